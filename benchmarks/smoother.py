@@ -1,0 +1,108 @@
+"""Speed of exact smoothing against statsmodels and a banded solve, and its growth with the record; memory beside it.
+
+    python benchmarks/smoother.py            about two minutes
+    python benchmarks/smoother.py --quick
+
+A random-walk regression with n = 4, means and standard deviations. Ours includes the replay of the run that collects
+its regressors. Everything runs in one process on one BLAS thread;
+what is compared takes turns, and figures are medians. statsmodels gets the same model (identity transition, exact
+diffuse start) and is asked for smoothed means and covariances only. The banded solve gives means only.
+"""
+
+import os
+
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ[f"{_library}_NUM_THREADS"] = "1"
+
+import argparse
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.linalg import solveh_banded
+
+from driftfit import FLS, Regression, track
+
+N, MU = 4, 100.0
+
+
+def record(T):
+    rng = np.random.default_rng(1)
+    theta = np.cumsum(0.1 * rng.standard_normal((T, N)), axis=0)
+    phi = rng.standard_normal((T, N))
+    return phi, np.sum(phi * theta, axis=1) + rng.standard_normal(T)
+
+
+def ours(phi, y, run):
+    smoothed = run.smooth()
+    return smoothed.theta, smoothed.std
+
+
+def statsmodels(phi, y, run):
+    from statsmodels.tsa.statespace.kalman_smoother import SMOOTHER_STATE, SMOOTHER_STATE_COV, KalmanSmoother
+
+    model = KalmanSmoother(k_endog=1, k_states=N, k_posdef=N, smoother_output=SMOOTHER_STATE | SMOOTHER_STATE_COV)
+    model.bind(y[:, None])
+    model["design"] = np.ascontiguousarray(phi.T[None])
+    model["transition"] = model["selection"] = np.eye(N)
+    model["state_cov"], model["obs_cov"] = np.eye(N) / MU, np.eye(1)
+    model.initialize_diffuse()
+    found = model.smooth()
+    var = np.diagonal(found.smoothed_state_cov.transpose(2, 0, 1), axis1=1, axis2=2)
+    return found.smoothed_state.T, np.sqrt(found_scale(run) * var)
+
+
+def found_scale(run):
+    return run._tile["scale"][0, 0]
+
+
+def banded(phi, y, run):
+    """Means by Cholesky of the block tridiagonal normal equations."""
+    T = len(y)
+    band = np.zeros((N + 1, T * N))
+    band[0, N:] = -MU
+    for j in range(N):
+        band[N - j].reshape(T, N)[:, j:] = phi[:, j:] * phi[:, : N - j]
+    band[N].reshape(T, N)[:] += MU * np.where(np.isin(np.arange(T), (0, T - 1)), 1.0, 2.0)[:, None]
+    return solveh_banded(band, (phi * y[:, None]).ravel(), overwrite_ab=True).reshape(T, N), None
+
+
+def seconds(function, *arguments):
+    start = perf_counter()
+    result = function(*arguments)
+    return perf_counter() - start, result
+
+
+def main(quick: bool) -> None:
+    sizes = (10_000, 30_000, 100_000) if quick else (10_000, 100_000, 1_000_000)
+    methods = {"driftfit": ours, "statsmodels": statsmodels, "banded solve, means only": banded}
+    table = Table(title=f"Exact smoothing, n = {N}: seconds, and microseconds a sample", title_justify="left")
+    table.add_column("samples", justify="right")
+    for name in methods:
+        table.add_column(name, justify="right")
+    table.add_column("statsmodels / driftfit", justify="right")
+    table.add_column("largest difference", justify="right")
+    track(Regression(N), FLS(MU), *record(100)[::-1]).smooth()
+    for T in sizes:
+        phi, y = record(T)
+        run = track(Regression(N), FLS(MU), y, phi)
+        times = {name: [] for name in methods}
+        found = {}
+        for _ in range(1 if T == 1_000_000 else 5):
+            for name, method in methods.items():
+                taken, found[name] = seconds(method, phi, y, run)
+                times[name].append(taken)
+        cells = [f"{median(t):.3f} ({median(t) / T * 1e6:.2f})" for t in times.values()]
+        theta, std = found["driftfit"]
+        other, other_std = found["statsmodels"]
+        gap = max(np.abs(theta - other).max() / np.abs(theta).max(), np.abs(std / other_std - 1.0).max())
+        table.add_row(f"{T:,}", *cells, f"{median(times['statsmodels']) / median(times['driftfit']):.1f}", f"{gap:.0e}")
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="up to 100,000 samples")
+    main(parser.parse_args().quick)

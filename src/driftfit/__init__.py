@@ -1,0 +1,34 @@
+"""driftfit follows the parameters of a system while they change."""
+
+from importlib.metadata import version
+
+from driftfit.fleet import Fleet
+from driftfit.frontier import frontier
+from driftfit.live import Live
+from driftfit.models.arx import ARX
+from driftfit.models.regression import Regression
+from driftfit.result import Track
+from driftfit.track import track
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.trackers.augmented_fls import AugmentedFLS
+from driftfit.trackers.fls import FLS
+from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.rls import RLS
+from driftfit.tune import tune
+
+__version__ = version("driftfit")
+__all__ = [
+    "ARX",
+    "FLS",
+    "RLS",
+    "AdaptiveKalman",
+    "AugmentedFLS",
+    "Fleet",
+    "Kalman",
+    "Live",
+    "Regression",
+    "Track",
+    "frontier",
+    "track",
+    "tune",
+]

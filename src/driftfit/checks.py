@@ -1,0 +1,231 @@
+"""The promises of a tracker as code, for trackers that stand outside this package as well.
+
+    from driftfit.checks import check_tracker
+
+    for sentence in check_tracker(MyTracker(gain=0.1)):
+        print(sentence)
+
+Every check drives the tracker over a small simulated record and says in a sentence what is broken and where to look.
+It takes about as long as compiling the tracker three times. Keeping all promises does not make a tracker good: compare
+its one-step errors with those of others (`Track.summary`).
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+
+import numpy as np
+
+from driftfit.fleet import FEWEST
+from driftfit.kernel import Array
+from driftfit.live import Live
+from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.models.regression import Regression
+from driftfit.result import Track, root_mean_square
+from driftfit.track import track
+from driftfit.trackers.base import Tracker
+
+T = 200
+LONG = 20_000
+
+
+def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
+    """The promises that a tracker breaks, a sentence each; an empty list when it keeps them all.
+
+    Parameters
+    ----------
+    tracker : Tracker
+        With all its settings, as for `track`.
+    model : Model or None
+        A model with one input on which to try it; ``ARX(1, 1)`` by default.
+    """
+    bound = (model or ARX(1, 1)).bind(1)
+    broken = list(_settings(tracker))
+    try:
+        run = track(bound, tracker, *record())
+    except Exception as error:  # whatever it is: its author wants to read it
+        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        return [*broken, f"It does not run: {type(error).__name__}: {first.strip()}"]
+    broken += _missing(tracker, bound)
+    if broken and "poison" in broken[-1]:  # nothing else can be told apart
+        return broken
+    for check in (_live, _lanes, _causal, _unused, _no_time, _variances, _rest, _saving, _learning):
+        broken += check(tracker, bound, run)
+    return broken
+
+
+def record(seed: int = 0, length: int = T) -> tuple[Array, Array]:
+    """y, u of y_t = 0.7 y_(t-1) + u_(t-1) + noise of standard deviation 0.1."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.normal(size=length), 0.1 * rng.normal(size=length)
+    y = np.zeros(length)
+    for t in range(1, length):
+        y[t] = 0.7 * y[t - 1] + u[t - 1] + v[t]
+    return y, u
+
+
+def damaged(seed: int = 0, bad: float = np.nan) -> tuple[Array, Array]:
+    """The same with a tenth of both signals missing."""
+    y, u = record(seed)
+    rng = np.random.default_rng(seed + 1)
+    y[rng.random(T) < 0.1], u[rng.random(T) < 0.1] = bad, bad
+    return y, u
+
+
+def _differ(one: Track, other: Track, upto: int | None = None) -> str | None:
+    """The first result in which two runs differ, and from which sample on."""
+    for name in one._out.dtype.names or ():
+        a, b = one._written(name)[:upto], other._written(name)[:upto]
+        wrong = ~((a == b) | (np.isnan(a) & np.isnan(b)))
+        if wrong.any():
+            return f"{name} differs from sample {int(np.argmax(wrong.reshape(len(a), -1).any(axis=1)))} on"
+    return None
+
+
+def _settings(tracker: Tracker) -> Iterator[str]:
+    kind = type(tracker).__name__
+    try:
+        again = type(tracker).from_settings(json.loads(json.dumps(tracker.settings())))
+        if again != tracker or hash(again) != hash(tracker):
+            yield f"{kind} is not the same after its settings were written down and read back; make lists tuples."
+    except (TypeError, ValueError) as error:
+        yield f"The settings of {kind} are not plain, hashable data (numbers, text, None, tuples of these): {error}."
+    for field in fields(tracker)[:1]:  # type: ignore[arg-type]
+        try:
+            setattr(tracker, field.name, getattr(tracker, field.name))
+            yield f"{kind} can be changed after construction; make it @dataclass(frozen=True)."
+        except FrozenInstanceError:
+            pass
+
+
+def _live(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    y, u = damaged()
+    run, live = track(model, tracker, y, u), Live(model, tracker)
+    for t in range(T):
+        y_hat, e, _s, ok = live.update(y[t], u[t])
+        said, expected = (y_hat, e, ok, *live.theta), (run.prediction[t], run.innovation[t], run.ok[t], *run.theta[t])
+        if not np.array_equal(said, expected, equal_nan=True):
+            yield (
+                f"Live does not say what the record says from sample {t} on: a step may use nothing but its record, "
+                "so keep whatever must be remembered in fields of the state."
+            )
+            return
+
+
+def _lanes(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    count = max(FEWEST, tracker.width) + 1
+    y, u = (np.stack(signal) for signal in zip(*(damaged(seed) for seed in range(count)), strict=True))
+    fleet = track(model, tracker, y, u, by="row")
+    for key in (0, 1, count - 1):
+        difference = _differ(fleet[key], track(model, tracker, y[key], u[key]))
+        if difference:
+            yield (
+                f"A series in a fleet is not what it is alone ({difference}): every field is used at [..., l], and "
+                "exp and log come from driftfit.kernel, because others differ with the number of lanes."
+            )
+            return
+
+
+def _causal(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
+    y, u = record()
+    y[120] += 10.0
+    other = track(model, tracker, y, u)
+    difference = _differ(run, other, 120)
+    if difference:
+        yield f"It looks ahead: a change of sample 120 shows before ({difference})."
+    elif run.prediction[120] != other.prediction[120]:
+        yield "The prediction of an output depends on that output: write s.y_hat from theta as it was before."
+    if not np.allclose(run.innovation[run.ok], (run.y - run.prediction)[run.ok]):
+        yield "s.e is not s.y[l] - s.y_hat[l] at samples that are used."
+
+
+def _missing(tracker: Tracker, model: Model) -> Iterator[str]:
+    runs = {bad: track(model, tracker, *damaged(bad=bad)) for bad in (np.nan, np.inf, 1e200)}
+    for bad, run in runs.items():
+        if not np.isfinite(run.theta).all():
+            t = int(np.argmax(~np.isfinite(run.theta).all(axis=1)))
+            yield f"Missing data poison theta (signals that are {bad}, at sample {t}): divide by nothing that can be 0."
+            return
+    if any(_differ(run, runs[np.nan]) for run in runs.values()):
+        yield "Values that are infinite or absurdly large are not treated like missing ones."
+
+
+def _unused(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    y, u = record()
+    weights = np.ones(T)
+    weights[100:110] = 0.0
+    loud = np.where(weights > 0.0, y, y + 5.0)
+    runs = [track(Regression(1), tracker, signal, u, weights=weights) for signal in (y, loud)]
+    if not np.array_equal(runs[0].theta, runs[1].theta):
+        yield "It learns from samples that are not to be used: s.ok[l], 0 or 1, must be a factor of the gain."
+
+
+def _no_time(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    y, u = record()
+    live = Live(model, tracker)
+    for t in range(100):
+        live.update(y[t], u[t])
+    before = live.theta, live.cov
+    live.hold()
+    for t in range(100, 110):
+        live.update(y[t], u[t])
+    if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, (live.theta, live.cov), strict=True)):
+        yield "Something happens although no time passes and nothing is used: with s.dt[l] = 0 predict changes nothing."
+
+
+def _variances(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
+    var, cov = run._written("var")[-1], run.cov(-1)
+    if not tracker.covariance:
+        if not np.isnan(var).all():
+            yield "It declares covariance = False, but reports variances; use driftfit.drivers.unknown as its report."
+        return
+    if not (np.isfinite(var).all() and (var >= 0.0).all()):
+        yield f"Variances of theta are not finite and positive after {T} samples: {var}."
+    elif not (
+        np.isfinite(cov).all() and np.array_equal(cov, cov.T) and np.linalg.eigvalsh(cov).min() >= -1e-9 * var.max()
+    ):
+        yield "The covariance of theta is not symmetric, finite and positive; keep its lower triangle in s.P."
+    s = run._written("s")[run.ok]
+    if not ((s > 0.0) | ~np.isfinite(s)).all():
+        yield "The variance of the innovation, s.s, is not positive."
+
+
+def _rest(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    y, u = record(length=LONG)
+    y[T:], u[T:] = 0.0, 0.0
+    run = track(model, tracker, y, u)
+    if not np.isfinite(run.theta).all() or not (np.isfinite(run.std[-1]).all() or not tracker.covariance):
+        yield f"Without excitation it does not stay finite for {LONG} samples."
+
+
+def _saving(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
+    y, u = record()
+    live = Live(model, tracker)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "state.npz"
+        try:
+            for t in range(T):
+                if t == T // 2:
+                    live.save(path)
+                    live = Live.load(path)
+                live.update(y[t], u[t])
+        except (ValueError, TypeError) as error:
+            yield f"It cannot be saved and loaded: {error}"
+            return
+    if not np.array_equal(live.theta, run.theta[-1]):
+        yield "Saved, loaded and continued it says something else than never stopped."
+
+
+def _learning(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
+    used = run.ok & (np.arange(T) >= T // 2)
+    error, level = root_mean_square(run.innovation[used]), root_mean_square(run.y[used])
+    if not error < 0.5 * level:
+        yield (
+            f"It does not follow a constant system: the rms error of the second half is {error:.3g}, the output's own "
+            f"is {level:.3g}."
+        )

@@ -1,0 +1,53 @@
+"""The comparison that every result carries: what a user would otherwise have done, on the same samples.
+
+*persistence*   the last output that was seen
+*constant LS*   recursive least squares without forgetting on the same regressors (fitted on the past only)
+*constant ARX*  the same on ARX(2, 1 per input) with intercept
+
+All are one-step predictions, scored on the samples after max(50, 5 n) that every one of them could predict.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.drivers import LARGEST
+from driftfit.kernel import Array
+from driftfit.models.arx import ARX
+from driftfit.result import Track, root_mean_square
+from driftfit.track import track
+from driftfit.trackers.rls import RLS
+
+
+class Comparison(NamedTuple):
+    """Root mean square one-step errors on ``samples`` samples; NaN where a record is too short to score."""
+
+    tracked: float
+    persistence: float
+    constant_ls: float
+    constant_arx: float
+    samples: int
+
+
+def persistence(y: Array) -> Array:
+    """For every sample the last output seen before it; NaN before the first."""
+    seen = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(seen)[:-1]])
+    return np.where(last >= 0, y[last], np.nan)
+
+
+def compare(run: Track) -> Comparison:
+    """Score a run beside persistence, constant least squares and constant ARX."""
+    y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
+    gaps = run._known[:, 0]  # 0 before the lags are filled
+    time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
+    steady = track(run.model, RLS(1.0), y, u, time=time)
+    arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
+    errors = [run.innovation, y - persistence(y), steady.innovation, arx.innovation]
+    scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
+    for error in errors:
+        scored &= np.isfinite(error)
+    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in errors)
+    return Comparison(tracked, last, ls, constant, int(scored.sum()))

@@ -1,0 +1,72 @@
+"""The frontier of flexible least squares: what fit costs in movement, over all mu.
+
+    r_M^2(mu) = sum w_k (y_k - phi_k' theta_k)^2          r_D^2(mu) = sum |theta_{k+1} - theta_k|^2 / (dt d)
+
+of the smoothed path. It is convex; r_M^2 does not fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu
+exactly. There is no corner to choose mu by: in logarithms the curve has none, because r_M^2 goes to 0 with mu, and on
+linear axes the knee depends on the scaling; `tune` finds mu.
+
+Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing a point.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.track import track
+from driftfit.trackers.fls import FLS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.smoothers.smoothed import Smoothed
+
+
+class Frontier(NamedTuple):
+    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, in the order of mu."""
+
+    mu: Array
+    measurement: Array
+    dynamic: Array
+
+    def plot(self) -> Figure:
+        """r_M^2 against r_D^2, and both against mu; a matplotlib figure."""
+        from driftfit.tuning.plots import plot_frontier
+
+        return plot_frontier(self)
+
+
+def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, **known: Any) -> Frontier:
+    """The two costs of the smoothed path for every mu.
+
+    Parameters
+    ----------
+    model, y, u, and time, dt, weights, drift
+        As for `track`.
+    mu : (S,) or None
+        Weights, positive. None: four per decade, from 1e-4 to 1e5 times the mean of phi' phi.
+
+    Raises
+    ------
+    ValueError
+        If a mu is not positive, or what `track` refuses.
+    """
+    if mu is None:
+        steady = track(model, FLS(1.0), y, u, **known).smooth()
+        used = steady.walk.weight > 0.0
+        power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
+        mu = power * np.logspace(-4.0, 5.0, 37)
+    weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
+    paths = [track(model, FLS(float(value)), y, u, **known).smooth() for value in weights]
+    return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
+
+
+def _movement(path: Smoothed) -> float:
+    """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
+    drift = path.walk.drift[1:, None]
+    steps = np.diff(path.theta, axis=0) ** 2
+    return float(np.sum(np.divide(steps, drift, out=np.zeros_like(steps), where=drift > 0.0)))

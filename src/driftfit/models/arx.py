@@ -1,0 +1,237 @@
+"""ARX: autoregression with exogenous inputs, the workhorse of on-line identification.
+
+    y_t = sum_{i=1..na} a_i y_{t-i} + sum_{inputs} sum_{j=1..nb} b_j u_{t-nk-j+1} (+ c) + v_t
+    phi_t = [y_{t-1} .. y_{t-na}, u1_{t-nk} .. u1_{t-nk-nb+1}, u2 ..., (1)],   theta_t = [a_1 .., b_1 .., (c)]
+
+The signs of a are those of the regression; MATLAB's polynomials A(z) carry the other sign (`polynomials` converts).
+With nk = 0 the present input is used. The model owns its lags, so nobody builds a design matrix.
+
+Missing outputs: the lag is filled with the model's own prediction, where that has a finite variance, for at most ``na``
+outputs in a row; after that samples cannot be used until real lags are back, because an unstable estimate would run
+away. A missing input makes every sample that needs it unusable. A gap in time above 1.5 nominal intervals makes the
+lags that reach across missing.
+
+Source: Ljung, System Identification (1999), eq. 4.7; the filling rule is ours. Cost per sample: O(na + nb).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import LARGEST, ModelSteps
+from driftfit.kernel import Array, State, kernel
+from driftfit.models.base import Model
+from driftfit.settings import one_of, output_names, whole
+
+GAP = 1.5
+"""Intervals longer than this many nominal ones break the lags."""
+
+
+@dataclass(frozen=True)
+class ARX(Model):
+    """ARX(na, nb, nk) with one output and any number of inputs.
+
+    Parameters
+    ----------
+    na : int
+        Lags of the output.
+    nb, nk : int, or one per input
+        Lags of each input, and its delay in samples (0 uses the present input).
+    inputs : int, names, or None
+        How many inputs, or their names. None: as many as ``nb`` or ``nk`` list, else as many as u has (`Live`: one).
+    intercept : bool
+        Add a constant as the last parameter.
+    start : "drop" or "zero"
+        "drop": until the lags are filled nothing happens at all. "zero": the unknown past is zero.
+    ny : int or names
+        Outputs, columns of y. With several, each has a regression of its own on the lags of all of them and on the
+        inputs (`driftfit.models.joint_arx`).
+    """
+
+    na: int
+    nb: int | tuple[int, ...] = 1
+    nk: int | tuple[int, ...] = 1
+    inputs: int | tuple[str, ...] | None = None
+    intercept: bool = False
+    start: str = "drop"
+    ny: int | tuple[str, ...] = 1
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.ny, int):
+            self._set("ny", output_names("ARX", self.ny))
+        output_names("ARX", self.ny)
+        self._set("na", whole("ARX", "na", self.na, 0))
+        counts = set()
+        for name, low in (("nb", 0), ("nk", 0)):
+            value = getattr(self, name)
+            if isinstance(value, Sequence | np.ndarray):
+                self._set(name, tuple(whole("ARX", name, int(v) if v == int(v) else v, low) for v in value))
+                counts.add(len(value))
+            else:
+                self._set(name, whole("ARX", name, value, low))
+        if isinstance(self.inputs, str):
+            self._set("inputs", (self.inputs,))
+        elif isinstance(self.inputs, int | np.integer):
+            self._set("inputs", whole("ARX", "inputs", self.inputs, 0))
+        elif self.inputs is not None:
+            self._set("inputs", tuple(str(name) for name in self.inputs))
+        elif self.inputs is None and counts:
+            self._set("inputs", counts.pop() if len(counts) == 1 else None)
+        elif self.inputs is None and self.nb == 0:
+            self._set("inputs", 0)
+        if counts - {self._count}:
+            raise ValueError(
+                f"ARX: nb={self.nb!r}, nk={self.nk!r} and inputs={self.inputs!r} speak of different numbers of inputs."
+            )
+        one_of("ARX", "start", self.start, ("drop", "zero"))
+        if self.inputs is not None and self.n == 0:
+            raise ValueError("ARX: there is nothing to estimate with na=0, nb=0 and no intercept.")
+
+    @property
+    def _count(self) -> int | None:
+        return self.inputs if isinstance(self.inputs, int) or self.inputs is None else len(self.inputs)
+
+    def bind(self, inputs: int | Sequence[str]) -> ARX:
+        bound = self._bound(inputs)
+        if len(self.outputs) == 1:
+            return bound
+        from driftfit.models.joint_arx import JointARX
+
+        return JointARX.from_settings(bound.settings())
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return output_names("ARX", self.ny)
+
+    def _bound(self, inputs: int | Sequence[str]) -> ARX:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if self.inputs is None:
+            if count == 0:
+                raise ValueError(f"ARX: nb={self.nb!r} asks for an input, but there is no u; give u, or nb=0.")
+            return replace(self, inputs=count if isinstance(inputs, int) else tuple(inputs))
+        if count != self.m:
+            raise ValueError(
+                f"ARX: the model has {self.m} inputs (nb={self.nb!r}, inputs={self.inputs!r}), "
+                f"but u has {count} columns."
+            )
+        if isinstance(self.inputs, int) and not isinstance(inputs, int):
+            return replace(self, inputs=tuple(inputs))
+        return self
+
+    @property
+    def m(self) -> int:
+        if self._count is None:
+            return 1
+        return self._count
+
+    @property
+    def lags(self) -> tuple[tuple[int, int], ...]:
+        """(nb, nk) of every input."""
+        nb = self.nb if isinstance(self.nb, tuple) else (self.nb,) * self.m
+        nk = self.nk if isinstance(self.nk, tuple) else (self.nk,) * self.m
+        return tuple(zip(nb, nk, strict=True))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*(f"a{i + 1}" for i in range(self.na)), *self._input_names())
+
+    def _input_names(self) -> tuple[str, ...]:
+        names: list[str] = []
+        for number, (nb, _) in enumerate(self.lags):
+            given = self.inputs[number] if isinstance(self.inputs, tuple) else f"u{number + 1}" if self.m > 1 else ""
+            names += [f"b{j + 1}[{given}]" if given else f"b{j + 1}" for j in range(nb)]
+        return (*names, "intercept") if self.intercept else tuple(names)
+
+    @property
+    def dimensions(self) -> tuple[tuple[int, int | None], ...]:
+        inputs = [(1, j) for j, (nb, _) in enumerate(self.lags) for _ in range(nb)]
+        return ((0, None),) * self.na + (*inputs, *([(1, None)] if self.intercept else []))
+
+    def memory(self) -> Mapping[str, Any]:
+        unknown = np.nan if self.start == "drop" else 0.0
+        depth = max((nb + nk for nb, nk in self.lags), default=1)
+        return {
+            "y_lag": np.full(max(self.na, 1), unknown),
+            "u_lag": np.full((max(self.m, 1), max(depth, 1)), unknown),
+            "filled": 0.0,
+            "started": 0.0 if self.start == "drop" else 1.0,
+        }
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self.na, self.lags, self.intercept)
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of 1 / A(z) to an impulse, (h,)."""
+        A, _ = self.polynomials(theta)
+        from scipy import signal  # a third of a second to import, for forecasts only
+
+        response: Array = signal.lfilter([1.0], A, np.eye(1, h)[0])
+        return response
+
+    def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
+        """A(z) = [1, -a_1, ..] and, per input, B(z) = [0 (nk times), b_1, ..], in powers of z^-1.
+
+        ``theta`` is (n,) or (..., n); the polynomials have their coefficients on the last axis.
+        """
+        theta = np.asarray(theta, dtype=float)
+        one = np.ones((*theta.shape[:-1], 1))
+        A = np.concatenate([one, -theta[..., : self.na]], axis=-1)
+        B, at = [], self.na
+        for nb, nk in self.lags:
+            delay = np.zeros((*theta.shape[:-1], nk))
+            B.append(np.concatenate([delay, theta[..., at : at + nb]], axis=-1))
+            at += nb
+        return A, B
+
+
+@lru_cache
+def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> ModelSteps:
+    """The steps of one structure: orders are constants, so every loop unrolls."""
+    m = len(lags)
+    # without inputs the loops over them never run, but an empty tuple cannot be typed
+    nb = tuple(b for b, _ in lags) or (0,)
+    nk = tuple(k for _, k in lags) or (0,)
+    at = tuple(int(na + sum(nb[:j])) for j in range(max(m, 1)))
+    n = na + sum(nb)
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        broken = s.dt[l] > GAP
+        depth = s.u_lag.shape[1]
+        for i in range(na):
+            s.y_lag[i, l] = np.nan if broken else s.y_lag[i, l]
+            s.phi[i, l] = s.y_lag[i, l]
+        for j in range(m):
+            # the present input takes place 0, so lag k is entry k and nk = 0 needs no case of its own
+            for i in range(depth - 1, 0, -1):
+                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
+            s.u_lag[j, 0, l] = s.u[j, l]
+            for i in range(nb[j]):
+                s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
+        if intercept:
+            s.phi[n, l] = 1.0
+        # "drop": until every lag has been filled once no time passes for the tracker
+        started = 1.0
+        for i in range(s.phi.shape[0]):
+            started = started if abs(s.phi[i, l]) < LARGEST else s.started[l]
+        s.started[l] = started
+        s.dt[l] = s.dt[l] if started > 0.0 else 0.0
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        for i in range(na - 1, 0, -1):
+            s.y_lag[i, l] = s.y_lag[i - 1, l]
+        # a prediction of infinite variance knows nothing (a diffuse start): as a lag it would pass for an output
+        known = s.valid[l] > 0.0 and (s.s[l] != np.inf or s.noise[l] == np.inf)
+        fill = s.y_hat[l] if known and s.filled[l] < na else np.nan
+        s.filled[l] = 0.0 if s.seen[l] > 0.0 else s.filled[l] + 1.0
+        if na > 0:
+            s.y_lag[0, l] = s.y[l] if s.seen[l] > 0.0 else fill
+
+    return ModelSteps(regress, push)

@@ -1,0 +1,76 @@
+"""What every model offers: signals to a regression, and names for its parameters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import ModelSteps
+from driftfit.kernel import Array
+from driftfit.settings import Settings
+
+
+class Model(Settings, ABC):
+    """How signals become ``y_t = phi_t' theta_t + v_t``.
+
+    A model is *bound* once the number (and perhaps the names) of its inputs is known; `bind` returns the bound model,
+    and everything else needs one.
+    """
+
+    @abstractmethod
+    def bind(self, inputs: int | Sequence[str]) -> Model:
+        """This model for that many inputs, or for inputs of these names; ValueError where they do not fit."""
+
+    @property
+    @abstractmethod
+    def m(self) -> int:
+        """Number of inputs, columns of u."""
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of theta."""
+
+    @property
+    def dimensions(self) -> tuple[tuple[int, int | None], ...] | None:
+        """For every parameter (p, j): its unit is that of y to the power p, over that of input j (None: over nothing).
+
+        None where a model cannot say; its parameters then have no units, and scaled signals cannot be undone.
+        """
+        return None
+
+    @property
+    def n(self) -> int:
+        """Number of parameters."""
+        return len(self.names)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs; several are followed by `driftfit.outputs`."""
+        return ("y",)
+
+    @property
+    def shared(self) -> bool:
+        """Whether all outputs measure one theta, instead of having one each."""
+        return False
+
+    def names_of(self, output: str) -> tuple[str, ...]:
+        """Names of the parameters of one of several outputs."""
+        return tuple(f"{name}[{output}]" for name in self.names)
+
+    @abstractmethod
+    def memory(self) -> Mapping[str, Any]:
+        """Fields of the record that hold the model's memory, with their values before the first sample."""
+
+    @property
+    @abstractmethod
+    def steps(self) -> ModelSteps:
+        """The compiled ``regress`` and ``push``."""
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
+        response: Array = np.eye(1, h)[0]
+        return response

@@ -1,0 +1,111 @@
+"""Linear regression: y_t = phi_t' theta_t + v_t, where the user's inputs are the regressors.
+
+    phi_t = [u_t1 .. u_tm, (1)]
+
+Use it when the regressors are known at the time of the output (hedge ratios, factor betas, sensor calibration); use
+`ARX` when the output has a memory. Several outputs either have one theta each, on the same regressors (``ny=2``), or
+measure the same theta, each with regressors of its own (``ny=2, shared=True``). A sample with a missing regressor or
+output is skipped: time passes, nothing is learned. Cost per sample: O(n).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import ModelSteps
+from driftfit.kernel import State, kernel, nothing
+from driftfit.models.base import Model
+from driftfit.settings import output_names, whole
+
+
+@dataclass(frozen=True)
+class Regression(Model):
+    """Regression on the rows of u.
+
+    Parameters
+    ----------
+    regressors : int, names, or None
+        How many columns u has, or what they are called. None: as many as u turns out to have.
+    intercept : bool
+        Add a regressor that is always 1, as the last parameter.
+    ny : int or names
+        Outputs, columns of y.
+    shared : bool
+        All outputs measure one theta: u is then (T, ny, m), a row of regressors for each output.
+    """
+
+    regressors: int | tuple[str, ...] | None = None
+    intercept: bool = False
+    ny: int | tuple[str, ...] = 1
+    shared: bool = False
+
+    def __post_init__(self) -> None:
+        given = self.regressors
+        if isinstance(given, str):
+            self._set("regressors", (given,))
+        elif isinstance(given, int | np.integer):
+            self._set("regressors", whole("Regression", "regressors", given, 0))
+        elif given is not None:
+            self._set("regressors", tuple(str(name) for name in given))
+        if not isinstance(self.ny, int):
+            self._set("ny", output_names("Regression", self.ny))
+        if self.shared and len(self.outputs) == 1:
+            raise ValueError("Regression: shared=True speaks of several outputs; say how many, as in ny=2.")
+        if self.regressors is not None and self.n == 0:
+            raise ValueError("Regression: there is nothing to estimate with 0 regressors and no intercept.")
+
+    def bind(self, inputs: int | Sequence[str]) -> Regression:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if self.regressors is None:
+            return replace(self, regressors=count if isinstance(inputs, int) else tuple(inputs))
+        if count != self.m:
+            raise ValueError(f"Regression: {self.m} regressors were declared, but u has {count} columns.")
+        if isinstance(self.regressors, int) and not isinstance(inputs, int):
+            return replace(self, regressors=tuple(inputs))
+        return self
+
+    @property
+    def m(self) -> int:
+        if self.regressors is None:
+            raise ValueError(
+                "Regression: say how many regressors there are, as in Regression(3) or Regression(['income'])."
+            )
+        return self.regressors if isinstance(self.regressors, int) else len(self.regressors)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        given = self.regressors
+        own = tuple(f"theta{i + 1}" for i in range(self.m)) if isinstance(given, int) else tuple(given or ())
+        return own + (("intercept",) if self.intercept else ())
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return output_names("Regression", self.ny)
+
+    @property
+    def dimensions(self) -> tuple[tuple[int, int | None], ...]:
+        return (*((1, j) for j in range(self.m)), *([(1, None)] if self.intercept else []))
+
+    def memory(self) -> Mapping[str, Any]:
+        return {}
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self.m, self.intercept)
+
+
+@lru_cache
+def _steps(m: int, intercept: bool) -> ModelSteps:
+    @kernel
+    def regress(s: State, l: int) -> None:
+        for i in range(m):
+            s.phi[i, l] = s.u[i, l]
+        if intercept:
+            s.phi[m, l] = 1.0
+
+    return ModelSteps(regress, nothing)

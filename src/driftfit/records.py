@@ -1,0 +1,157 @@
+"""Records: many series one after the other in flat arrays, and what their signals are called.
+
+This is what every fleet runs on, whether it came from a table, from rows of an array, or from one series under many
+settings: a lane reads from ``first`` on, for ``length`` samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import known_factors
+from driftfit.kernel import Array
+from driftfit.signals import as_inputs, as_numbers, as_output, factor, intervals, noise_of
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the signals of a series are called, in which units they are, and what was left out of it.
+
+    ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
+    counts rows that never became samples, by reason. ``by`` names what tells the series of a fleet apart.
+    """
+
+    y: str = "y"
+    u: tuple[str, ...] = ()
+    time: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    zone: str | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    by: tuple[str, ...] = ("series",)
+
+    def __post_init__(self) -> None:
+        for name in ("u", "by"):  # lists, after a passage through JSON
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    def unit(self, power: int, j: int | None) -> str:
+        """The unit of y to the power 0 or 1, over that of input j; empty where it is not known, or 1."""
+        top = self.units.get(self.y, "") if power else ""
+        bottom = "" if j is None or j >= len(self.u) else self.units.get(self.u[j], "")
+        if (power and not top) or (j is not None and not bottom) or top == bottom:
+            return ""
+        top, bottom = (f"({unit})" if "/" in unit and bottom else unit for unit in (top or "1", bottom))
+        return f"{top}/{bottom}" if bottom else top
+
+
+PLAIN = Labels()
+
+
+@dataclass(frozen=True)
+class Records:
+    """Series in flat arrays of N samples.
+
+    ``y`` (N,), ``u`` (N, m), ``known`` (N, 3) or (1, 3), ``time`` (N,) or None; series k is ``length[k]`` samples from
+    ``first[k]`` on and is called ``keys[k]``. ``dropped`` counts, per key, rows that never became samples.
+    """
+
+    keys: tuple[Hashable, ...]
+    first: Array
+    length: Array
+    y: Array
+    u: Array
+    known: Array
+    time: Array | None = None
+    labels: Labels = PLAIN
+    dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+
+    def part(self, k: int) -> tuple[Array, Array, Array | None, Array]:
+        """(y, u, time, known) of series k, as views."""
+        rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
+        known = self.known if len(self.known) == 1 else self.known[rows]
+        return self.y[rows], self.u[rows], None if self.time is None else self.time[rows], known
+
+    def repeated(self, keys: tuple[Hashable, ...]) -> Records:
+        """The only series under several keys, without copying it."""
+        return replace(
+            self, keys=keys, first=np.repeat(self.first, len(keys)), length=np.repeat(self.length, len(keys))
+        )
+
+    def labels_of(self, k: int) -> Labels:
+        """The labels of series k."""
+        dropped = self.dropped.get(self.keys[k])
+        return replace(self.labels, dropped=dropped) if dropped else self.labels
+
+
+def one_series(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Records:
+    """One series; y (T,), u (T,), (T, m) or None, time (T,) or None."""
+    output = as_output(y)
+    T = len(output)
+    axis, gaps = (None, 1.0) if time is None else intervals(time, dt, T)
+    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
+    return Records((0,), np.array([0]), np.array([T]), output, as_inputs(u, T), known, axis)
+
+
+def rows(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Records:
+    """Series as rows: y (units, T), u (units, T), (units, T, m) or None, time (T,) or (units, T) or None."""
+    output = as_numbers("y", y)
+    if output.ndim != 2 or output.size == 0:
+        raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
+    units, T = output.shape
+    known, axis = _known_of_rows(units, T, time, dt, weights, drift)
+    return Records(
+        tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
+        _inputs_of_rows(u, units, T), known, axis,
+    )  # fmt: skip
+
+
+def _inputs_of_rows(u: Any, units: int, T: int) -> Array:
+    """u as (units * T, m)."""
+    if u is None:
+        return np.zeros((units * T, 0))
+    inputs = as_numbers("u", u)
+    if inputs.ndim == 2:
+        inputs = inputs[:, :, None]
+    if inputs.ndim != 3 or inputs.shape[:2] != (units, T):
+        raise ValueError(
+            f'by="row": y is {units} units of {T} samples, so u must be ({units}, {T}) or ({units}, {T}, m); '
+            f"got shape {np.shape(u)}."
+        )
+    return inputs.reshape(units * T, inputs.shape[2])
+
+
+def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Array, Array | None]:
+    """known (units * T, 3) or (1, 3), and time (units * T,) or None."""
+    shape = (units, T)
+    axis: Array | None = None
+    gaps: Any = 1.0
+    if time is not None:
+        given = np.asarray(time)
+        if given.ndim == 1:
+            axis, gaps = intervals(given, dt, T)
+            axis = np.broadcast_to(axis, shape)
+        elif given.shape == shape:
+            axis, gaps = (np.stack(part) for part in zip(*(intervals(row, dt, T) for row in given), strict=True))
+        else:
+            raise ValueError(f'by="row": time must be ({T},) or {shape}; got shape {given.shape}.')
+    factors = [gaps, _per_row("weights", weights, shape, noise_of), _per_row("drift", drift, shape, drift_of)]
+    flat = [np.broadcast_to(f, shape).ravel() if np.ndim(f) else f for f in factors]
+    return known_factors(*flat), None if axis is None else axis.ravel()
+
+
+def drift_of(value: Any, T: int | None = None) -> Array:
+    """Known factors of the drift."""
+    return factor("drift", value, T)
+
+
+def _per_row(name: str, value: Any, shape: tuple[int, int], convert: Any) -> Array:
+    """A factor given as one number, (T,) for all rows, or (units, T)."""
+    array = np.asarray(value)
+    if array.ndim < 2:
+        return np.asarray(convert(value, shape[1]))
+    if array.shape != shape:
+        raise ValueError(f'by="row": {name} must be a number, ({shape[1]},) or {shape}; got shape {array.shape}.')
+    return np.asarray(convert(array.ravel(), array.size)).reshape(shape)

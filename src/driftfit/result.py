@@ -1,0 +1,285 @@
+"""Track: the result of a run, the same whatever ran."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC
+from functools import cached_property
+from os import PathLike
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, Self, cast
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from driftfit import storage
+from driftfit.drivers import drivers, output_type
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.records import PLAIN, Labels
+from driftfit.trackers.base import Tracker
+from driftfit.warm import End, fresh_tile
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.forecast import Forecast
+    from driftfit.smoothers.smoothed import Smoothed
+    from driftfit.summary import Summary
+
+
+class Track:
+    """Parameters of a record, sample by sample.
+
+    Attributes
+    ----------
+    theta, std : (T, n)
+        Parameters after each sample, and their standard deviations: inf for what has not been seen yet, NaN where the
+        tracker carries no covariance.
+    prediction, innovation, innovation_std : (T,)
+        One-step prediction made before the output was seen, its error, and the standard deviation of that error.
+    ok : (T,) bool
+        Which samples were used.
+    y, u, time : (T,), (T, m), (T,) or None
+        The record.
+    names : tuple of str
+        Names of the parameters.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        tracker: Tracker,
+        y: Array,
+        u: Array,
+        time: Array | None,
+        known: Array,
+        out: Array,
+        tile: Array,
+        lane: int = 0,
+        labels: Labels = PLAIN,
+        start: Mapping[str, Array] | None = None,
+    ) -> None:
+        self.model = model
+        self.tracker = tracker
+        self.y = y
+        self.u = u
+        self._time = time
+        self._known = known
+        self._out = out
+        self._tile = tile
+        self._lane = lane
+        self.labels = labels
+        self._start = start
+
+    def _written(self, name: str) -> Array:
+        """A field of what the driver wrote, for this lane."""
+        field: Array = self._out[name][..., self._lane]
+        return field
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def __repr__(self) -> str:
+        return f"Track of {len(self)} samples, {int(self.ok.sum())} used: {self.model!r}, {self.tracker!r}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.tracker.names_for(self.model)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the parameters, empty where they are not known."""
+        dimensions = self.model.dimensions
+        if dimensions is None or self.names != self.model.names:
+            return ("",) * len(self.names)
+        return tuple(self.labels.unit(*dimension) for dimension in dimensions)
+
+    @property
+    def time(self) -> Array:
+        """Times given, or sample numbers."""
+        return np.arange(len(self)) if self._time is None else self._time
+
+    def time_text(self, t: int) -> str:
+        """The time of sample t, in the time zone of the table that it came from."""
+        time = self.time[t]
+        if not isinstance(time, np.datetime64):
+            return f"{time:g}"
+        text = time.astype("datetime64[us]").item()
+        if self.labels.zone is None:
+            return f"{text:%Y-%m-%d %H:%M:%S}"
+        return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(self.labels.zone)):%Y-%m-%d %H:%M:%S %Z}"
+
+    @property
+    def theta(self) -> Array:
+        return self._written("theta")
+
+    @cached_property
+    def std(self) -> Array:
+        return np.sqrt(self._written("var"))
+
+    @property
+    def prediction(self) -> Array:
+        return self._written("y_hat")
+
+    @property
+    def innovation(self) -> Array:
+        return self._written("e")
+
+    @cached_property
+    def innovation_std(self) -> Array:
+        return np.sqrt(self._written("s"))
+
+    @cached_property
+    def ok(self) -> Array:
+        return self._written("ok") > 0.0
+
+    @cached_property
+    def loglik(self) -> float:
+        """Gaussian log-likelihood of the one-step predictions; the diffuse likelihood after a diffuse start.
+
+        Sum over used samples of -1/2 (log 2 pi s + e^2 / s), and -1/2 log F for each sample that determined a new
+        direction. NaN for trackers without an innovation variance.
+        """
+        if not self.tracker.covariance:
+            return float("nan")
+        s = self._written("s")
+        counted = self.ok & np.isfinite(s) & (s > 0.0)
+        e, s = self.innovation[counted], s[counted]
+        total = -0.5 * np.sum(np.log(2.0 * np.pi * s) + e * e / s)
+        if "F" in _names(self._tile):
+            total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
+        return float(total)
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        return self.theta - half, self.theta + half
+
+    def cov(self, t: int) -> Array:
+        """Covariance (n, n) of theta after sample t (negative t counts from the end).
+
+        Replays the record up to t, O(t), unless the run was made with keep="cov".
+        """
+        T = len(self)
+        if not -T <= t < T:
+            raise IndexError(f"cov: t must be within the record of {T} samples; got {t}.")
+        t %= T
+        if "P" in _names(self._out):
+            return np.array(self._written("P")[t])
+        tile = self._fresh_tile()
+        out = np.empty(t + 1, output_type(tile, self.tracker.outputs))
+        known = self._known if len(self._known) == 1 else self._known[: t + 1]
+        run = drivers(self.model.steps, self.tracker.steps_for(self.model)).run
+        run(tile, self.y[: t + 1, None], self.u[: t + 1, :, None], known[:, :, None], out)
+        return self.tracker.cov({name: tile[name][0, ..., 0] for name in storage.fields(tile)})
+
+    def smooth(self, keep: str = "std", order_by: Any = None) -> Smoothed:
+        """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.
+
+        The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
+        each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
+        time; the samples are sorted by it, smoothed in that order, and put back. ValueError for a tracker that is no
+        random walk in Gaussian noise.
+        """
+        from driftfit.smoothers.smoothed import Smoothed
+
+        if self._start is not None:
+            raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
+        return Smoothed.of(self, keep, order_by)
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """theta and y at the h nominal samples after the record, u (h,) or (h, m) being the inputs then."""
+        from driftfit.forecast import forecast
+
+        return forecast(self, h, u)
+
+    def _fresh_tile(self) -> Array:
+        """A tile of one lane as it was before the first sample."""
+        return fresh_tile(self.model, self.tracker, self._start)
+
+    def end(self) -> End:
+        """Where the run ended, for another one to begin (`warm_start`)."""
+        state = {name: self._tile[name][0, ..., self._lane].copy() for name in storage.fields(self._tile)}
+        return End(self.model, self.tracker, state, None if self._time is None else self._time[-1])
+
+    def summary(self) -> Summary:
+        """Parameters now, and one-step errors beside what one would otherwise do; print it."""
+        from driftfit.summary import summarise
+
+        return summarise(self)
+
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters with bands, prediction against output, innovations; a matplotlib figure."""
+        from driftfit.plots import plot_track
+
+        return plot_track(self, level)
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row a sample; see `driftfit.export`."""
+        from driftfit.export import to_table
+
+        return to_table(self, kind)
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """The same table as an Arrow stream, for whatever reads one."""
+        return self.to_table().__arrow_c_stream__(requested_schema)
+
+    def to_parquet(self, path: str | PathLike[str]) -> None:
+        """Write the same table as Parquet."""
+        from driftfit.export import to_parquet
+
+        to_parquet(self, path)
+
+    def polynomials(self) -> tuple[Array, list[Array]]:
+        """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
+        convert = getattr(self.model, "polynomials", None)
+        if convert is None:
+            raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
+        return cast("tuple[Array, list[Array]]", convert(self.theta))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the result to one file, without pickle; complete or not at all."""
+        header = {
+            "kind": "track",
+            "model": storage.describe(self.model),
+            "tracker": storage.describe(self.tracker),
+            "labels": asdict(self.labels),
+            "keep": "cov" if "P" in _names(self._out) else "std",
+        }
+        arrays = {"y": self.y, "u": self.u, "known": self._known}
+        if self._time is not None:
+            arrays["time"] = self._time
+        arrays |= {f"out_{name}": self._written(name) for name in _names(self._out)}
+        arrays |= {f"state_{name}": self._tile[name][0, ..., self._lane] for name in storage.fields(self._tile)}
+        arrays |= {f"start_{name}": value for name, value in (self._start or {}).items()}
+        storage.write(path, header, arrays)
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read what `save` wrote."""
+        header, arrays = storage.read(path, "track")
+        model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
+        tile = fresh_tile(model, tracker)
+        state = {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
+        storage.restore(path, tracker, arrays, "state_", state)
+        out = np.empty(len(arrays["y"]), output_type(tile, tracker.outputs, header["keep"]))
+        storage.restore(path, tracker, arrays, "out_", {name: out[name][..., 0] for name in _names(out)})
+        start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
+        return cls(
+            model, tracker, arrays["y"], arrays["u"], arrays.get("time"), arrays["known"], out, tile,
+            labels=Labels(**header["labels"]), start=start or None,
+        )  # fmt: skip
+
+
+def _names(records: Array) -> tuple[str, ...]:
+    return records.dtype.names or ()
+
+
+def root_mean_square(values: Any) -> float:
+    """sqrt(mean(values^2)); NaN for none."""
+    values = np.asarray(values, dtype=float)
+    return float(np.sqrt(np.mean(values * values))) if values.size else float("nan")

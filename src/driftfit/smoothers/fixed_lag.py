@@ -1,0 +1,110 @@
+"""Fixed-lag smoothing: what a stream says of the last few samples, past and future together, in constant memory.
+
+A window holds the last ``lag`` + 1 samples; a filter of square-root information (`driftfit.trackers.information`) holds
+what all samples before the window say of theta. Smoothing the window from there is exact: row 0 equals the smoother of
+the whole record that ends now.
+
+Cost: one step of the filter a sample, O(n^3); one exact smoothing of the window, O(lag n^3), when it is asked for.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.smoothers import two_filters
+from driftfit.smoothers.walk import Walk
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.information import triangular_root
+
+SAMPLES = ("phi", "y", "weight", "drift")
+
+
+class FixedLag(NamedTuple):
+    """The samples of the window, oldest first."""
+
+    theta: Array
+    """(k, n), k = lag + 1 once that many samples have been seen."""
+    std: Array
+    """(k, n): inf for what has not been seen yet."""
+
+
+class Window:
+    """The last ``lag`` + 1 samples of a stream, and what is known from before them."""
+
+    def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
+        prior = tracker.random_walk(model)
+        n, r = model.n, 1.0 if prior.r is None else prior.r
+        p0 = None if prior.p0 is None else prior.p0 / r
+        self.walk = Walk(
+            np.zeros((lag + 1, n)), np.zeros(lag + 1), np.zeros(lag + 1), np.zeros(lag + 1),
+            prior.q / r, prior.theta0, p0, prior.r,
+        )  # fmt: skip
+        self.G = triangular_root(self.walk.q)
+        self.count = 0
+        self.drifts = not prior.at_first_sample and p0 is not None
+        self.before = two_filters.workspace(n, 2).copy()
+        self.before["G"] = self.G[:, :, None]
+        if p0 is not None:
+            rows, values, _ = two_filters.start(self.walk, np.ones(n), np.eye(n))
+            self._filter(0, rows, values)
+
+    def _filter(self, count: int, rows: Array, values: Array) -> None:
+        """Move what is known from before the window over its first ``count`` samples."""
+        walk, n = self.walk, len(self.G)
+        drift = np.sqrt(np.append(walk.drift[:count], 0.0))
+        filters, _ = two_filters.compiled()
+        scratch = np.zeros(1, two_filters.block_type(n))
+        self.before["S"][..., 1] = self.before["d"][..., 1] = 0.0
+        filters(
+            self.before, walk.phi[:count], walk.y[:count], np.sqrt(walk.weight[:count]), drift, rows, values, scratch
+        )
+
+    def push(self, tile: Array, known: tuple[float, float, float]) -> None:
+        """Take in the sample that the tile has just seen; ``known`` as the tile was given it."""
+        s, walk = tile[0], self.walk
+        if self.count == len(walk.y):
+            self._filter(1, np.zeros((0, len(self.G))), np.zeros(0))
+            for name in SAMPLES:
+                values = getattr(walk, name)
+                values[:-1] = values[1:]
+            self.count -= 1
+        k, dt = self.count, float(s["dt"][0])
+        _, noise, factor = known
+        walk.phi[k], walk.y[k] = s["phi"][:, 0], s["y"][0]
+        walk.weight[k] = s["ok"][0] / noise
+        walk.drift[k] = dt * factor if self.drifts else 0.0
+        self.drifts = self.drifts or dt > 0.0
+        self.count += 1
+
+    def smooth(self, tile: Array) -> FixedLag:
+        """Smooth the window; the tile says which directions have been seen, and the noise variance."""
+        n = len(self.G)
+        rows, values = self.before["S"][0, ..., 0], self.before["d"][0, :, 0]
+        hidden = np.zeros(n, bool)
+        rank = int(tile["rank"][0, 0])
+        if rank < n:
+            unseen = two_filters.unspanned(tile["V"][0, :rank, :, 0], np.ones(n))
+            hidden = two_filters.undetermined(unseen)
+            rows, values = np.vstack([rows, unseen]), np.append(values, unseen @ self.walk.theta0)
+        samples = {name: getattr(self.walk, name)[: self.count] for name in SAMPLES}
+        path, _ = two_filters.meeting(self.walk._replace(**samples), self.G, rows, values)
+        r = float(tile["scale"][0, 0]) if self.walk.r is None else self.walk.r
+        return FixedLag(path.theta, np.sqrt(r * np.where(hidden, np.inf, path.var)))
+
+    def plain(self) -> dict[str, Any]:
+        """The state as plain data."""
+        arrays = {name: getattr(self.walk, name) for name in SAMPLES}
+        arrays |= {name: self.before[name][0, ..., 0] for name in ("S", "d")}
+        return {"count": self.count, "drifts": self.drifts, **{name: array.tolist() for name, array in arrays.items()}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """The inverse of `plain`."""
+        self.count, self.drifts = state["count"], state["drifts"]
+        for name in SAMPLES:
+            getattr(self.walk, name)[...] = state[name]
+        for name in ("S", "d"):
+            self.before[name][0, ..., 0] = state[name]

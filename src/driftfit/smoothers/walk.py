@@ -1,0 +1,147 @@
+"""The problem that smoothers solve: a regression whose coefficients walk at random, as a run left it.
+
+    y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
+    theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r q drift_t)
+    theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
+
+The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
+once to collect them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.drivers import drivers, make_tile, output_type
+from driftfit.kernel import Array, State, kernel
+from driftfit.signals import as_numbers
+from driftfit.trackers.base import RandomWalk
+
+if TYPE_CHECKING:
+    from driftfit.result import Track
+
+COLLECTED = ("phi", "y", "dt", "valid")
+
+
+class Walk(NamedTuple):
+    """T samples of a regression on n parameters that walk at random; q and p0 are relative to the noise variance."""
+
+    phi: Array
+    """(T, n), finite."""
+    y: Array
+    """(T,), finite."""
+    weight: Array
+    """(T,): 0 for samples that are not used."""
+    drift: Array
+    """(T,): nominal intervals of drift before each sample."""
+    q: Array
+    """(n, n), drift covariance per nominal interval."""
+    theta0: Array
+    """(n,)"""
+    p0: Array | None
+    """(n, n), or None for the diffuse start."""
+    r: float | None
+    """Noise variance; None where it is to be estimated."""
+
+    @property
+    def used(self) -> int:
+        """Number of samples with a positive weight."""
+        return int(np.count_nonzero(self.weight))
+
+    def residual(self, theta: Array) -> Array:
+        """y - phi' theta, (T,)."""
+        residual: Array = self.y - np.einsum("ti,ti->t", self.phi, theta)
+        return residual
+
+    def pull(self, residual: Array) -> Array:
+        """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the force on each increment.
+
+        At the minimum of J its first row is zero (without a prior) and theta_{t+1} - theta_t = drift_{t+1} q pull.
+        """
+        weighted = self.phi * (self.weight * residual)[:, None]
+        forces: Array = np.cumsum(weighted[::-1], axis=0)[::-1]
+        return forces
+
+
+def constants(n: int) -> RandomWalk:
+    """Parameters that never change, of which nothing is known."""
+    return RandomWalk(np.zeros((n, n)), None, np.zeros(n), None, at_first_sample=True)
+
+
+class Path(NamedTuple):
+    """What a smoother found; covariances are relative to the noise variance."""
+
+    theta: Array
+    """(T, n)"""
+    var: Array
+    """(T, n): inf for parameters that the record does not determine."""
+    rho: Array
+    """(T,): NaN where there was no sample."""
+    c: Array
+    """(T,): sqrt(1 - leverage)."""
+    cost: float
+    """The least J."""
+    cov: Array
+    """(T, n, n), or empty."""
+    lag_cov: Array
+    """(T - 1, n, n), of theta_t and theta_{t+1}, or empty."""
+    method: str
+    """"fast" or "safe"."""
+    rank: Array = np.zeros(0, np.int64)
+    """(T,): rank of the regressors up to each sample."""
+
+
+@kernel
+def collect(o: State, s: State, l: int) -> None:
+    """Store what the tracker saw, after the model and the missing-data rule have spoken."""
+    for i in range(s.phi.shape[0]):
+        o.phi[i, l] = s.phi[i, l]
+    o.y[l] = s.y[l]
+    o.dt[l] = s.dt[l]
+    o.valid[l] = s.valid[l]
+
+
+def replay(run: Track) -> Array:
+    """Run the tracker over its record again and return what it saw, (T,) records of phi, y, dt, valid, ok and more."""
+    model, tracker = run.model, run.tracker
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
+    out = np.empty(len(run), output_type(tile, COLLECTED))
+    steps = tracker.steps_for(model)._replace(store=collect)
+    drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
+    return out
+
+
+def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
+    """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
+
+    ``prior`` replaces what the tracker takes theta to be.
+    """
+    prior = run.tracker.random_walk(run.model) if prior is None else prior
+    seen = replay(run)
+    dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
+    with np.errstate(divide="ignore"):
+        weight = np.where(ok, 1.0 / run._known[:, 1], 0.0)
+    drift = dt * run._known[:, 2]
+    if prior.at_first_sample or prior.p0 is None:
+        drift[: np.argmax(dt > 0.0) + 1] = 0.0
+    r = 1.0 if prior.r is None else prior.r
+    p0 = None if prior.p0 is None else prior.p0 / r
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
+    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r)
+
+
+def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
+    """(walk, order): the samples sorted by a state variable, one nominal step apart; equal values stay in time order.
+
+    A sample whose value is missing comes last and is not used.
+    """
+    value = as_numbers("order_by", by)
+    if value.shape != walk.y.shape:
+        raise ValueError(f"order_by has shape {value.shape}, but the record has {len(walk.y)} samples.")
+    order = np.argsort(value, kind="stable")
+    weight = np.where(np.isfinite(value), walk.weight, 0.0)
+    drift = np.ones(len(order))
+    drift[:1] = 0.0 if walk.p0 is None else 1.0
+    return walk._replace(phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift), order

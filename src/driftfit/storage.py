@@ -1,0 +1,142 @@
+"""Files of states and results: one .npz each, arrays and a header of plain JSON, no pickle.
+
+A file is written beside its place and moved there in one step, so it is complete or absent. Classes are named by module
+and class; loading imports that module, so load only files from people whose code you would run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from datetime import datetime, timedelta
+from importlib import import_module
+from os import PathLike
+from typing import Any, cast
+
+import numpy as np
+
+from driftfit.drivers import make_tile
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.settings import Settings
+from driftfit.trackers.base import Tracker
+
+FORMAT = 1
+
+
+def describe(settings: Settings) -> dict[str, Any]:
+    """A model or tracker as plain data."""
+    return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": settings.settings()}
+
+
+def rebuild(description: Mapping[str, Any], kind: type) -> Any:
+    """The inverse of `describe`; the class must be of the given kind."""
+    module, _, name = str(description["class"]).partition(":")
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError):
+        raise ValueError(
+            f"the file needs the class {name} of the module {module}, which cannot be imported here."
+        ) from None
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise ValueError(f"the file names {module}:{name} as its {kind.__name__.lower()}, which it is not.")
+    assert issubclass(found, Settings)
+    try:
+        return found.from_settings(dict(description["settings"]))
+    except TypeError as error:  # a setting that this version does not know
+        raise ValueError(f"the file was written by another version: {error}.") from None
+
+
+def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    """Write a header and arrays, all or nothing."""
+    target = os.path.abspath(os.fspath(path))
+    text = json.dumps({"format": FORMAT, **header}, default=_encode)
+    handle, name = tempfile.mkstemp(dir=os.path.dirname(target), prefix=".driftfit-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, target)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of a file that holds a ``kind`` ("state" or "track"); ValueError where it does not."""
+    with open(path, "rb") as handle:
+        try:
+            with np.load(handle, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
+        except Exception as error:  # damage has many faces: zipfile, NumPy and JSON raise a dozen kinds
+            raise ValueError(f"{os.fspath(path)} is not a driftfit file, or it is damaged ({error}).") from None
+    if header.get("format", 0) > FORMAT:
+        raise ValueError(
+            f"{os.fspath(path)} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
+        )
+    if header.get("kind") != kind:
+        raise ValueError(f"{os.fspath(path)} holds a {header.get('kind')}, not a {kind}.")
+    return header, arrays
+
+
+def _encode(value: Any) -> Any:
+    """What JSON does not know: times and intervals."""
+    if isinstance(value, datetime):
+        return {"datetime": value.isoformat()}
+    if isinstance(value, timedelta):
+        return {"seconds": value.total_seconds()}
+    if isinstance(value, np.datetime64 | np.timedelta64):
+        return {"numpy": [value.dtype.str, int(value.astype(np.int64))]}
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"cannot write {value!r}, a {type(value).__name__}, as plain data")
+
+
+def _decode(value: dict[str, Any]) -> Any:
+    if value.keys() == {"datetime"}:
+        return datetime.fromisoformat(value["datetime"])
+    if value.keys() == {"seconds"}:
+        return timedelta(seconds=value["seconds"])
+    if value.keys() == {"numpy"}:
+        kind, count = value["numpy"]
+        return np.array([count], dtype=np.int64).view(kind)[0]
+    return value
+
+
+def save_state(
+    path: str | PathLike[str], model: Model, tracker: Tracker, tile: Array, extra: Mapping[str, Any]
+) -> None:
+    """Write the state of one stream."""
+    header = {"kind": "state", "model": describe(model), "tracker": describe(tracker), "extra": dict(extra)}
+    write(path, header, {f"state_{name}": tile[name][0, ..., 0] for name in fields(tile)})
+
+
+def load_state(path: str | PathLike[str]) -> tuple[Model, Tracker, Array, dict[str, Any]]:
+    """Read what `save_state` wrote."""
+    header, arrays = read(path, "state")
+    model, tracker = rebuild(header["model"], Model), rebuild(header["tracker"], Tracker)
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
+    restore(path, tracker, arrays, "state_", {name: tile[name][0, ..., 0] for name in fields(tile)})
+    return model, tracker, tile, header["extra"]
+
+
+def restore(
+    path: str | PathLike[str], tracker: Tracker, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
+) -> None:
+    """Write stored arrays into the fields of a record; ValueError where one is missing or of another shape."""
+    for name, field in into.items():
+        stored = arrays.get(prefix + name)
+        if stored is None or stored.shape != field.shape:
+            raise ValueError(
+                f"{os.fspath(path)} does not fit {type(tracker).__name__} in this version: field {name!r}."
+            )
+        field[...] = stored
+
+
+def fields(tile: Array) -> list[str]:
+    """Names of the fields that hold state."""
+    return [name for name in tile.dtype.names or () if name != "pad"]

@@ -1,0 +1,226 @@
+"""Record mode: a whole series in one call, causal at every sample."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, cast, overload
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from driftfit.drivers import drivers, output_type
+from driftfit.fleet import Fleet, run_fleet
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.records import Records, one_series, rows
+from driftfit.result import Track
+from driftfit.settings import one_of
+from driftfit.signals import check_ready
+from driftfit.trackers.base import Tracker
+from driftfit.warm import Run, carried, first_interval, fresh_tile
+
+Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
+"""One tracker for all, or one per setting of a grid or per series."""
+
+CHUNK = 1_000_000
+"""Samples between two looks at the progress bar."""
+
+
+@overload
+def track(
+    model: Model,
+    tracker: Tracker,
+    y: Any,
+    u: Any = None,
+    *,
+    data: Any = None,
+    time: Any = None,
+    by: None = None,
+    dt: Any = None,
+    weights: Any = 1.0,
+    drift: Any = 1.0,
+    units: Mapping[str, str] | None = None,
+    keep: str = "std",
+    warm_start: Run | None = None,
+) -> Track: ...
+
+
+@overload
+def track(
+    model: Model,
+    tracker: Trackers,
+    y: Any,
+    u: Any = None,
+    *,
+    data: Any = None,
+    time: Any = None,
+    by: str | Sequence[str] | None = None,
+    dt: Any = None,
+    weights: Any = 1.0,
+    drift: Any = 1.0,
+    units: Mapping[str, str] | None = None,
+    keep: str = "std",
+    warm_start: Fleet | None = None,
+) -> Fleet: ...
+
+
+def track(
+    model: Model,
+    tracker: Trackers,
+    y: Any,
+    u: Any = None,
+    *,
+    data: Any = None,
+    time: Any = None,
+    by: str | Sequence[str] | None = None,
+    dt: Any = None,
+    weights: Any = 1.0,
+    drift: Any = 1.0,
+    units: Mapping[str, str] | None = None,
+    keep: str = "std",
+    warm_start: Any = None,
+) -> Track | Fleet:
+    """Follow the parameters of a model through a record, or through many.
+
+    What is reported at sample t is what `Live` would have said at t: nothing looks ahead.
+
+    Parameters
+    ----------
+    model : Model
+        How signals become a regression, such as ``ARX(2, 2)`` or ``Regression(3)``.
+    tracker : Tracker, or a list or mapping of them
+        How theta is followed, such as ``Kalman(q=1e-4, r=0.1)``. Without ``by`` several trackers are a grid of settings
+        over the one record; with it they are the settings of each series, in order or by key.
+    y : (T,), with by="row" (units, T), or the name of a column of ``data``
+        Output. NaN, inf and None are missing.
+    u : (T,), (T, m) or None, with by="row" (units, T) or (units, T, m), or names of columns
+        Inputs.
+    data : table, path, pattern or list of paths
+        A table that narwhals reads (pandas, polars, pyarrow), or CSV and Parquet files such as ``"runs/*.parquet"``.
+        y, u, time, by, weights and drift are then names of its columns.
+    time : (T,) numbers or datetimes, increasing, or the name of a column
+        When the samples were taken. Drift scales with the interval, and a gap above 1.5 ``dt`` breaks the lags. Rows
+        of a table are put in order; of rows at the same time the first stands.
+    by : names of columns, "row" or None
+        What tells the series of a table apart ("file": the file a row comes from). "row": every row of the array y is
+        a series of its own.
+    dt : number or timedelta
+        Nominal interval in the unit of ``time``: 1 by default, required for datetimes.
+    weights : number or (T,)
+        The noise variance of a sample is r / weight; 0 marks a sample that is not to be used.
+    drift : number or (T,)
+        Known factors of the drift before each sample, such as 100 where a set-point was changed.
+    units : mapping from names of columns to their units, such as {"flow": "l/min"}
+        Carried to summary, plots and exports.
+    keep : "std" or "cov"
+        "cov" also stores the covariance of every sample, n * n numbers each.
+    warm_start : Track, Live, Fleet or None
+        Begin where that run ended, a fleet series by series (those that it does not have begin afresh).
+
+    Returns
+    -------
+    Track, or a Fleet (from key to Track) for several series or several trackers. A model with several outputs (``ny``)
+    takes y (T, ny) and gives `driftfit.outputs.Outputs`, or `driftfit.outputs.Shared` where they share one theta.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, times of arrays that do not increase, settings that are incomplete; columns that are not
+        there, cells that are not numbers, files that cannot be read. Missing and non-finite data never raise.
+    """
+    if len(model.outputs) > 1:
+        other = (data, by, units, warm_start)
+        return cast("Track", _several_outputs(model, tracker, y, u, time, dt, weights, drift, keep, other))
+    one_of("track", "keep", keep, ("std", "cov"))
+    records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
+    bound = model.bind(records.labels.u or records.u.shape[1])
+    if by is None and isinstance(tracker, Tracker):
+        return _one(bound, _checked(tracker, keep), records, keep, warm_start, dt)
+    if by is None and not isinstance(tracker, Tracker):
+        names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
+        records = records.repeated(names)
+    trackers = _per_series(tracker, records.keys)
+    for one in set(trackers):
+        _checked(one, keep)
+    return run_fleet(bound, trackers, records, keep, failed, warm_start, dt)
+
+
+def _several_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any, keep: str, other: Any
+) -> Any:
+    """A record with several outputs, of one tracker."""
+    from driftfit.outputs import track_outputs
+
+    if any(value is not None for value in other) or not isinstance(tracker, Tracker):
+        raise ValueError(
+            "track: several outputs are followed by one tracker on arrays, y (T, ny); data=, by=, units= and "
+            "warm_start= are for single outputs."
+        )
+    return track_outputs(model, tracker, y, u, time, dt, weights, drift, keep)
+
+
+def _records(
+    y: Any, u: Any, data: Any, time: Any, by: Any, dt: Any, weights: Any, drift: Any, units: Any
+) -> tuple[Records, dict[Hashable, str]]:
+    """What is to be run, and the reasons of what cannot be."""
+    if data is not None:
+        from driftfit.tables import read_records  # narwhals and polars take as long to import as all the rest
+
+        return read_records(data, y, u, time, by, dt, weights, drift, units)
+    if by not in (None, "row"):
+        raise ValueError(
+            f"track: by={by!r} names a column of a table, so data= is needed; rows of arrays are by='row'."
+        )
+    if units is not None:
+        raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
+    return (rows if by == "row" else one_series)(y, u, time, dt, weights, drift), {}
+
+
+def _checked(tracker: Tracker, keep: str) -> Tracker:
+    """The tracker, if its settings are complete and it has what is to be kept."""
+    if keep == "cov" and not tracker.covariance:
+        raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
+    return check_ready(tracker)
+
+
+def _per_series(tracker: Trackers, keys: Sequence[Hashable]) -> list[Tracker]:
+    """The tracker of each series."""
+    if isinstance(tracker, Tracker):
+        return [tracker] * len(keys)
+    if isinstance(tracker, Mapping):
+        absent = [key for key in keys if key not in tracker]
+        if absent:
+            raise ValueError(f"track: the settings lack {len(absent)} of {len(keys)} series, such as {absent[0]!r}.")
+        return [tracker[key] for key in keys]
+    if len(tracker) != len(keys):
+        raise ValueError(f"track: {len(tracker)} trackers were given for {len(keys)} series.")
+    return list(tracker)
+
+
+def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Run | None, dt: Any) -> Track:
+    """Run the only series of ``records``."""
+    y, u, time, known = records.part(0)
+    start = None
+    if before is not None:
+        start = carried(before, model, tracker)
+        known = known.copy()
+        known[0, 0] *= first_interval(before, None if time is None else time[0], dt)
+    tile = fresh_tile(model, tracker, start)
+    out = drive(model, tracker, tile, y, u, known, keep)
+    return Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)
+
+
+def drive(model: Model, tracker: Tracker, tile: Array, y: Array, u: Array, known: Array, keep: str = "std") -> Array:
+    """Run a tile of one lane over a record and return what the driver wrote, (T,) records of `output_type`."""
+    T = len(y)
+    out = np.empty(T, output_type(tile, tracker.outputs, keep))
+    run = drivers(model.steps, tracker.steps_for(model), keep).run
+    with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
+        task = progress.add_task("tracking", total=T)
+        for a in range(0, T, CHUNK):
+            b = min(a + CHUNK, T)
+            factors = known if len(known) == 1 else known[a:b]
+            run(tile, y[a:b, None], u[a:b, :, None], factors[:, :, None], out[a:b])
+            progress.advance(task, b - a)
+    return out

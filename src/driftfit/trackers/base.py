@@ -1,0 +1,108 @@
+"""What every tracker offers: settings, a state, and two compiled steps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from driftfit.drivers import TrackerSteps
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.settings import Settings
+
+
+class RandomWalk(NamedTuple):
+    """What a tracker takes theta to be: theta_t = theta_{t-1} + w_t, w_t ~ N(0, q), seen in noise of variance r."""
+
+    q: Array
+    """(n, n), drift covariance per nominal sample."""
+    r: float | None
+    """Noise variance; None where it is estimated, and q and p0 are in units of it."""
+    theta0: Array
+    """(n,)"""
+    p0: Array | None
+    """(n, n), or None where nothing is known before the first sample."""
+    at_first_sample: bool = False
+    """Whether the prior holds at the first sample, with no drift before it."""
+
+
+class Tracker(Settings, ABC):
+    """How theta is followed. A subclass is a frozen dataclass whose fields are the settings.
+
+    ``covariance`` says whether the tracker carries one; without it, standard deviations are NaN. ``required`` names
+    settings that have no default: they may be left None only for `tune` to fill. ``width`` is how many series share a
+    tile in a fleet; a tracker that vectorises over something of its own wants 1. ``outputs`` names fields of the record
+    that are stored for every sample beside the common ones, by ``steps.store``.
+
+    Most trackers need only the number of parameters. One that works on the inside of a model (an extended Kalman filter
+    on its minimal parameters, a bank that cleans lags) overrides `state_for`, `steps_for` and, where its theta is not
+    the model's, `names_for`.
+    """
+
+    covariance: ClassVar[bool] = True
+    required: ClassVar[tuple[str, ...]] = ()
+    width: ClassVar[int] = 32
+    outputs: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def state(self, n: int) -> Mapping[str, Any]:
+        """Fields of the record, with their values before the first sample, for n parameters; at least ``theta``."""
+
+    @property
+    @abstractmethod
+    def steps(self) -> TrackerSteps:
+        """The compiled steps."""
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        """The state for a bound model."""
+        return self.state(model.n)
+
+    def steps_for(self, model: Model) -> TrackerSteps:
+        """The steps for a bound model."""
+        return self.steps
+
+    def names_for(self, model: Model) -> tuple[str, ...]:
+        """Names of the entries of theta."""
+        return model.names
+
+    def random_walk(self, model: Model) -> RandomWalk:
+        """The random walk in Gaussian noise behind this tracker, which smoothers solve exactly."""
+        raise ValueError(
+            f"{type(self).__name__} does not describe a random walk in Gaussian noise, so there is nothing to smooth; "
+            "track with FLS or Kalman."
+        )
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        """Add variances p (n,), in squared units of theta, to the covariance in the fields of one lane.
+
+        Raises
+        ------
+        ValueError
+            If the tracker carries no covariance that could be widened.
+        """
+        P, n = lane.get("P"), len(p)
+        if not self.covariance or P is None or P.shape != (n, n):
+            raise ValueError(
+                f"{type(self).__name__} carries no covariance that can be widened; "
+                "say where the parameters stand now, with theta=."
+            )
+        scale = float(lane["scale"])
+        np.einsum("ii->i", P)[:] += p / scale if scale > 0.0 else p
+        lane["var"][:] += p
+
+    def cov(self, lane: Mapping[str, Array]) -> Array:
+        """Covariance (n, n) of theta from the fields of one lane; inf on the diagonal where nothing is known."""
+        n = len(lane["theta"])
+        if not self.covariance:
+            return np.full((n, n), np.nan)
+        lower = np.tril(lane["P"]) * lane["scale"]
+        full: Array = lower + np.tril(lower, -1).T
+        np.fill_diagonal(full, lane["var"])
+        return full
+
+    def learning(self, lane: Mapping[str, Array]) -> Array:
+        """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""
+        raise ValueError(f"learning: {type(self).__name__} keeps no windowed information; AdaptiveKalman does.")

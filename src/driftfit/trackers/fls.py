@@ -1,0 +1,132 @@
+"""Flexible least squares, on line: the exact filter.
+
+At every t it gives the last point of the path that minimises
+
+    J = sum_k w_k (y_k - phi_k' theta_k)^2 + sum_k (theta_{k+1} - theta_k)' D_k (theta_{k+1} - theta_k) + prior
+    D_k = diag(mu) / (dt_{k+1} d_{k+1}),   k <= t
+
+with w the weight of a sample, dt the interval since the last one and d a known factor of the drift, 1 unless given.
+
+    predict   P <- P + D^-1                                          (not before the first sample)
+    correct   e = y - phi' theta;  s = phi' P phi + 1 / w;  K = P phi / s
+              theta <- theta + K e;  P <- P - K (P phi)'
+    scale     r = sum(e^2 / s) / count, which is J / (N - rank) after a diffuse start
+
+So it is the Kalman filter with q = 1 / mu, r = 1 and an estimated scale: mu = r / q is a ratio of variances, and is not
+free of scale ((c phi, c y, c^2 mu) gives the same path). mu = inf keeps a parameter constant.
+
+Use it when one number for "how smooth" is all that is wanted; `tune` finds it. `Kalman` takes q and r as numbers,
+`AugmentedFLS` is cheaper and carries no covariance. `run.smooth()` gives the whole path that minimises J.
+
+Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
+this is in covariance form. Departures: an exact diffuse start (`driftfit.trackers.diffuse`), which needs no penalty on
+the first point and no large matrix; the minimum-norm answer about theta0 until the regressors span. Cost: O(n^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from driftfit.drivers import TrackerSteps, diagonal
+from driftfit.kernel import State, kernel
+from driftfit.models.base import Model
+from driftfit.settings import covariance, matrix, numbers, plain, vector
+from driftfit.trackers.base import RandomWalk, Tracker
+from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.rls import correct, learn_scale
+
+
+@kernel
+def drift(s: State, l: int) -> None:
+    """Between samples only: the prior stands at the first one."""
+    time = s.dt[l] * s.drift[l] * s.begun[l]
+    for i in range(s.theta.shape[0]):
+        s.P[i, i, l] += s.q[i, l] * time
+    s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
+
+
+@kernel
+def begin(s: State, l: int) -> None:
+    drift(s, l)
+    enter(s, l)
+    if s.s[l] < np.inf:
+        learn_scale(s, l)
+    spanned_variance(s, l)
+
+
+def price(mu: Any) -> Any:
+    """Check mu: positive, inf allowed, one number or one per parameter."""
+    try:
+        array = np.asarray(mu, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"FLS: mu must be numeric; got {mu!r}.") from None
+    if array.ndim > 1 or not (array > 0.0).all():
+        raise ValueError(
+            f"FLS: mu must be positive, one number or one per parameter (inf keeps a parameter constant); got {mu!r}."
+        )
+    return plain(array)
+
+
+@dataclass(frozen=True)
+class FLS(Tracker):
+    """Flexible least squares (exact filter).
+
+    Parameters
+    ----------
+    mu : number or (n,)
+        Price of a squared change of theta per nominal sample against a squared residual; positive, in units of
+        phi' phi. inf keeps a parameter constant.
+    theta0 : number or (n,)
+        Mean of theta at the first sample; without p0 it stands only in directions that the regressors never span.
+    p0 : number, (n,), (n, n), or None
+        Covariance of theta at the first sample, in units of the noise variance. None: nothing is known.
+
+    Raises
+    ------
+    ValueError
+        If mu is not positive or p0 is not a covariance.
+    """
+
+    mu: Any = None
+    theta0: Any = 0.0
+    p0: Any = None
+
+    required: ClassVar[tuple[str, ...]] = ("mu",)
+
+    def __post_init__(self) -> None:
+        if self.mu is not None:
+            self._set("mu", price(self.mu))
+        self._set("theta0", numbers("FLS", "theta0", self.theta0))
+        if self.p0 is not None:
+            self._set("p0", covariance("FLS", "p0", self.p0))
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        return {
+            "theta": vector("FLS", "theta0", self.theta0, n),
+            "P": np.zeros((n, n)) if self.p0 is None else matrix("FLS", "p0", self.p0, n),
+            "q": 1.0 / vector("FLS", "mu", self.mu, n),
+            "r": 1.0,
+            "g": np.zeros(n),
+            "begun": 0.0,
+            "squares": 0.0,
+            "count": 0.0,
+            "scale": np.nan,
+            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+        }
+
+    @property
+    def steps(self) -> TrackerSteps:
+        return STEPS
+
+    def random_walk(self, model: Model) -> RandomWalk:
+        n = model.n
+        p0 = None if self.p0 is None else matrix("FLS", "p0", self.p0, n)
+        q = np.diag(1.0 / vector("FLS", "mu", self.mu, n))
+        return RandomWalk(q, None, vector("FLS", "theta0", self.theta0, n), p0, at_first_sample=True)
+
+
+STEPS = TrackerSteps(drift, correct, diagonal, begin)

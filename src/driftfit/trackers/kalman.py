@@ -1,0 +1,140 @@
+"""The Kalman filter of a random walk.
+
+    theta_t = theta_{t-1} + w_t,  w ~ N(0, q);    y_t = phi_t' theta_t + v_t,  v ~ N(0, r)
+
+    predict   P <- P + q dt d
+    correct   e = y - phi' theta;  s = phi' P phi + r / w;  K = P phi / s
+              theta <- theta + K e;  P <- P - K (P phi)'
+
+with w the weight of the sample and d a known factor of the drift, both 1 unless given.
+
+Use it when the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` carries no
+covariance. Without excitation P grows by exactly q per sample: finite and honest.
+
+form="sqrt" keeps the square root of the information instead (`driftfit.trackers.square_root`): the same numbers for
+ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r, at O(n^3).
+
+Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
+Departures: one triangle of P is kept; an exact diffuse start (`driftfit.trackers.diffuse`). Cost per sample: O(n^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from driftfit.drivers import TrackerSteps, diagonal
+from driftfit.kernel import State, kernel
+from driftfit.models.base import Model
+from driftfit.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.trackers import square_root
+from driftfit.trackers.base import RandomWalk, Tracker
+from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
+
+
+@kernel
+def drift(s: State, l: int) -> None:
+    time = s.dt[l] * s.drift[l]
+    for i in range(s.theta.shape[0]):
+        s.P[i, i, l] += s.q[i, l] * time
+
+
+@kernel
+def drift_matrix(s: State, l: int) -> None:
+    time = s.dt[l] * s.drift[l]
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] += s.q[i, j, l] * time
+
+
+def _steps(predict: Any) -> TrackerSteps:
+    @kernel
+    def begin(s: State, l: int) -> None:
+        predict(s, l)
+        enter(s, l)
+        spanned_variance(s, l)
+
+    return TrackerSteps(predict, measurement, diagonal, begin)
+
+
+INDEPENDENT, TOGETHER = _steps(drift), _steps(drift_matrix)
+SQUARE_ROOT, SQUARE_ROOT_TOGETHER = square_root.steps(drift), square_root.steps(drift_matrix)
+
+
+@dataclass(frozen=True)
+class Kalman(Tracker):
+    """Random-walk Kalman filter.
+
+    Parameters
+    ----------
+    q : number, (n,), or (n, n)
+        Drift covariance per nominal sample, in squared units of theta. 0 keeps a parameter constant; a number is that
+        number times the identity.
+    r : number
+        Noise variance, in squared units of y; positive.
+    p0 : number, (n,), (n, n), or None
+        Covariance of theta before the first sample. None: nothing is known (exact diffuse start).
+    theta0 : number or (n,)
+        Mean of theta before the first sample.
+    form : "covariance" or "sqrt"
+        "sqrt" for collinear or badly scaled regressors: variances are positive by construction.
+
+    Raises
+    ------
+    ValueError
+        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), or r is not positive.
+    """
+
+    q: Any = None
+    r: float | None = None
+    p0: Any = None
+    theta0: Any = 0.0
+    form: str = "covariance"
+
+    required: ClassVar[tuple[str, ...]] = ("q", "r")
+
+    def __post_init__(self) -> None:
+        if self.q is not None:
+            self._set("q", covariance("Kalman", "q", self.q))
+        if self.r is not None:
+            self._set("r", numbers("Kalman", "r", self.r, ndim=0, low=0.0, strict=True))
+        if self.p0 is not None:
+            self._set("p0", covariance("Kalman", "p0", self.p0))
+        self._set("theta0", numbers("Kalman", "theta0", self.theta0))
+        if one_of("Kalman", "form", self.form, ("covariance", "sqrt")) == "sqrt" and self.p0 is not None:
+            p0 = np.asarray(self.p0)
+            if not (np.linalg.eigvalsh(p0) if p0.ndim == 2 else p0).min() > 0.0:
+                raise ValueError(
+                    f'Kalman: with form="sqrt" p0 must be positive definite; got {self.p0!r}. Known parameters need '
+                    'form="covariance".'
+                )
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        together = np.ndim(self.q) == 2
+        return {
+            "theta": vector("Kalman", "theta0", self.theta0, n),
+            "P": np.zeros((n, n)) if self.p0 is None else matrix("Kalman", "p0", self.p0, n),
+            "q": matrix("Kalman", "q", self.q, n) if together else vector("Kalman", "q", self.q, n),
+            "r": self.r,
+            "g": np.zeros(n),
+            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **(self._root(n) if self.form == "sqrt" else {}),
+        }
+
+    def _root(self, n: int) -> Mapping[str, Any]:
+        p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
+        return square_root.state(matrix("Kalman", "q", self.q, n), vector("Kalman", "theta0", self.theta0, n), p0)
+
+    @property
+    def steps(self) -> TrackerSteps:
+        if self.form == "sqrt":
+            return SQUARE_ROOT_TOGETHER if np.ndim(self.q) == 2 else SQUARE_ROOT
+        return TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
+
+    def random_walk(self, model: Model) -> RandomWalk:
+        n = model.n
+        p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
+        return RandomWalk(matrix("Kalman", "q", self.q, n), self.r, vector("Kalman", "theta0", self.theta0, n), p0)

@@ -1,0 +1,102 @@
+"""The Kalman filter of a random walk on square roots of information: positive by construction.
+
+    predict   theta <- theta + G w sqrt(dt d), G G' = q           spread
+    correct   (phi' theta = y) / sqrt(r / w)                      absorb;  theta = S^-1 d,  P = S^-1 S^-T
+              s = |S^-T phi|^2 + r / w,  e = y - phi' theta       with S before the sample
+
+Use it through ``Kalman(form="sqrt")``. Until the regressors span, theta and P are those of the diffuse start in
+covariance form, whose rank decides; what they leave is not used afterwards. The rotations are in
+`driftfit.trackers.information`.
+
+Source: Bierman (1977), chapter 6. Cost per sample: O(n^3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+
+from driftfit.drivers import TrackerSteps, diagonal
+from driftfit.kernel import Array, State, kernel
+from driftfit.trackers.diffuse import enter, prediction, spanned_variance
+from driftfit.trackers.information import absorb, invert, solve, spread, triangular_root
+
+
+def state(q: Array, theta0: Array, p0: Array | None) -> Mapping[str, Any]:
+    """Fields beside those of the covariance form."""
+    n = len(theta0)
+    S = np.zeros((n, n)) if p0 is None else linalg.solve_triangular(triangular_root(p0), np.eye(n))
+    return {
+        "S": S, "d": S @ theta0, "R": np.zeros((n, n)), "G": triangular_root(q),
+        "row": np.zeros(n), "pivot": np.zeros(n), "x": np.zeros(n),
+    }  # fmt: skip
+
+
+@kernel
+def grow(s: State, l: int) -> None:
+    spread(s.S, s.d, s.G, np.sqrt(s.dt[l] * s.drift[l]), s.pivot, l)
+
+
+@kernel
+def take_in(s: State, l: int) -> None:
+    """Absorb the sample, if there is one."""
+    root = np.sqrt(s.ok[l] / (s.r[l] * s.noise[l]))
+    for i in range(s.theta.shape[0]):
+        s.row[i, l] = root * s.phi[i, l]
+    absorb(s.S, s.d, s.row, root * s.y[l], l)
+
+
+@kernel
+def read_out(s: State, l: int) -> None:
+    """theta and the lower triangle of P."""
+    n = s.theta.shape[0]
+    solve(s.S, s.d, s.theta, l)
+    invert(s.S, s.R, l)
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += s.R[i, k, l] * s.R[j, k, l]
+            s.P[i, j, l] = total
+
+
+@kernel
+def innovation_variance(s: State, l: int) -> float:
+    """|S^-T phi|^2."""
+    total = 0.0
+    for i in range(s.theta.shape[0]):
+        t = s.phi[i, l]
+        for j in range(i):
+            t -= s.S[j, i, l] * s.x[j, l]
+        s.x[i, l] = t / s.S[i, i, l]
+        total += s.x[i, l] * s.x[i, l]
+    return total
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    s.y_hat[l] = prediction(s, l)
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.s[l] = innovation_variance(s, l) + s.r[l] * s.noise[l]
+    take_in(s, l)
+    read_out(s, l)
+
+
+def steps(drift: Any) -> TrackerSteps:
+    """The steps, with what the covariance form does in time, which the diffuse start still needs."""
+
+    @kernel
+    def begin(s: State, l: int) -> None:
+        drift(s, l)
+        grow(s, l)
+        enter(s, l)
+        spanned_variance(s, l)
+        take_in(s, l)
+        if s.rank[l] == s.theta.shape[0]:
+            read_out(s, l)
+            diagonal(s, l)
+
+    return TrackerSteps(grow, correct, diagonal, begin)

@@ -1,0 +1,70 @@
+"""What tuning minimises: minus the log-likelihood, or the logarithm of a mean square of errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import make_tile
+from driftfit.kernel import Array
+from driftfit.models.regression import Regression
+from driftfit.result import Track
+from driftfit.smoothers.walk import ordered, walk_of
+from driftfit.track import drive
+from driftfit.trackers.base import Tracker
+from driftfit.tuning.knobs import Knobs, constant
+from driftfit.tuning.lanes import Record, score
+
+
+def along(record: Record, tracker: Tracker, order_by: Any) -> Record:
+    """The record as a regression whose samples are sorted by a variable."""
+    model = record.model
+    walk, _ = ordered(walk_of(run_record(record, constant(record, tracker))), order_by)
+    known = np.ones((len(walk.y), 3))
+    with np.errstate(divide="ignore"):
+        known[:, 1] = 1.0 / walk.weight
+    return Record(Regression(model.names), walk.y, walk.phi, known)
+
+
+def objective(record: Record, knobs: Knobs, method: str, h: int) -> Callable[[Array], Array]:
+    """Points (S, p) to values (S,), to be minimised: minus the log-likelihood, or the log of a mean square.
+
+    In logarithms the unit of y is an offset, so that the tolerances of the search do not depend on it.
+    """
+
+    def value(points: Array) -> Array:
+        trackers = [knobs.run(x) for x in points]
+        if method == "ml":
+            return -score(record, trackers).loglik(knobs.profiled)
+        if method == "h-step":
+            squares = score(record, trackers, h).h_step
+        else:
+            squares = np.array([_smoothed_score(record, tracker, method) for tracker in trackers])
+        tiny = np.finfo(float).tiny  # a perfect fit is the best there is, and has a logarithm
+        return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
+
+    return value
+
+
+def run_record(record: Record, tracker: Tracker) -> Track:
+    """Track a checked record."""
+    model, y, u, known = record
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
+    out = drive(model, tracker, tile, y, u, known)
+    return Track(model, tracker, y, u, None, known, out, tile)
+
+
+def _smoothed_score(record: Record, tracker: Tracker, method: str) -> float:
+    """Mean square of the leave-one-out residuals of the smoothed path, or its rotation-invariant relative."""
+    path = run_record(record, tracker).smooth()
+    weight = path.walk.weight
+    used = weight > 0.0
+    if method == "loo":
+        terms = weight * path.loo**2
+        value = float(np.mean(terms[np.isfinite(terms)])) if np.isfinite(terms).any() else np.inf
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = float(path.measurement_cost / used.sum() / np.mean(1.0 - path.leverage[used]) ** 2)
+    return value if np.isfinite(value) else np.inf

@@ -1,0 +1,126 @@
+"""Bad data never raise and never poison a state: what is NaN, inf, absurdly large or away is skipped, nothing more."""
+
+import numpy as np
+import pytest
+from contract_table import ready
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from support import BAD, arx_record, damaged, same
+
+from driftfit import Live, Regression, track
+from driftfit.trackers import found
+
+T = 3000
+
+
+@pytest.mark.parametrize("value", [*BAD, 1e100, None])
+@pytest.mark.parametrize("signal", ["y", "u"])
+def test_one_bad_value_is_skipped_and_forgotten(model, tracker, signal, value):
+    y, u = arx_record(T, 1)
+    clean = track(model, tracker, y, u)
+    record = {"y": y.astype(object), "u": u.astype(object)}
+    record[signal][100] = value
+    run = track(model, tracker, **record)
+    assert np.isfinite(run.theta).all()
+    needed = [100] if signal == "y" else [101, 102]  # nk = 1, nb = 2: the input of sample 100 is in phi of the next two
+    assert np.flatnonzero(~run.ok[50:]).tolist() == [i - 50 for i in needed]
+    assert np.isnan(run.innovation[needed]).all()
+    np.testing.assert_allclose(run.theta[-1], clean.theta[-1], atol=0.02)
+    record[signal][100] = np.nan
+    assert same(run.theta, track(model, tracker, **record).theta)
+
+
+@pytest.mark.parametrize("signals", ["y", "u", "yu"])
+def test_an_outage_is_survived(model, tracker, signals):
+    y, u = arx_record(T, 2)
+    clean = track(model, tracker, y, u)
+    record = {"y": y.copy(), "u": u.copy()}
+    for signal in signals:
+        record[signal][500:900] = np.nan
+    run = track(model, tracker, **record)
+    assert np.isfinite(run.theta).all()
+    assert not run.ok[503:900].any()
+    assert run.ok[903:].all()
+    assert same(run.theta[510:900], np.repeat(run.theta[510:511], 390, axis=0))
+    np.testing.assert_allclose(run.theta[-1], clean.theta[-1], atol=0.02)
+
+
+def test_an_outage_widens_the_band_and_never_narrows_it(model, tracker):
+    y, u = arx_record(600, 3)
+    y[300:500] = np.nan
+    std = track(model, tracker, y, u).std
+    if tracker.covariance:
+        assert (np.diff(std[303:500], axis=0) >= 0.0).all()
+    else:
+        assert np.isnan(std).all()
+
+
+def test_filling_ends_after_na_outputs(model, tracker):
+    """Filled lags carry the prediction for na outputs; then nothing is predicted until real lags are back."""
+    y, u = arx_record(600, 4)
+    y[300:350] = np.nan
+    run = track(model, tracker, y, u)
+    assert np.flatnonzero(np.isnan(run.prediction[200:])).tolist() == list(range(103, 152))
+    assert np.flatnonzero(~run.ok[200:]).tolist() == list(range(100, 152))
+
+
+def test_a_record_without_any_data_leaves_the_start(model, tracker):
+    run = track(model, tracker, np.full(50, np.nan), np.full(50, np.nan))
+    assert not run.ok.any()
+    assert same(run.theta, np.broadcast_to(tracker.state_for(model)["theta"], run.theta.shape))
+    assert run.summary().comparison.samples == 0
+
+
+def test_a_sample_of_weight_0_is_not_used(model, tracker):
+    y, u = arx_record(300, 5)
+    weights = np.ones(300)
+    weights[[100, 101, 200]] = 0.0
+    run = track(model, tracker, y, u, weights=weights)
+    assert np.flatnonzero(~run.ok[2:]).tolist() == [98, 99, 198]
+    assert same(run.theta[101], run.theta[99])
+    y2 = y.copy()
+    y2[100] += 5.0  # its value still stands in the lags, so only its own sample may ignore it
+    other = track(model, tracker, y2, u, weights=weights)
+    assert same(other.theta[:101], run.theta[:101])
+    assert not same(other.theta[102:], run.theta[102:])
+
+
+def test_a_regressor_that_wakes_up_late(tracker):
+    """Silence before every direction was seen: exponential forgetting must not run away meanwhile."""
+    rng = np.random.default_rng(6)
+    u = np.zeros((20_000, 2))
+    u[:3, 0] = 1.0, 2.0, 1.0
+    u[-200:] = rng.standard_normal((200, 2))
+    y = u @ [1.0, 2.0] + 0.01 * rng.standard_normal(len(u))
+    run = track(Regression(2), tracker, y, u)
+    assert np.isfinite(run.theta).all()
+    np.testing.assert_allclose(run.theta[-1], [1.0, 2.0], atol=0.05)
+
+
+# Numbers whose squares span less than double precision: beyond that a covariance needs its square-root form.
+ANYTHING = st.one_of(
+    st.sampled_from([*BAD, 0.0, -999.0, 5e-324, 1e-200]), st.floats(0.01, 1000.0), st.floats(-1000.0, -0.01)
+)
+
+
+@pytest.mark.parametrize("kind", list(found().values()), ids=list(found()))
+@given(samples=st.lists(st.tuples(ANYTHING, ANYTHING), min_size=1, max_size=25))
+@example(samples=[(1.0, 1e-170)])
+@settings(max_examples=150)
+def test_no_sequence_of_numbers_poisons_a_stream(kind, samples):
+    live = Live(Regression(1), ready(kind))
+    for y, u in samples:
+        live.update(y, u)
+        assert np.isfinite(live.theta).all(), live.theta
+        assert not (np.diag(live.cov) < 0.0).any()
+    rng = np.random.default_rng(0)
+    for u in rng.standard_normal(50):
+        live.update(2.0 * u, u)
+    assert np.isfinite(live.theta).all()
+
+
+def test_damage_everywhere_leaves_a_usable_estimate(model, tracker):
+    y, u = arx_record(T, 7)
+    run = track(model, tracker, *damaged(y, u, seed=8))
+    assert 0.4 < run.ok.mean() < 0.9
+    np.testing.assert_allclose(run.theta[-1], track(model, tracker, y, u).theta[-1], atol=0.1)

@@ -1,0 +1,114 @@
+"""Compiled code is found on disk by a second process, and an edited step is compiled again."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).parents[2] / "src"
+
+COUNT = """
+import json, sys
+from numba.core import event
+
+class Count(event.Listener):
+    compiled = 0
+    def on_start(self, happened):
+        Count.compiled += 1
+    def on_end(self, happened):
+        pass
+
+event.register("numba:compile", Count())
+"""
+
+EVERY_TRACKER = (
+    COUNT
+    + """
+from contract_table import ready
+from driftfit import Live, Regression, track
+from driftfit.trackers import found
+
+for kind in found().values():
+    live = Live(Regression(1), ready(kind))
+    track(Regression(1), ready(kind), [1.0, 2.0], [1.0, 1.0])
+    live.update(1.0, 1.0)
+print(json.dumps(Count.compiled))
+"""
+)
+
+OWN_TRACKER = (
+    COUNT
+    + """
+from own_tracker import Half
+from driftfit import Regression, track
+
+run = track(Regression(1), Half(), [1.0, 1.0], [1.0, 1.0])
+print(json.dumps([Count.compiled, run.theta[-1, 0]]))
+"""
+)
+
+OWN_PARTS = """
+from driftfit.kernel import kernel
+
+GAIN = 0.5
+
+@kernel
+def gain(s, l):
+    return GAIN * s.ok[l]
+"""
+
+OWN_FILE = """
+from dataclasses import dataclass
+import numpy as np
+from driftfit.drivers import TrackerSteps, unknown
+from driftfit.kernel import kernel, nothing
+from driftfit.trackers.base import Tracker
+from own_parts import gain
+
+@kernel
+def correct(s, l):
+    s.y_hat[l] = s.theta[0, l] * s.phi[0, l]
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.theta[0, l] += gain(s, l) * s.e[l]
+
+@dataclass(frozen=True)
+class Half(Tracker):
+    covariance = False
+    def state(self, n):
+        return {"theta": np.zeros(n)}
+    @property
+    def steps(self):
+        return TrackerSteps(nothing, correct, unknown)
+"""
+
+
+def run(code, tmp_path):
+    """What a fresh process prints, as JSON."""
+    paths = [str(tmp_path), str(SRC), str(Path(__file__).parents[1])]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(paths)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    assert run(EVERY_TRACKER, tmp_path) > 0
+    assert run(EVERY_TRACKER, tmp_path) == 0
+
+
+@pytest.mark.parametrize(
+    "edit", [("GAIN = 0.5", "GAIN = 0.25"), ("s.ok[l]", "s.ok[l] * 0.5")], ids=["constant", "step"]
+)
+def test_an_edit_in_another_file_is_seen(tmp_path, edit):
+    (tmp_path / "own_tracker.py").write_text(OWN_FILE)
+    (tmp_path / "own_parts.py").write_text(OWN_PARTS)
+    compiled, theta = run(OWN_TRACKER, tmp_path)
+    assert (compiled > 0, theta) == (True, 0.75)
+    if edit[0].startswith("GAIN"):
+        assert run(OWN_TRACKER, tmp_path) == [0, 0.75]
+    (tmp_path / "own_parts.py").write_text(OWN_PARTS.replace(*edit))
+    compiled, theta = run(OWN_TRACKER, tmp_path)
+    assert (compiled > 0, theta) == (True, 0.4375)

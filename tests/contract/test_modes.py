@@ -1,0 +1,156 @@
+"""Stream = record = lane of a fleet's tile, bit for bit; nothing looks ahead; nothing that was given is changed."""
+
+import sys
+
+import numpy as np
+import pytest
+from support import arx_record, damaged, run_lanes, same
+
+from driftfit import Live, track
+from driftfit.drivers import known_factors
+
+T = 300
+
+
+def factors(seed):
+    """Times with gaps, weights with zeros, and factors of the drift."""
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.choice([1.0, 0.5, 1.25, 3.0], T, p=[0.8, 0.1, 0.05, 0.05]))
+    weights = rng.choice([1.0, 2.0, 0.25, 0.0], T, p=[0.7, 0.1, 0.1, 0.1])
+    drift = rng.choice([1.0, 0.0, 50.0], T, p=[0.8, 0.1, 0.1])
+    return {"time": time, "weights": weights, "drift": drift}
+
+
+def assert_same_run(a, b, upto=None):
+    for name in ("theta", "std", "prediction", "innovation", "innovation_std", "ok"):
+        assert same(getattr(a, name)[:upto], getattr(b, name)[:upto]), name
+    for name in a.tracker.outputs:
+        assert same(a._written(name)[:upto], b._written(name)[:upto]), name
+
+
+@pytest.mark.parametrize("known", [{}, factors(5)], ids=["plain", "times, weights, drift"])
+def test_live_says_what_the_record_says(model, tracker, known):
+    y, u = damaged(*arx_record(T, 1), seed=2)
+    run = track(model, tracker, y, u, **known)
+    live = Live(model, tracker)
+    names = {"time": "time", "weights": "weight", "drift": "drift"}
+    for t in range(T):
+        at = {names[name]: float(value[t]) for name, value in known.items()}
+        drive = float(u[t]) if t % 2 else u[t : t + 1]  # a number, or an array: two compiled entry points
+        got = live.update(None if np.isnan(y[t]) else float(y[t]), drive, **at)
+        innovation_std = np.sqrt(got[2])
+        assert same(got[:2], (run.prediction[t], run.innovation[t])), t
+        assert same(innovation_std, run.innovation_std[t]), t
+        assert got[3] == run.ok[t], t
+        assert same(live.theta, run.theta[t]), t
+        assert same(live.std, run.std[t]), t
+
+
+def test_a_lane_says_what_the_record_says(model, tracker):
+    series = [damaged(*arx_record(T, lane), seed=lane, share=0.01 * lane) for lane in range(tracker.width)]
+    known = [factors(lane) for lane in range(tracker.width)]
+    runs = [track(model, tracker, y, u, **k) for (y, u), k in zip(series, known, strict=True)]
+    y, u = (np.stack(signal, axis=1) for signal in zip(*series, strict=True))
+    out, _ = run_lanes(
+        model, [tracker] * tracker.width, y, u[:, None, :], np.stack([run._known for run in runs], axis=2)
+    )
+    for lane, run in enumerate(runs):
+        for name in run._out.dtype.names:
+            assert same(out[name][..., lane], run._written(name)), (lane, name)
+
+
+def test_lanes_do_not_touch_each_other(model, tracker):
+    """One lane full of rubbish beside healthy ones, at other places of the tile: nothing changes."""
+    y, u = arx_record(T, 3)
+    alone = track(model, tracker, y, u)
+    ys, us = (np.repeat(signal[:, None], tracker.width, axis=1) for signal in (y, u))
+    if tracker.width > 1:
+        ys[:, 1], us[::3, 1] = 1e149, np.nan
+    out, _ = run_lanes(model, [tracker] * tracker.width, ys, us[:, None, :], known_factors()[:, :, None] + 0 * ys[:1])
+    for lane in set(range(tracker.width)) - {1}:
+        assert same(out["theta"][..., lane], alone.theta)
+
+
+def test_chunks_do_not_show(model, tracker, monkeypatch):
+    y, u = damaged(*arx_record(T, 4))
+    whole = track(model, tracker, y, u, **factors(1))
+    monkeypatch.setattr(sys.modules["driftfit.track"], "CHUNK", 37)
+    assert_same_run(whole, track(model, tracker, y, u, **factors(1)))
+
+
+@pytest.mark.parametrize("cut", [2, 3, 6, 150])
+def test_nothing_looks_ahead(model, tracker, cut):
+    y, u = damaged(*arx_record(T, 6))
+    known = factors(2)
+    run = track(model, tracker, y, u, **known)
+    rng = np.random.default_rng(0)
+    late = slice(cut, None)
+    y2, u2, known2 = y.copy(), u.copy(), {name: value.copy() for name, value in known.items()}
+    y2[late], u2[late] = 100.0 * rng.standard_normal((2, T - cut))
+    known2["time"][late] += 40.0
+    known2["weights"][late], known2["drift"][late] = 3.0, 7.0
+    other = track(model, tracker, y2, u2, **known2)
+    assert_same_run(run, other, upto=cut)
+    assert same(run.cov(cut - 1), other.cov(cut - 1))
+    assert not same(run.theta[late], other.theta[late])
+    assert_same_run(run, track(model, tracker, y[:cut], u[:cut], **{k: v[:cut] for k, v in known.items()}), upto=cut)
+
+
+def test_the_output_of_a_sample_is_not_in_its_own_prediction(model, tracker):
+    y, u = arx_record(T, 7)
+    run = track(model, tracker, y, u)
+    y2 = y.copy()
+    y2[200] += 10.0
+    other = track(model, tracker, y2, u)
+    assert other.prediction[200] == run.prediction[200]
+    assert same(other.innovation_std[200], run.innovation_std[200])
+    assert not same(other.theta[200], run.theta[200])
+
+
+def test_what_was_given_stays_as_it_was(model, tracker):
+    y, u = damaged(*arx_record(T, 8))
+    given = {"y": y, "u": u, **factors(3)}
+    before = {name: value.copy() for name, value in given.items()}
+    for value in given.values():
+        value.setflags(write=False)
+    run = track(model, tracker, **given)
+    run.cov(T // 2)
+    live = Live(model, tracker)
+    for t in range(20):
+        live.update(y[t], u[t : t + 1])
+    for name, value in given.items():
+        assert same(value, before[name]), name
+
+
+def test_inputs_of_other_kinds_give_the_same(model, tracker):
+    y, u = arx_record(T, 9)
+    run = track(model, tracker, y, u)
+    spaced = np.zeros((T, 3))
+    spaced[:, 1] = u
+    assert_same_run(run, track(model, tracker, y.tolist(), u[:, None]))
+    assert_same_run(run, track(model, tracker, y[:, None], spaced[:, 1]))
+    single = y.astype(np.float32)
+    assert_same_run(track(model, tracker, single, u), track(model, tracker, single.astype(float), u))
+
+
+def test_predict_leaves_the_state_alone(model, tracker):
+    y, u = arx_record(60, 10)
+    live = Live(model, tracker)
+    for t in range(60):
+        before = live._tile.copy()
+        expected = live.predict(float(u[t]))
+        assert live._tile.tobytes() == before.tobytes()
+        y_hat, _, s, _ = live.update(float(y[t]), float(u[t]))
+        assert same((y_hat, s), expected)
+
+
+def test_a_sample_before_the_last_is_counted_and_ignored(model, tracker):
+    y, u = arx_record(50, 11)
+    live = Live(model, tracker)
+    for t in range(50):
+        live.update(y[t], u[t : t + 1], time=float(t))
+    before = live._tile.copy()
+    for late in (49.0, 10.0):
+        assert not live.update(1e3, u[:1], time=late)[3]
+    assert live.ignored == 2
+    assert live._tile.tobytes() == before.tobytes()

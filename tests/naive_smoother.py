@@ -1,0 +1,91 @@
+"""Slow and obvious twins of the smoothers: dense least squares, and the same in eighty digits."""
+
+from decimal import Decimal, getcontext
+
+import numpy as np
+
+getcontext().prec = 80
+
+
+def stacked(phi, y, D, weight=None, theta0=0.0, lambda0=None):
+    """The rows of the cost as one least squares problem: (A, b) with J = |A theta - b|^2."""
+    L, n = phi.shape
+    root = np.ones(L) if weight is None else np.sqrt(weight)
+    A = np.zeros((L, L * n))
+    for k in range(L):
+        A[k, k * n : k * n + n] = root[k] * phi[k]
+    blocks, b = [A], [root * y]
+    for k in range(L - 1):
+        W = np.zeros((n, L * n))
+        half = np.linalg.cholesky(D[k]).T
+        W[:, k * n : k * n + n], W[:, (k + 1) * n : (k + 2) * n] = -half, half
+        blocks.append(W)
+        b.append(np.zeros(n))
+    if lambda0 is not None:
+        half = np.linalg.cholesky(lambda0).T
+        blocks.append(np.hstack([half, np.zeros((n, (L - 1) * n))]))
+        b.append(half @ (np.zeros(n) + theta0))
+    return np.vstack(blocks), np.concatenate(b)
+
+
+def dense(*args, **kwargs):
+    """(theta (L, n), C (L n, L n), J) from the stacked problem; of full rank."""
+    A, b = stacked(*args, **kwargs)
+    L, n = args[0].shape
+    theta = np.linalg.lstsq(A, b, rcond=None)[0]
+    return theta.reshape(L, n), np.linalg.inv(A.T @ A), float(np.sum((A @ theta - b) ** 2))
+
+
+def precise(phi, y, mu):
+    """(theta (L, n), variances (L, n)) by the flexible least squares recursion in eighty digits."""
+    L, n = phi.shape
+    mu = Decimal(float(mu))
+    rows = [[Decimal(float(v)) for v in row] for row in phi]
+    outputs = [Decimal(float(v)) for v in y]
+    Q, p, kept = zeros(n), [Decimal(0)] * n, []
+    for k in range(L):
+        U = [[Q[i][j] + rows[k][i] * rows[k][j] for j in range(n)] for i in range(n)]
+        z = [p[i] + rows[k][i] * outputs[k] for i in range(n)]
+        if k < L - 1:
+            E = inverse([[U[i][j] + (mu if i == j else 0) for j in range(n)] for i in range(n)])
+            e = apply(E, z)
+            kept.append((E, e))
+            Q = [[mu * v for v in row] for row in product(E, U)]
+            p = [mu * v for v in e]
+    C = inverse(U)
+    theta = apply(C, z)
+    path, var = [theta], [[C[i][i] for i in range(n)]]
+    for E, e in reversed(kept):
+        M = [[mu * v for v in row] for row in E]
+        theta = [a + b for a, b in zip(e, apply(M, theta), strict=True)]
+        spread = product(product(M, C), [list(row) for row in zip(*M, strict=True)])
+        C = [[E[i][j] + spread[i][j] for j in range(n)] for i in range(n)]
+        path.append(theta)
+        var.append([C[i][i] for i in range(n)])
+    return np.array(path[::-1], dtype=float), np.array(var[::-1], dtype=float)
+
+
+def zeros(n):
+    return [[Decimal(0)] * n for _ in range(n)]
+
+
+def apply(A, x):
+    return [sum(a * b for a, b in zip(row, x, strict=True)) for row in A]
+
+
+def product(A, B):
+    return [[sum(A[i][k] * B[k][j] for k in range(len(B))) for j in range(len(B[0]))] for i in range(len(A))]
+
+
+def inverse(A):
+    """Gauss and Jordan, with pivoting."""
+    n = len(A)
+    M = [[*row, *(Decimal(int(i == j)) for j in range(n))] for i, row in enumerate(A)]
+    for i in range(n):
+        pivot = max(range(i, n), key=lambda k: abs(M[k][i]))
+        M[i], M[pivot] = M[pivot], M[i]
+        M[i] = [v / M[i][i] for v in M[i]]
+        for k in range(n):
+            if k != i:
+                M[k] = [a - M[k][i] * b for a, b in zip(M[k], M[i], strict=True)]
+    return [row[n:] for row in M]

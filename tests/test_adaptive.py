@@ -1,0 +1,115 @@
+"""AdaptiveKalman: no numbers to choose, bands that hold, nothing blows up when inputs are dull."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, AdaptiveKalman, Kalman, Live, Regression, track
+from driftfit.systems import scenarios
+
+BURN = 200
+MODELS = {"regression": Regression(3), "arx": ARX(2, 2)}
+
+
+def errors(tracker, simulated, kind):
+    run = track(MODELS[kind], tracker, simulated.y, simulated.u)
+    return run, (run.theta - simulated.theta)[BURN:]
+
+
+@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("name", scenarios.found())
+def test_close_to_the_best_fixed_ratio_in_hindsight(name, kind):
+    seeds = range(3)
+    records = [scenarios.simulate(name, kind, seed) for seed in seeds]
+    grid = [0.0, *np.logspace(-6, 0, 7)]
+    fixed = [Kalman(q=ratio * 0.09, r=0.09) for ratio in grid]
+    best = min(np.mean([np.mean(errors(t, r, kind)[1] ** 2) for r in records]) for t in fixed)
+    own = np.mean([np.mean(errors(AdaptiveKalman(), r, kind)[1] ** 2) for r in records])
+    assert np.sqrt(own / best) < 1.35  # three runs: the benchmark holds 1.25 over many
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_bands_hold_where_the_truth_walks(kind):
+    inside, one_step = [], []
+    for seed in range(12):
+        for name in ("slow_walk", "fast_walk"):
+            simulated = scenarios.simulate(name, kind, seed)
+            run, error = errors(AdaptiveKalman(), simulated, kind)
+            inside.append(np.mean(np.abs(error) < 1.96 * run.std[BURN:]))
+            one_step.append(np.mean(np.abs(run.innovation[BURN:]) < 1.96 * run.innovation_std[BURN:]))
+    assert 0.93 < np.mean(inside) < 0.97
+    assert 0.93 < np.mean(one_step) < 0.97
+
+
+def test_one_step_bands_hold_when_the_noise_changes():
+    inside = []
+    for seed in range(12):
+        run, _ = errors(AdaptiveKalman(), scenarios.simulate("changing_noise", "regression", seed), "regression")
+        inside.append(np.mean(np.abs(run.innovation[BURN:]) < 1.96 * run.innovation_std[BURN:]))
+    assert 0.93 < np.mean(inside) < 0.97
+
+
+@pytest.mark.parametrize(("fy", "fu"), [(1e6, 1.0), (1e-6, 1.0), (1.0, 1e6), (1.0, 1e-6)])
+@pytest.mark.parametrize("kind", MODELS)
+def test_scaling_changes_nothing_but_units(kind, fy, fu):
+    simulated = scenarios.simulate("slow_walk", kind, 0, T=300)
+    run = track(MODELS[kind], AdaptiveKalman(), simulated.y, simulated.u)
+    scaled = track(MODELS[kind], AdaptiveKalman(), simulated.y * fy, simulated.u * fu)
+    unit = np.full(run.model.n, fy / fu)
+    if kind == "arx":
+        unit[:2] = 1.0
+    np.testing.assert_allclose(scaled.theta[20:] / unit, run.theta[20:], rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(scaled.innovation_std[20:] / fy, run.innovation_std[20:], rtol=1e-9)
+
+
+def test_a_million_dull_samples_and_excitation_back():
+    rng = np.random.default_rng(0)
+    live = Live(Regression(3), AdaptiveKalman())
+    truth = np.array([1.0, -0.5, 0.8])
+    for u in rng.normal(size=(500, 3)):
+        live.update(u @ truth + 0.1 * rng.normal(), u)
+    assert live.learning.all()
+    dull = np.tile([1.0, 1.0, 0.0], (1_000_000, 1))
+    run = track(Regression(3), AdaptiveKalman(), dull @ truth + 0.1 * rng.normal(size=len(dull)), dull)
+    assert np.isfinite(run.theta).all()
+    for u in dull[:2000]:
+        live.update(u @ truth + 0.1 * rng.normal(), u)
+    assert not live.learning.any()  # the first two cannot be told apart, the third is 0
+    assert np.abs(live.theta - truth).max() < 0.3
+    truth = truth + 0.5
+    for u in rng.normal(size=(15, 3)):
+        live.update(u @ truth + 0.1 * rng.normal(), u)
+    assert np.abs(live.theta - truth).max() < 0.3
+
+
+def test_flag_is_honest_for_a_constant_regressor():
+    rng = np.random.default_rng(1)
+    alone, doubled = Live(Regression(1), AdaptiveKalman()), Live(Regression(1, intercept=True), AdaptiveKalman())
+    for _ in range(300):
+        y = 2.0 + 0.1 * rng.normal()
+        alone.update(y, 1.0)
+        doubled.update(y, 1.0)
+    assert alone.learning.all()
+    assert not doubled.learning.any()
+    with pytest.raises(ValueError, match="AdaptiveKalman"):
+        Live(Regression(1), Kalman(q=0.0, r=1.0)).learning.any()
+
+
+def test_groups_follow_rates_of_their_own():
+    wins = []
+    for seed in range(6):
+        simulated = scenarios.simulate("mixed_rates", "regression", seed)
+        _, one = errors(AdaptiveKalman(), simulated, "regression")
+        _, own = errors(AdaptiveKalman(groups=[[0], [1, 2]]), simulated, "regression")
+        wins.append(np.mean(own[:, 1:] ** 2) < np.mean(one[:, 1:] ** 2))
+    assert sum(wins) >= 5
+
+
+@pytest.mark.parametrize("groups", [[[0], [0, 1]], [[]], [[-1]]])
+def test_wrong_groups_are_refused(groups):
+    with pytest.raises(ValueError, match="AdaptiveKalman"):
+        AdaptiveKalman(groups=groups)
+
+
+def test_groups_beyond_the_parameters_are_refused():
+    with pytest.raises(ValueError, match="there are 3"):
+        track(Regression(3), AdaptiveKalman(groups=[[3]]), np.ones(5), np.ones((5, 3)))

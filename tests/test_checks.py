@@ -1,0 +1,173 @@
+"""The shipped contract: it passes the trackers of the house and names what others break."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, track
+from driftfit.checks import check_tracker
+from driftfit.drivers import TrackerSteps, unknown
+from driftfit.kernel import kernel, nothing
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.diffuse import prediction
+
+
+def steps(predict, correct) -> TrackerSteps:
+    return TrackerSteps(predict, correct, unknown)
+
+
+@kernel
+def follow(s, l):
+    """Normalised LMS."""
+    s.y_hat[l] = prediction(s, l)
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.s[l] = np.nan
+    power = 0.0
+    for i in range(s.theta.shape[0]):
+        power += s.phi[i, l] * s.phi[i, l]
+    for i in range(s.theta.shape[0]):
+        s.theta[i, l] += s.ok[l] * s.gain[l] * s.phi[i, l] * s.e[l] / (1.0 + power)
+
+
+@kernel
+def fade(s, l):
+    """Forgets theta, whether time passes or not."""
+    for i in range(s.theta.shape[0]):
+        s.theta[i, l] *= 0.999
+
+
+@kernel
+def always(s, l):
+    """Learns from every sample, also those that are not to be used."""
+    s.ok[l] = 1.0
+    follow(s, l)
+
+
+@kernel
+def careless(s, l):
+    """Looks at lane 0 for the size of the regressor, and does not ask whether the sample is to be used."""
+    s.y_hat[l] = prediction(s, l)
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.s[l] = np.nan
+    for i in range(s.theta.shape[0]):
+        s.theta[i, l] += s.gain[l] * s.phi[i, l] * s.e[l] / (1.0 + s.phi[0, 0] * s.phi[0, 0])
+
+
+@kernel
+def bold(s, l):
+    """Projects with no regularisation."""
+    s.y_hat[l] = prediction(s, l)
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.s[l] = np.nan
+    s.theta[0, l] += s.ok[l] * s.e[l] / s.phi[0, l]
+
+
+@kernel
+def hindsight(s, l):
+    """Reports what it knows after the output was seen."""
+    follow(s, l)
+    s.y_hat[l] = prediction(s, l)
+
+
+@dataclass(frozen=True)
+class NLMS(Tracker):
+    """Normalised least mean squares."""
+
+    gain: float = 0.5
+    covariance: ClassVar[bool] = False
+    kind: ClassVar[TrackerSteps] = steps(nothing, follow)
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        return {"theta": np.zeros(n), "gain": self.gain}
+
+    @property
+    def steps(self) -> TrackerSteps:
+        return self.kind
+
+
+class Fading(NLMS):
+    kind = steps(fade, follow)
+
+
+class Always(NLMS):
+    kind = steps(nothing, always)
+
+
+class Careless(NLMS):
+    kind = steps(nothing, careless)
+
+
+class Bold(NLMS):
+    kind = steps(nothing, bold)
+
+
+class Hindsight(NLMS):
+    kind = steps(nothing, hindsight)
+
+
+class Boastful(NLMS):
+    covariance = True
+    kind = TrackerSteps(nothing, follow)
+
+
+@dataclass
+class Loose(Tracker):
+    gain: Any = 0.5
+    covariance: ClassVar[bool] = False
+
+    def __hash__(self) -> int:
+        return 0
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        return {"theta": np.zeros(n), "gain": self.gain}
+
+    @property
+    def steps(self) -> TrackerSteps:
+        return NLMS.kind
+
+
+@pytest.mark.parametrize("tracker", [Kalman(q=1e-4, r=0.01), RLS(0.99), AugmentedFLS(mu=1.0), NLMS()], ids=repr)
+def test_trackers_that_keep_their_promises(tracker):
+    assert check_tracker(tracker) == []
+
+
+@pytest.mark.parametrize(
+    ("tracker", "said"),
+    [
+        (Fading(), ["with s.dt[l] = 0 predict changes nothing"]),
+        (Always(), ["must be a factor of the gain", "no time passes and nothing is used"]),
+        (Careless(), ["every field is used at [..., l]", "must be a factor of the gain"]),
+        (Bold(), ["poison theta"]),
+        (Hindsight(), ["depends on that output", "s.e is not"]),
+        (Boastful(), ["It does not run"]),
+        (Loose(), ["frozen=True"]),
+        (NLMS(gain=0.0), ["does not follow a constant system"]),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_broken_promises_are_said(tracker, said):
+    sentences = check_tracker(tracker)
+    for words in said:
+        assert any(words in sentence for sentence in sentences), sentences
+
+
+def test_a_tracker_from_any_module_passes_everywhere(tmp_path):
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(12, 100))
+    y = np.concatenate([np.zeros((12, 1)), u[:, :-1]], axis=1) + 0.1 * rng.normal(size=(12, 100))
+    fleet = track(ARX(1, 1), NLMS(), y, u, by="row")
+    run = track(ARX(1, 1), NLMS(), y[3], u[3])
+    assert np.array_equal(fleet[3].theta, run.theta)
+    assert "NLMS(gain=0.5)" in str(run.summary())
+    assert "x median" in str(fleet.summary())
+    run.plot()
+    fleet.plot()
+    live = Live(ARX(1, 1), NLMS())
+    live.update(1.0, 1.0)
+    live.save(tmp_path / "state.npz")
+    assert Live.load(tmp_path / "state.npz").tracker == NLMS()

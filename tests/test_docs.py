@@ -1,0 +1,57 @@
+"""The build fails when the docs lie.
+
+Python blocks of a page run in order, in one namespace; a text block right after one is what it prints. A text block
+after a line ``Printed by `examples/NAME.py`:`` is what that script prints. Links and pictures must exist.
+"""
+
+import contextlib
+import io
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"```(\w*)\n(.*?)```", re.S)
+SCRIPT = re.compile(r"Printed by `(examples/\w+\.py)`:\n\n```text\n(.*?)```", re.S)
+
+
+def squeezed(text: str) -> list[str]:
+    return [" ".join(line.split()) for line in text.strip().splitlines()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = page.read_text()
+    namespace: dict[str, object] = {}
+    blocks = list(BLOCK.finditer(text))
+    for i, block in enumerate(blocks):
+        if block[1] != "python":
+            continue
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(block[2], f"{page.name}: block {i}", "exec"), namespace)
+        follows = i + 1 < len(blocks) and not text[block.end() : blocks[i + 1].start()].strip()
+        if follows and blocks[i + 1][1] == "text":
+            assert squeezed(printed.getvalue()) == squeezed(blocks[i + 1][2])
+
+
+def test_scripts_print_what_the_docs_say(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["script"])
+    shown = [(found[1], found[2]) for page in PAGES for found in SCRIPT.finditer(page.read_text())]
+    assert shown
+    for script, said in shown:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        assert squeezed(printed.getvalue()) == squeezed(said), script
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target

@@ -1,0 +1,160 @@
+"""Runs of 100,000 steps and more: drift, an unstable system, a term that appears, coverage, no excitation."""
+
+import numpy as np
+import pytest
+from contract_table import SLOW, ready
+from support import THETA, arx_record
+
+from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
+from driftfit.result import root_mean_square
+from driftfit.trackers import found
+
+LONG = 100_000
+TRACKERS = [pytest.param(ready(kind, SLOW), id=name) for name, kind in found().items()]
+
+
+def drifting(T):
+    """Parameters that turn slowly, (T, 4)."""
+    phase = 2.0 * np.pi * np.arange(T) / 20_000
+    return THETA + np.stack([0.2 * np.sin(phase), -0.2 * np.sin(phase), 0.5 * np.cos(phase), 0.3 * np.sin(phase)], 1)
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+def test_a_drifting_system_is_followed_to_the_end(tracker):
+    path = drifting(LONG)
+    y, u = arx_record(LONG, 1, theta=path)
+    run = track(ARX(2, 2), tracker, y, u)
+    steady = track(ARX(2, 2), RLS(1.0), y, u)
+    for part in (slice(1000, 50_000), slice(50_000, LONG)):
+        error = root_mean_square(run.theta[part] - path[part])
+        assert error < 0.12
+        assert error < 0.5 * root_mean_square(steady.theta[part] - path[part])
+        assert root_mean_square(run.innovation[part]) < 1.4 * 0.1
+    first, last = (root_mean_square(run.innovation[part]) for part in (slice(1000, 21_000), slice(80_000, LONG)))
+    assert last == pytest.approx(first, rel=0.05)  # as good at the end as at the start
+
+
+def unstable_in_closed_loop(T, seed):
+    """y_t = 1.1 y_(t-1) + u_(t-1) + v with u = -0.6 y + dither: the loop is stable, the system is not."""
+    rng = np.random.default_rng(seed)
+    v, dither = 0.1 * rng.standard_normal(T), 0.5 * rng.standard_normal(T)
+    y, u = np.zeros(T), np.zeros(T)
+    for t in range(T):
+        y[t] = (1.1 * y[t - 1] + u[t - 1] if t else 0.0) + v[t]
+        u[t] = -0.6 * y[t] + dither[t]
+    return y, u
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+def test_an_unstable_system_with_bounded_output(tracker):
+    """Filled lags of an unstable estimate must not run away: outages are cut after na outputs."""
+    y, u = unstable_in_closed_loop(LONG, 2)
+    y[np.random.default_rng(3).random(LONG) < 0.05] = np.nan
+    for start in range(10_000, LONG, 10_000):
+        y[start : start + 300] = np.nan
+    run = track(ARX(1, 1), tracker, y, u)
+    assert np.isfinite(run.theta).all()
+    assert np.nanmax(np.abs(run.prediction)) < 10.0
+    np.testing.assert_allclose(run.theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=0.05)
+    assert root_mean_square(run.innovation[run.ok][1000:]) < 0.2
+
+
+@pytest.mark.parametrize("tracker", TRACKERS)
+def test_a_structure_that_changes_half_way(tracker):
+    """The second lags appear at half time: their parameters are 0 before and what they became after."""
+    half = LONG // 2
+    path = np.where(np.arange(LONG)[:, None] < half, [0.7, 0.0, 1.0, 0.0], THETA)
+    y, u = arx_record(LONG, 4, theta=path)
+    run = track(ARX(2, 2), tracker, y, u)
+    np.testing.assert_allclose(run.theta[half - 2000 : half].mean(axis=0), path[0], atol=0.05)
+    np.testing.assert_allclose(run.theta[half + 1000 : half + 3000].mean(axis=0), THETA, atol=0.05)
+    np.testing.assert_allclose(run.theta[-2000:].mean(axis=0), THETA, atol=0.05)
+    if tracker.covariance:  # the term is told from 0 only where it exists
+        low, high = run.band()
+        outside = (low[:, 1] > 0.0) | (high[:, 1] < 0.0)
+        assert outside[1000:half].mean() < 0.1
+        assert outside[half + 1000 :].mean() > 0.95
+
+
+def random_walk(T, seed, q, r, n=1):
+    """y, u, theta of a regression whose parameters really are a random walk."""
+    rng = np.random.default_rng(seed)
+    theta = np.cumsum(np.sqrt(q) * rng.standard_normal((T, n)), axis=0)
+    u = rng.standard_normal((T, n))
+    return (u * theta).sum(axis=1) + np.sqrt(r) * rng.standard_normal(T), u, theta
+
+
+@pytest.mark.parametrize(("q", "r"), [(1e-3, 0.1), (0.1, 0.1), (1e-5, 1.0)])
+def test_bands_cover_what_they_say(q, r):
+    y, u, theta = random_walk(LONG, 5, q, r)
+    run = track(Regression(1), Kalman(q=q, r=r), y, u)
+    for level, least, most in ((0.95, 0.93, 0.97), (0.5, 0.46, 0.54)):
+        low, high = run.band(level)
+        inside = (low < theta) & (theta < high)
+        assert least < inside[100:].mean() < most
+    score = run.innovation[100:] / run.innovation_std[100:]
+    assert score.var() == pytest.approx(1.0, abs=0.02)
+    assert np.mean(score[1:] * score[:-1]) == pytest.approx(0.0, abs=0.015)
+
+
+def test_bands_cover_through_gaps_and_missing_data():
+    """Interval, weight and drift factor enter the band as they enter the truth."""
+    rng = np.random.default_rng(6)
+    T, q, r = LONG, 1e-3, 0.1
+    dt = rng.choice([1.0, 0.5, 4.0], T)
+    dt[0] = 1.0
+    drift, weights = rng.choice([1.0, 0.0, 5.0], T), rng.choice([1.0, 4.0, 0.25], T)
+    theta = np.cumsum(np.sqrt(q * dt * drift) * rng.standard_normal(T))
+    u = rng.standard_normal(T)
+    y = u * theta + np.sqrt(r / weights) * rng.standard_normal(T)
+    y[rng.random(T) < 0.3] = np.nan
+    run = track(Regression(1), Kalman(q=q, r=r), y, u, time=np.cumsum(dt), weights=weights, drift=drift)
+    low, high = run.band()
+    inside = (low[:, 0] < theta) & (theta < high[:, 0])
+    assert 0.93 < inside[100:].mean() < 0.97
+    assert 0.93 < inside[100:][~run.ok[100:]].mean() < 0.97
+
+
+def test_bands_of_least_squares_cover():
+    """RLS(1) estimates the noise as it goes; over many short records its final band covers."""
+    rng = np.random.default_rng(7)
+    hits = []
+    for _ in range(1500):
+        u = rng.standard_normal(60)
+        y = 2.0 * u + 0.7 * rng.standard_normal(60)
+        low, high = track(Regression(1), RLS(1.0), y, u).band()
+        hits.append(low[-1, 0] < 2.0 < high[-1, 0])
+    assert 0.93 < np.mean(hits) < 0.97
+
+
+def test_a_million_steps_without_excitation():
+    """P grows by exactly q a sample; theta stays where it was; afterwards the filter learns as before."""
+    T = 1_000_000
+    y, u, _ = random_walk(T, 8, 1e-3, 0.1)
+    u[1000:-200], y[1000:-200] = 0.0, 0.5
+    run = track(Regression(1), Kalman(q=2.0**-10, r=0.1), y, u[:, 0])
+    silent = slice(1000, T - 200)
+    assert (run.theta[silent] == run.theta[999]).all()
+    grown = run.std[T - 201, 0] ** 2 - run.std[999, 0] ** 2
+    assert grown == pytest.approx((T - 1200) * 2.0**-10, rel=1e-9)
+    assert run.std[-1, 0] < 0.3
+    assert np.isfinite(run.loglik)
+
+
+def test_forgetting_keeps_its_memory_over_a_long_run():
+    """The variance of a constant regression under forgetting is r (1 - lam) / (1 + lam), at 1e3 and at 1e5 alike."""
+    rng = np.random.default_rng(9)
+    y = 3.0 + rng.standard_normal(LONG)
+    lam = 0.95
+    theta = track(Regression(1), RLS(lam), y, np.ones(LONG)).theta[:, 0]
+    for part in (slice(500, 50_000), slice(50_000, LONG)):
+        assert theta[part].var() == pytest.approx((1.0 - lam) / (1.0 + lam), rel=0.08)
+        assert theta[part].mean() == pytest.approx(3.0, abs=0.02)
+
+
+def test_augmented_fls_has_a_floor_that_does_not_drift():
+    y, u = arx_record(LONG, 10)
+    run = track(ARX(2, 2), AugmentedFLS(5.0), y, u)
+    early, late = (root_mean_square(run.theta[part] - THETA) for part in (slice(1000, 50_000), slice(50_000, LONG)))
+    assert 0.0 < late < 0.1
+    assert late == pytest.approx(early, rel=0.1)

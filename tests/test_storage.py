@@ -1,0 +1,181 @@
+"""Files: damaged, truncated, of another kind, for another model, from the future; complete or absent."""
+
+import io
+import json
+import os
+import zipfile
+
+import numpy as np
+import pytest
+from support import arx_record, same
+
+from driftfit import ARX, RLS, Kalman, Live, Track, track
+
+Y, U = arx_record(60, 1)
+
+
+@pytest.fixture(params=["state", "track"])
+def saved(request, tmp_path):
+    """(path, load) of a file of each kind."""
+    path = tmp_path / "file"
+    if request.param == "state":
+        live = Live(ARX(2, 2), Kalman(q=1e-3, r=0.1))
+        for t in range(60):
+            live.update(Y[t], U[t : t + 1])
+        live.save(path)
+        return path, Live.load
+    track(ARX(2, 2), Kalman(q=1e-3, r=0.1), Y, U).save(path)
+    return path, Track.load
+
+
+def rewrite(path, change_header=None, change_arrays=None):
+    """Write the file again with another header or other arrays."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays.pop("header")))
+    if change_header:
+        change_header(header)
+    if change_arrays:
+        change_arrays(arrays)
+    with open(path, "wb") as file:
+        np.savez(file, header=np.array(json.dumps(header)), **arrays)
+
+
+def test_a_missing_file_is_a_missing_file(tmp_path):
+    for load in (Live.load, Track.load):
+        with pytest.raises(FileNotFoundError):
+            load(tmp_path / "absent")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04 not really", b"\x93NUMPY" + bytes(100)])
+def test_other_files_are_named(tmp_path, content):
+    path = tmp_path / "other"
+    path.write_bytes(content)
+    for load in (Live.load, Track.load):
+        with pytest.raises(ValueError, match=r"other is not a driftfit file, or it is damaged"):
+            load(path)
+
+
+def test_files_of_arrays_that_are_not_ours_are_named(tmp_path):
+    path = tmp_path / "other.npz"
+    for arrays in (
+        {"a": np.ones(3)},
+        {"header": np.array("[1, 2]")},
+        {"header": np.array("7")},
+        {"header": np.ones(2)},
+    ):
+        np.savez(path, **arrays)
+        with pytest.raises(ValueError, match=r"other\.npz"):
+            Live.load(path)
+    np.savez(path, header=np.array({"kind": "state"}, dtype=object))  # a pickle: never opened
+    with pytest.raises(ValueError, match=r"not a driftfit file"):
+        Live.load(path)
+
+
+def test_a_truncated_file_is_refused_at_every_length(saved):
+    path, load = saved
+    whole = path.read_bytes()
+    for length in range(0, len(whole), max(1, len(whole) // 60)):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=r"not a driftfit file, or it is damaged"):
+            load(path)
+
+
+def test_a_flipped_bit_is_refused_or_without_effect(saved):
+    path, load = saved
+    whole = path.read_bytes()
+    expected = load(path)
+    rng = np.random.default_rng(0)
+    refused = 0
+    for place in rng.choice(len(whole), 250, replace=False):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:
+            got = load(path)
+        except ValueError:
+            refused += 1
+        else:
+            assert same(got.theta, expected.theta)
+            assert got.tracker == expected.tracker
+    assert refused > 100
+
+
+def test_the_wrong_kind_is_named(saved):
+    path, load = saved
+    other, holds, wanted = (Live, "track", "state") if load == Track.load else (Track, "state", "track")
+    with pytest.raises(ValueError, match=f"holds a {holds}, not a {wanted}"):
+        other.load(path)
+
+
+def test_a_future_format_is_named(saved):
+    path, load = saved
+    rewrite(path, lambda header: header.update(format=99))
+    with pytest.raises(ValueError, match=r"newer driftfit \(format 99\); this one reads 1"):
+        load(path)
+
+
+@pytest.mark.parametrize("which", ["model", "tracker"])
+def test_a_class_that_is_not_here_is_named(saved, which):
+    path, load = saved
+    rewrite(path, lambda header: header[which].update({"class": "driftfit.trackers.absent:Absent"}))
+    with pytest.raises(ValueError, match=r"needs the class Absent of the module driftfit\.trackers\.absent"):
+        load(path)
+    rewrite(path, lambda header: header[which].update({"class": "os:system"}))
+    with pytest.raises(ValueError, match=f"os:system as its {which}, which it is not"):
+        load(path)
+
+
+@pytest.mark.parametrize("other", [("driftfit.models.arx:ARX", {"na": 1, "nb": 2, "inputs": 1})])
+def test_a_state_of_another_model_is_refused(saved, other):
+    path, load = saved
+    rewrite(path, lambda header: header["model"].update({"class": other[0], "settings": other[1]}))
+    with pytest.raises(ValueError, match=r"does not fit"):
+        load(path)
+
+
+def test_a_state_without_one_of_its_fields_is_refused(saved):
+    path, load = saved
+    rewrite(path, change_arrays=lambda arrays: arrays.pop("state_theta"))
+    with pytest.raises(ValueError, match=r"does not fit.*'theta'"):
+        load(path)
+
+
+def test_a_failure_while_writing_leaves_the_old_file(saved, monkeypatch):
+    path, load = saved
+    before = path.read_bytes()
+    again = load(path)
+
+    def fails(file, **arrays):
+        file.write(b"half of it")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(np, "savez", fails)
+    with pytest.raises(OSError, match="no space left"):
+        again.save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_a_failure_at_the_first_writing_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "replace", lambda *paths: (_ for _ in ()).throw(OSError("busy")))
+    with pytest.raises(OSError, match="busy"):
+        track(ARX(2, 2), RLS(0.9), Y, U).save(tmp_path / "run")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_file_holds_no_pickle_and_opens_anywhere(saved):
+    path, _ = saved
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            np.load(io.BytesIO(archive.read(name)), allow_pickle=False)
+    with np.load(path, allow_pickle=False) as file:
+        header = json.loads(str(file["header"]))
+    assert header["tracker"]["settings"]["q"] == 1e-3
+
+
+def test_a_path_may_be_text_and_is_written_over(tmp_path):
+    path = str(tmp_path / "run")
+    for q in (1e-3, 1e-2):
+        track(ARX(2, 2), Kalman(q=q, r=0.1), Y, U).save(path)
+    assert Track.load(path).tracker.q == 1e-2

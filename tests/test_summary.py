@@ -1,0 +1,171 @@
+"""The summary, the comparison that every result carries, bands and pictures."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import THETA, arx_record, damaged, same
+
+from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
+from driftfit.compare import compare, persistence
+
+K = Kalman(q=1e-3, r=0.1)
+
+
+def least_squares_predictions(phi, y):
+    """For every sample the prediction of least squares (of least norm) on the complete rows before it."""
+    expected, rows, seen = np.full(len(y), np.nan), [], []
+    for t, row in enumerate(phi):
+        if np.isfinite(row).all():
+            expected[t] = row @ np.linalg.lstsq(np.array(rows), np.array(seen))[0] if rows else 0.0
+            if np.isfinite(y[t]):
+                rows.append(row)
+                seen.append(y[t])
+    return expected
+
+
+def lagged(signal, lag):
+    return np.concatenate([np.full(lag, np.nan), signal[: len(signal) - lag]])
+
+
+def test_comparison_is_what_plain_numpy_gives():
+    T = 300
+    theta = THETA + 0.3 * np.sin(np.arange(T) / 40.0)[:, None] * [0.0, 0.0, 1.0, 1.0]
+    y, u = arx_record(T, 1, theta=theta)
+    run = track(ARX(2, 2), K, y, u)
+    got = run.summary().comparison
+    own = np.stack([lagged(y, 1), lagged(y, 2), lagged(u, 1), lagged(u, 2)], axis=1)
+    simple = np.stack([lagged(y, 1), lagged(y, 2), lagged(u, 1), np.ones(T)], axis=1)
+    scored = slice(50, None)  # max(50, 5 n), and everything is there
+
+    def rms(prediction):
+        return math.sqrt(np.mean((y - prediction)[scored] ** 2))
+
+    assert got.samples == T - 50
+    assert got.tracked == pytest.approx(rms(run.prediction), rel=1e-12)
+    assert got.persistence == pytest.approx(rms(lagged(y, 1)), rel=1e-12)
+    assert got.constant_ls == pytest.approx(rms(least_squares_predictions(own, y)), rel=1e-7)
+    assert got.constant_arx == pytest.approx(rms(least_squares_predictions(simple, y)), rel=1e-7)
+    assert got.tracked < got.constant_ls
+
+
+def test_comparison_uses_the_samples_that_all_can_predict():
+    """A regression with holes: the same samples for everyone, whatever each of them could do alone."""
+    T = 200
+    rng = np.random.default_rng(2)
+    u = rng.standard_normal(T)
+    y = 2.0 * u + 0.3 * rng.standard_normal(T)
+    y[[100, 101, 150]], u[[60, 120]] = np.nan, np.nan
+    run = track(Regression(1), K, y, u)
+    got = compare(run)
+    missing = {100, 101, 150} | {60, 61, 120, 121}  # outputs; inputs for the regression, and one later for ARX
+    scored = np.array([t for t in range(50, T) if t not in missing])
+    # after two outputs in a row are missing, ARX(2, 1) predicts on: two fills are allowed
+    assert got.samples == len(scored)
+    assert got.tracked == pytest.approx(np.sqrt(np.mean(run.innovation[scored] ** 2)), rel=1e-12)
+    last = [y[np.flatnonzero(np.isfinite(y[:t]))[-1]] for t in scored]
+    assert got.persistence == pytest.approx(np.sqrt(np.mean((y[scored] - last) ** 2)), rel=1e-12)
+    expected = least_squares_predictions(u[:, None], y)
+    assert got.constant_ls == pytest.approx(np.sqrt(np.mean((y - expected)[scored] ** 2)), rel=1e-7)
+
+
+def test_persistence_is_the_last_output_seen():
+    y = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, 5.0])
+    assert same(persistence(y), [np.nan, np.nan, 1.0, 1.0, 1.0, 4.0])
+
+
+def test_a_short_record_has_nothing_to_compare():
+    y, u = arx_record(40, 3)
+    summary = track(ARX(2, 2), K, y, u).summary()
+    assert summary.comparison.samples == 0
+    assert math.isnan(summary.comparison.tracked)
+    assert "nothing to compare" in str(summary)
+
+
+def test_comparison_without_inputs_and_with_times_and_weights():
+    y, u = arx_record(200, 4)
+    time = np.cumsum(np.where(np.arange(200) == 100, 5.0, 1.0))
+    plain, timed = track(ARX(2, 2), K, y, u), track(ARX(2, 2), K, y, u, time=time, weights=np.full(200, 2.0))
+    assert compare(timed).samples == compare(plain).samples - 2  # the lags across the gap
+    own = track(ARX(2, 0), RLS(1.0), y).summary().comparison
+    assert own.tracked == pytest.approx(own.constant_ls, rel=1e-12)
+
+
+def test_numbers_of_the_summary():
+    y, u = damaged(*arx_record(400, 5))
+    run = track(ARX(2, 2), K, y, u)
+    summary = run.summary()
+    assert (summary.samples, summary.used, summary.burn) == (400, int(run.ok.sum()), 50)
+    assert summary.loglik == run.loglik
+    low, high = run.band()
+    for i, row in enumerate(summary.rows):
+        assert (row.name, row.theta, row.std) == (run.names[i], run.theta[-1, i], run.std[-1, i])
+        assert (row.low, row.high) == (low[-1, i], high[-1, i])
+        assert (row.path_low, row.path_high) == (run.theta[50:, i].min(), run.theta[50:, i].max())
+    text = str(summary)
+    for word in (*run.names, "persistence", "constant LS", "constant ARX", f"{summary.used} used", "Kalman", "ARX"):
+        assert word in text
+    assert max(map(len, text.splitlines())) <= 96
+
+
+def test_loglik_is_the_sum_over_used_samples():
+    y, u = arx_record(300, 6)
+    y[[50, 100]] = np.nan
+    run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), y, u)
+    expected = stats.norm.logpdf(run.innovation[run.ok], 0.0, run.innovation_std[run.ok]).sum()
+    assert run.loglik == pytest.approx(expected, rel=1e-12)
+
+
+def test_bands_are_normal_quantiles_of_std():
+    run = track(ARX(2, 2), K, *arx_record(100, 7))
+    for level, half in ((0.95, 1.959963984540054), (0.6826894921370859, 1.0), (0.5, 0.6744897501960817)):
+        low, high = run.band(level)
+        np.testing.assert_allclose(high - run.theta, half * run.std, rtol=1e-9)
+        assert same(low[5:] + high[5:], 2.0 * run.theta[5:]) or np.allclose(low[5:] + high[5:], 2.0 * run.theta[5:])
+    assert np.isinf(low[0]).all()
+    assert np.isnan(track(ARX(2, 2), AugmentedFLS(1.0), *arx_record(100, 7)).band()[0]).all()
+
+
+def test_predictions_and_innovations_add_up():
+    y, u = damaged(*arx_record(300, 8))
+    run = track(ARX(2, 2), K, y, u)
+    np.testing.assert_allclose((run.prediction + run.innovation)[run.ok], y[run.ok], rtol=1e-12, atol=1e-12)
+    assert np.isnan(run.innovation[~run.ok]).all()
+    steady = run.ok & np.isfinite(run.innovation_std)
+    assert (run.innovation_std[steady] ** 2 >= 0.1).all()
+
+
+def kinds_of_runs():
+    y, u = arx_record(300, 9)
+    days = np.datetime64("2024-01-01") + np.arange(300)
+    yield "Kalman", track(ARX(2, 2), K, y, u)
+    yield "damaged", track(ARX(2, 2), K, *damaged(y, u))
+    yield "dates", track(ARX(2, 2), K, y, u, time=days, dt=np.timedelta64(1, "D"))
+    yield "no covariance", track(ARX(2, 2), AugmentedFLS(1.0), y, u)
+    yield "RLS", track(ARX(2, 2), RLS(0.98), y, u)
+    yield "all missing", track(ARX(2, 2), K, np.full(300, np.nan), u)
+    yield "one sample", track(ARX(2, 2), K, y[:1], u[:1])
+    yield "constant", track(ARX(2, 2), RLS(1.0), np.ones(300), np.ones(300))
+    yield "huge value", track(ARX(2, 2), K, np.where(np.arange(300) == 200, 1e200, y), u)
+
+
+@pytest.mark.parametrize(
+    ("name", "run"), list(kinds_of_runs()), ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_pictures_are_drawn_without_warnings(name, run, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = run.plot()
+        figure.savefig(tmp_path / "run.png", dpi=40)
+        str(run.summary())
+    assert {axis.get_ylabel() for axis in figure.axes} == {*run.names, "y", "innovation"}
+    assert (tmp_path / "run.png").stat().st_size > 2000
+
+
+def test_a_track_says_what_it_is():
+    run = track(ARX(2, 2), K, *arx_record(100, 10))
+    assert repr(run).startswith("Track of 100 samples, 98 used: ARX(")
+    assert len(run) == 100
+    assert run.time.tolist() == list(range(100))

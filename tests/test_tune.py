@@ -1,0 +1,287 @@
+"""Tuning: the right numbers on simulated truths, units that do not matter, bounds that are reported, bad input."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, track, tune
+from driftfit.models.regression import Regression as Base
+from driftfit.systems.drift import RandomWalk, paths
+from driftfit.systems.time_varying import EXAMPLES, example
+
+
+def walks(seed, std=(0.1, 0.1), noise=0.5, T=200):
+    """Random walks seen through white regressors."""
+    rng = np.random.default_rng(seed)
+    theta = paths([RandomWalk(0.0, s) for s in std], T, rng)
+    u = rng.normal(size=(T, len(std)))
+    return np.sum(u * theta, axis=1) + noise * rng.normal(size=T), u
+
+
+def test_ml_is_consistent_and_its_intervals_cover():
+    """95 % intervals of 60 records: at least 51 cover with probability 0.999 if the level is right."""
+    true = {"mu": 25.0, "r": 0.25, "q[theta1]": 0.01}
+    found, covered = [], dict.fromkeys(true, 0)
+    for seed in range(60):
+        y, u = walks(seed)
+        fls = tune(Regression(2), FLS(), y, u)
+        kalman = tune(Regression(2), Kalman(), y, u)
+        found.append(fls.tracker.mu)
+        for name, value in true.items():
+            low, high = (fls.interval | kalman.interval)[name]
+            covered[name] += low <= value <= high
+    assert 20.0 < np.median(found) < 32.0
+    assert all(51 <= count <= 60 for count in covered.values()), covered
+    long = tune(Regression(2), FLS(), *walks(1, T=20_000))
+    assert long.tracker.mu == pytest.approx(25.0, rel=0.1)
+    low, high = long.interval["mu"]
+    assert low < 25.0 < high < 1.3 * low
+
+
+def test_drift_of_each_parameter_and_zero():
+    y, u = walks(3, std=(0.1, 0.0), T=2000)
+    tuned = tune(Regression(2), Kalman(), y, u, groups="each")
+    q = tuned.tracker.q
+    assert q[0] == pytest.approx(0.01, rel=0.5)
+    assert q[1] < 1e-5
+    low, high = tuned.interval["q[theta2]/r"]
+    assert low == 0.0
+    assert high < 1e-3
+    together = tune(Regression(2), Kalman(), y, u, groups=["a", "a"])
+    assert together.loglik < tuned.loglik - 10.0
+    records = (walks(seed, (0.0, 0.0)) for seed in range(20))  # about half of them look as if nothing drifted
+    zero = next(found for found in (tune(Regression(2), Kalman(), *r) for r in records) if found.at_bound)
+    assert zero.at_bound == ("q[theta1]/r", "q[theta2]/r")  # a result: no warning
+    assert zero.tracker.q == (0.0, 0.0)
+    assert zero.interval["q[theta1]/r"][0] == 0.0
+
+
+def test_likelihood_is_that_of_the_run():
+    y, u = walks(5)
+    tuned = tune(Regression(2), Kalman(), y, u)
+    assert tuned.loglik == pytest.approx(track(Regression(2), tuned.tracker, y, u).loglik, abs=1e-8)
+    assert tuned.noise == pytest.approx(tuned.tracker.r)
+    for factor in (0.9, 1.1):
+        other = Kalman(q=np.multiply(tuned.tracker.q, factor), r=tuned.tracker.r)
+        assert track(Regression(2), other, y, u).loglik < tuned.loglik
+    smooth = track(Regression(2), tune(Regression(2), FLS(), y, u).tracker, y, u).smooth()
+    fls = tune(Regression(2), FLS(), y, u)
+    assert fls.noise == pytest.approx(smooth.cost / (len(y) - 2), rel=1e-9)
+    one = tune(Regression(2), Kalman(q=tuned.tracker.q), y, u)
+    assert one.tracker.r == pytest.approx(tuned.tracker.r, rel=0.02)
+    both = tune(Regression(2), Kalman(p0=10.0), y, u)
+    assert both.tracker.r == pytest.approx(tuned.tracker.r, rel=0.1)
+
+
+def test_likelihood_of_fls_is_the_diffuse_one_of_the_stacked_system():
+    """log|R| - sum log|D| and J of the normal equations, written out."""
+    y, u = walks(8, T=25)
+    tuned = tune(Regression(2), FLS(), y, u, bounds=(0.5, 2e3))
+    mu, L, n = tuned.tracker.mu, 25, 2
+    R = np.kron(np.diff(np.eye(L), axis=0).T @ np.diff(np.eye(L), axis=0) * mu, np.eye(n))
+    for k in range(L):
+        R[k * n : k * n + n, k * n : k * n + n] += np.outer(u[k], u[k])
+    b = (u * y[:, None]).ravel()
+    sigma2 = (y @ y - b @ np.linalg.solve(R, b)) / (L - n)
+    logs = np.linalg.slogdet(R)[1] - (L - 1) * n * np.log(mu)
+    assert tuned.loglik == pytest.approx(-0.5 * ((L - n) * (np.log(2 * np.pi * sigma2) + 1) + logs), abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_units_do_not_matter(scale):
+    y, u = walks(2)
+    inputs = scale ** np.array([1.0, 0.5])  # each regressor in a unit of its own
+    for tracker, options in (
+        (Kalman(), {}),
+        (Kalman(), {"groups": "each"}),
+        (RLS(), {}),
+        (Kalman(), {"method": "h-step"}),
+    ):
+        a = tune(Regression(2), tracker, y, u, **options)
+        b = tune(Regression(2), tracker, scale * y, u * inputs, **options)
+        if isinstance(tracker, RLS):
+            assert b.tracker.forgetting == pytest.approx(a.tracker.forgetting, rel=1e-6)
+            continue
+        q = np.array(a.tracker.q) * (scale / inputs) ** 2
+        np.testing.assert_allclose(b.tracker.q, q, rtol=1e-3)
+        assert b.tracker.r == pytest.approx(scale**2 * a.tracker.r, rel=1e-3)
+    for method in ("ml", "loo", "gcv", "h-step"):
+        a = tune(Regression(2), FLS(), y, u, method=method)
+        b = tune(Regression(2), FLS(), scale * y, scale * u, method=method)
+        assert b.tracker.mu == pytest.approx(scale**2 * a.tracker.mu, rel=1e-3)
+
+
+REFERENCE = {
+    ("sinusoids", "ml"): 0.116, ("sinusoids", "loo"): 0.116, ("rational", "ml"): 0.141, ("rational", "gcv"): 0.190,
+    ("switching", "ml"): 0.062, ("switching", "loo"): 0.061, ("exp-ar", "ml"): 0.077, ("exp-ar", "loo"): 0.079,
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:tune:UserWarning")
+@pytest.mark.parametrize(("name", "method"), REFERENCE)
+def test_selectors_on_the_examples(name, method):
+    """Median parameter error of the smoothed path; a loose band, for the reference has more seeds."""
+    assert name in EXAMPLES
+    errors = []
+    for s in range(16):
+        d = example(name, s)
+        tuned = tune(d.model, FLS(), d.y, d.u, method=method)
+        path = track(d.model, tuned.tracker, d.y, d.u).smooth()
+        errors.append(np.sqrt(np.mean((path.theta - d.theta) ** 2)))
+    assert np.median(errors) == pytest.approx(REFERENCE[name, method], rel=0.3)
+
+
+def test_loo_and_gcv_of_the_choice():
+    """Both criteria from their definitions, with every sample left out by hand."""
+    y, u = walks(4, T=40)
+    tuned = tune(Regression(2), FLS(), y, u, method="loo")
+    run = track(Regression(2), tuned.tracker, y, u)
+    left = []
+    for k in range(40):
+        hole = y.copy()
+        hole[k] = np.nan
+        left.append(y[k] - u[k] @ track(Regression(2), tuned.tracker, hole, u).smooth().theta[k])
+    best = tuned.table["loo"][0]
+    assert np.mean(np.square(left)) == pytest.approx(best, rel=1e-8)
+    path = run.smooth()
+    gcv = np.mean(path.residual**2) / (1.0 - path.leverage.mean()) ** 2
+    table = tune(Regression(2), FLS(), *walks(4, T=40), method="gcv").table
+    assert table["gcv"][0] <= gcv * (1.0 + 1e-12)
+
+
+def test_h_step_is_the_forecast_error():
+    y, u = walks(6)
+    tuned = tune(Regression(2), AugmentedFLS(), y, u, method="h-step", h=3)
+    run = track(Regression(2), tuned.tracker, y, u)
+    error = y[3:] - np.sum(u[3:] * run.theta[:-3], axis=1)
+    start = min(max(50, 10), len(y) // 3)
+    assert tuned.table["mean_square"][0] == pytest.approx(np.mean(error[start - 3 :] ** 2), rel=1e-12)
+    assert np.isnan(tuned.loglik)
+    assert all(np.isnan(tuned.interval["mu"]))
+
+
+def test_a_bound_is_reported():
+    y, u = walks(0)
+    with pytest.warns(UserWarning, match="mu ended at a bound"):
+        tuned = tune(Regression(2), FLS(), y, u, bounds=(1e2, 1e4))
+    assert tuned.at_bound == ("mu",)
+    assert tuned.interval["mu"][0] == 0.0
+    assert tune(Regression(2), FLS(), y, u).at_bound == ()
+
+
+def test_memory_of_rls():
+    slow, fast = (tune(Regression(2), RLS(), *walks(1, std=(s, s), T=2000)) for s in (0.01, 0.1))
+    assert 0.7 < fast.tracker.forgetting < slow.tracker.forgetting < 1.0
+    low, high = fast.interval["forgetting"]
+    assert low < fast.tracker.forgetting < high
+
+
+def test_missing_samples_weights_and_time():
+    y, u = walks(7, T=400)
+    y[::5] = np.nan
+    y[3] = np.inf
+    tuned = tune(Regression(2), FLS(), y, u)
+    assert 10.0 < tuned.tracker.mu < 60.0
+    weights = np.where(np.isfinite(y), 1.0, 0.0)
+    filled = tune(Regression(2), FLS(), np.where(weights > 0.0, y, 1e3), u, weights=weights)
+    assert filled.tracker.mu == pytest.approx(tuned.tracker.mu, rel=1e-3)
+    keep = np.isfinite(y)
+    gaps = tune(Regression(2), FLS(), y[keep], u[keep], time=np.flatnonzero(keep).astype(float))
+    assert gaps.tracker.mu == pytest.approx(tuned.tracker.mu, rel=1e-3)
+
+
+def test_order_by_sorts_the_samples():
+    y, u = walks(9)
+    order = np.random.default_rng(0).permutation(200)
+    a = tune(Regression(2), FLS(), y, u)
+    b = tune(Regression(2), FLS(), y[order], u[order], order_by=np.arange(200)[order])
+    assert b.tracker.mu == pytest.approx(a.tracker.mu, rel=1e-6)
+    path = track(Regression(2), a.tracker, y, u).smooth()
+    mixed = track(Regression(2), a.tracker, y[order], u[order]).smooth(order_by=np.arange(200.0)[order])
+    np.testing.assert_allclose(mixed.theta, path.theta[order], rtol=1e-9)
+    np.testing.assert_allclose(mixed.std, path.std[order], rtol=1e-9)
+    assert mixed.cov(0) == pytest.approx(path.cov(int(order[0])), rel=1e-9)
+    assert mixed.loo == pytest.approx(path.loo[order], rel=1e-9)
+    hidden = np.arange(200.0)[order]
+    hidden[0] = np.nan
+    assert np.isnan(track(Regression(2), a.tracker, y[order], u[order]).smooth(order_by=hidden).theta[0]).all()
+
+
+class Squared(Base):
+    """y is the square of what the regression explains: p(y) has a Jacobian that depends on y alone."""
+
+    def log_jacobian(self, theta, y):
+        return np.where(np.isfinite(y), -0.5 * np.ones(np.shape(y)), np.nan)
+
+
+def test_a_model_may_add_a_jacobian():
+    y, u = walks(5)
+    y[10] = np.nan
+    plain, squared = (tune(model, Kalman(), y, u) for model in (Regression(2), Squared(2)))
+    assert squared.loglik == pytest.approx(plain.loglik - 0.5 * 197, abs=1e-6)
+
+
+def test_table_and_plot():
+    y, u = walks(5)
+    tuned = tune(Regression(2), Kalman(), y, u, groups="each")
+    table = tuned.table
+    assert table.columns == ["q[theta1]/r", "q[theta2]/r", "loglik"]
+    assert table["loglik"].is_sorted(descending=True)
+    assert len(tuned.plot().axes) == 2
+    assert "Kalman" in repr(tuned)
+    assert len(tune(Regression(2), RLS(), y, u).plot().axes) == 1
+
+
+def test_frontier():
+    """Convex and monotone on a grid, and a slope of -mu."""
+    d = example("switching")
+    grid = frontier(d.model, d.y, d.u)
+    assert len(grid.mu) == 37
+    assert (np.diff(grid.measurement) >= -1e-10).all()
+    assert (np.diff(grid.dynamic) <= 1e-10).all()
+    slopes = np.diff(grid.measurement) / np.diff(grid.dynamic)
+    assert (np.diff(slopes) <= 1e-10 * np.abs(slopes[1:])).all()  # steeper with mu
+    for mu in (1e-3, 1.0, 300.0):
+        pair = frontier(d.model, d.y, d.u, mu=[mu * 1.001**0.5, mu / 1.001**0.5])
+        assert np.diff(pair.measurement) / np.diff(pair.dynamic) == pytest.approx(-mu, rel=1e-3)
+    assert len(grid.plot().axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("tracker", "options", "says"),
+    [
+        (Kalman(q=1.0, r=1.0), {}, "leaves nothing open"),
+        (AugmentedFLS(), {}, "use 'h-step'"),
+        (FLS(), {"method": "aic"}, "must be one of"),
+        (FLS(), {"bounds": (10.0, 1.0)}, "bounds must be"),
+        (FLS(), {"bounds": (0.0, 1.0)}, "bounds must be"),
+        (FLS(), {"level": 1.0}, "level must be"),
+        (FLS(), {"groups": ["a"]}, "one label for each of the 2"),
+        (RLS(), {"groups": "each"}, "groups belong to"),
+        (AugmentedFLS(), {"groups": "each", "method": "h-step"}, "one mu for all"),
+        (FLS(), {"h": 0}, "h must be"),
+        (FLS(), {"order_by": np.zeros(3)}, "order_by has shape"),
+        (FLS(), {"u": np.zeros((200, 2))}, "no usable sample"),
+        (FLS(), {"y": np.full(200, np.nan)}, "no usable sample"),
+    ],
+)
+def test_bad_input(tracker, options, says):
+    y, u = walks(0)
+    with pytest.raises(ValueError, match=says):
+        tune(Regression(2), tracker, options.pop("y", y), options.pop("u", u), **options)
+
+
+def test_frontier_refuses_a_weight_that_is_not_positive():
+    y, u = walks(0)
+    with pytest.raises(ValueError, match="mu must be positive"):
+        frontier(Regression(2), y, u, mu=[1.0, -1.0])
+
+
+def test_an_arx_model_with_lags_that_are_filled():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=500)
+    y = np.zeros(500)
+    for t in range(1, 500):
+        y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.1 * rng.normal()
+    y[100:103] = np.nan
+    tuned = tune(ARX(1, 1), Kalman(), y, u)
+    assert tuned.noise == pytest.approx(0.01, rel=0.2)
