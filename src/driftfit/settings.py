@@ -17,6 +17,16 @@ import numpy as np
 class Settings:
     """Base of models and trackers: a frozen dataclass, equal by value, hashable, saved without pickle."""
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]  # a dataclass leaves alone what its class has
+
+    def __repr__(self) -> str:
+        """What makes it again: settings without a default, and those that differ from it."""
+        own = [field for field in fields(self) if field.init]  # type: ignore[arg-type]
+        said = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
+        return f"{type(self).__name__}({', '.join(said)})"
+
     def settings(self) -> dict[str, Any]:
         """The fields as plain data (numbers, strings, None, nested tuples)."""
         return {field.name: getattr(self, field.name) for field in fields(self) if field.init}  # type: ignore[arg-type]
