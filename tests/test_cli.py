@@ -11,7 +11,7 @@ from driftfit.export import as_table
 from driftfit.files import read_columns
 
 runner = CliRunner()
-SETTINGS = ["-p", "q=1e-4", "-p", "r=0.01"]
+SETTINGS = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
 
 
 def simulate(T=200, seed=3):
@@ -59,6 +59,15 @@ def test_track_prints_the_summary_of_the_run(file):
     assert result.exit_code == 0, result.output
     said = [line for line in result.output.splitlines() if "flow rate from pressure" not in line]
     assert str(expected().summary()).splitlines() == said
+
+
+def test_without_settings_the_tracker_chooses_them(file):
+    result = run("track", file, "--y", "flow rate", "--u", "pressure", "--model", "arx:1,1")
+    assert result.exit_code == 0, result.output
+    assert "AdaptiveKalman()" in result.output
+    message = fails("track", file, "--y", "flow rate", "--u", "pressure", "-p", "q=1")
+    assert "AdaptiveKalman has no setting 'q'" in message
+    assert "Kalman" in message
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])
@@ -177,11 +186,13 @@ def test_wrong_models(file, model, hint):
 )
 def test_wrong_settings(file, settings, hint):
     given = [part for setting in settings for part in ("-p", setting)]
-    assert hint in fails("track", file, "--y", "flow rate", "--u", "pressure", "--model", "arx:1,1", *given)
+    assert hint in fails(
+        "track", file, "--y", "flow rate", "--u", "pressure", "--model", "arx:1,1", "--tracker", "kalman", *given
+    )
 
 
 def test_unknown_tracker_gets_near_matches(file):
-    message = fails("track", file, "--y", "flow rate", "--u", "pressure", "--tracker", "kalmn", *SETTINGS)
+    message = fails("track", file, "--y", "flow rate", "--u", "pressure", "--tracker", "kalmn")
     assert "did you mean Kalman" in message
 
 

@@ -43,7 +43,20 @@ def run(*arguments: str) -> str:
 
 
 def test_a_fleet_over_a_pattern(folder):
-    settings = ("--model", "arx:1,1", "-p", "q=1e-3", "-p", "r=0.1", "--time", "t", "--unit", "flow=l/min")
+    settings = (
+        "--model",
+        "arx:1,1",
+        "--tracker",
+        "kalman",
+        "-p",
+        "q=1e-3",
+        "-p",
+        "r=0.1",
+        "--time",
+        "t",
+        "--unit",
+        "flow=l/min",
+    )
     text = run(
         "*.csv", "--y", "flow", "--u", "valve", "--by", "pump", *settings, "--out", "fleet.parquet", "--plot", "f.png"
     )
@@ -88,6 +101,8 @@ def test_what_is_wrong_is_said_in_one_line(folder):
         (["z*.csv", "--y", "flow"], "no file matches z*.csv"),
         (["a.csv", "--y", "flow", "--unit", "flow"], "a unit is given as column=unit"),
     ):
-        result = CliRunner().invoke(app, ["track", *arguments, "--model", "arx:1,0", "-p", "q=0", "-p", "r=1"])
+        result = CliRunner().invoke(
+            app, ["track", *arguments, "--model", "arx:1,0", "--tracker", "kalman", "-p", "q=0", "-p", "r=1"]
+        )
         assert result.exit_code == 2
         assert said in " ".join(result.output.split())

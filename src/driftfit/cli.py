@@ -88,7 +88,7 @@ def track(
     ] = None,
     tracker: Annotated[
         str, typer.Option(help="Tracker, as `driftfit trackers` lists them; the default needs no settings.")
-    ] = "kalman",
+    ] = "adaptive-kalman",
     p: Annotated[
         list[str] | None, typer.Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")
     ] = None,
@@ -244,6 +244,11 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
         key, is_named, value = entry.partition("=")
         if not is_named or not value.strip():
             raise ValueError(f"-p {entry}: a setting is name=value, such as -p {known[0]}=1e-4.")
+        others = [other for other, at in trackers.found().items() if key.strip() in {f.name for f in given_fields(at)}]
+        if key.strip() not in known and others:
+            raise ValueError(
+                f"-p {entry}: {kind.__name__} has no setting {key.strip()!r}; {', '.join(others)} have it."
+            )
         add_setting(f"-p {entry}", settings, known, key.strip(), parse_value(value, ","))
     return build(f"--with {own}" if own else f"--tracker {name}", kind, settings)
 

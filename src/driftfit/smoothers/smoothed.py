@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 from functools import cached_property
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
 
 from driftfit.kernel import Array
 from driftfit.settings import one_of
@@ -117,7 +117,7 @@ class Smoothed:
         """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
         if not 0.0 < level < 1.0:
             raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
-        half = stats.norm.ppf(0.5 + level / 2.0) * self.std
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
         return self.theta - half, self.theta + half
 
     def cov(self, t: int) -> Array:

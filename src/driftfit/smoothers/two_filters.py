@@ -24,7 +24,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from driftfit.drivers import WIDTH, make_tile
 from driftfit.kernel import Array, Driver
@@ -74,7 +73,7 @@ def start(walk: Walk, scale: Array, spanned: Array) -> tuple[Array, Array, Array
     """
     theta0 = walk.theta0 * scale
     if walk.p0 is not None:
-        variance, axes = linalg.eigh(walk.p0 * np.outer(scale, scale))
+        variance, axes = np.linalg.eigh(walk.p0 * np.outer(scale, scale))
         sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
         rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
         return rows, rows @ theta0, np.zeros(len(scale), bool)
@@ -88,6 +87,8 @@ def start(walk: Walk, scale: Array, spanned: Array) -> tuple[Array, Array, Array
 
 def unspanned(spanned: Array, scale: Array) -> Array:
     """Orthonormal basis, in rows, of the theta that regressors in the span of ``spanned / scale`` do not see."""
+    from scipy import linalg  # a fifth of a second to import
+
     complement = linalg.null_space(spanned) if len(spanned) else np.eye(len(scale))
     basis: Array = linalg.qr(complement / scale[:, None], mode="economic")[0].T
     return basis

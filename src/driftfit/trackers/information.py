@@ -19,7 +19,6 @@ that keeps the triangle. Cost: n rotations a sample and n (n + 1) / 2 for the dr
 from __future__ import annotations
 
 import numpy as np
-from scipy import linalg
 
 from driftfit.kernel import Array, kernel
 
@@ -100,6 +99,8 @@ def triangular_root(q: Array) -> Array:
     variances = np.diag(q)
     if np.array_equal(q, np.diag(variances)):
         return np.diag(np.sqrt(variances))
+    from scipy import linalg  # a fifth of a second to import
+
     values, vectors = linalg.eigh(q)
     G: Array = linalg.rq(vectors * np.sqrt(np.maximum(values, 0.0)), mode="r")
     return G

@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel
@@ -27,6 +26,8 @@ from driftfit.trackers.information import absorb, invert, solve, spread, triangu
 
 def state(q: Array, theta0: Array, p0: Array | None) -> Mapping[str, Any]:
     """Fields beside those of the covariance form."""
+    from scipy import linalg  # a fifth of a second to import
+
     n = len(theta0)
     S = np.zeros((n, n)) if p0 is None else linalg.solve_triangular(triangular_root(p0), np.eye(n))
     return {

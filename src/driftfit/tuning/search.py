@@ -16,7 +16,6 @@ from functools import cached_property
 from statistics import NormalDist
 
 import numpy as np
-from scipy import optimize
 
 from driftfit.kernel import Array
 from driftfit.tuning.knobs import Knobs
@@ -103,6 +102,8 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
         values = f(points)
         slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
         return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
+
+    from scipy import optimize  # half a second to import
 
     options = {"ftol": 1e-14, "gtol": 1e-9, "maxiter": 100}  # the logarithm of a mean square is flat: 0.01 a decade^2
     found = optimize.minimize(
