@@ -338,3 +338,17 @@ def test_picture_shows_every_parameter():
     assert [axis.get_ylabel() for axis in figure.axes] == ["gain", "offset"]
     with pytest.raises(ValueError, match="level must be between"):
         track(Regression(2), FLS(mu=3.0), y, phi).smooth().band(95)
+
+
+def test_what_the_record_does_not_determine_is_as_asked():
+    phi, y = record(30, 2)
+    phi[:, 1] = 0.0
+    run = track(Regression(["gain", "idle"]), FLS(mu=1.0, theta0=[0.0, 5.0]), y, phi)
+    np.testing.assert_allclose(run.smooth().theta[:, 1], 5.0, rtol=1e-14)
+    nan = run.smooth(undetermined="nan").theta
+    assert np.isfinite(nan[:, 0]).all()
+    assert np.isnan(nan[:, 1]).all()
+    with pytest.raises(ValueError, match=r"does not determine idle \(rank 1 of 2\)"):
+        run.smooth(undetermined="raise")
+    with pytest.raises(ValueError, match="undetermined"):
+        run.smooth(undetermined="zero")

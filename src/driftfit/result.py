@@ -177,19 +177,20 @@ class Track:
         run(tile, self.y[: t + 1, None], self.u[: t + 1, :, None], known[:, :, None], out)
         return self.tracker.cov({name: tile[name][0, ..., 0] for name in storage.fields(tile)})
 
-    def smooth(self, keep: str = "std", order_by: Any = None) -> Smoothed:
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.
 
         The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
         each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
-        time; the samples are sorted by it, smoothed in that order, and put back. ValueError for a tracker that is no
-        random walk in Gaussian noise.
+        time; the samples are sorted by it, smoothed in that order, and put back. ``undetermined``: what to give for
+        parameters that the record does not determine, whose std is inf: "min_norm", the answer nearest to theta0;
+        "nan"; or "raise". ValueError for a tracker that is no random walk in Gaussian noise.
         """
         from driftfit.smoothers.smoothed import Smoothed
 
         if self._start is not None:
             raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
-        return Smoothed.of(self, keep, order_by)
+        return Smoothed.of(self, keep, order_by, undetermined)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """theta and y at the h nominal samples after the record, u (h,) or (h, m) being the inputs then."""

@@ -61,11 +61,22 @@ class Smoothed:
         self.r = noise_variance(walk, path) if walk.r is None else walk.r
 
     @classmethod
-    def of(cls, run: Track, keep: str = "std", order_by: Any = None) -> Smoothed:
+    def of(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Smooth a run."""
         one_of("smooth", "keep", keep, ("std", "cov"))
+        one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
         walk = walk_of(run)
-        return cls(walk, solve(walk, keep, order_by), run, order_by)
+        smoothed = cls(walk, solve(walk, keep, order_by), run, order_by)
+        unknown = np.isinf(smoothed._path.var)
+        if undetermined == "raise" and unknown.any():
+            names = ", ".join(name for name, one in zip(run.names, unknown.any(axis=0), strict=True) if one)
+            raise ValueError(
+                f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {len(run.names)}); "
+                'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
+            )
+        if undetermined == "nan":
+            smoothed.theta[unknown] = np.nan
+        return smoothed
 
     def __repr__(self) -> str:
         run = self.run
