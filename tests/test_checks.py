@@ -163,7 +163,7 @@ def test_a_tracker_from_any_module_passes_everywhere(tmp_path):
     fleet = track(ARX(1, 1), NLMS(), y, u, by="row")
     run = track(ARX(1, 1), NLMS(), y[3], u[3])
     assert np.array_equal(fleet[3].theta, run.theta)
-    assert "NLMS(gain=0.5)" in str(run.summary())
+    assert "NLMS()" in str(run.summary())
     assert "x median" in str(fleet.summary())
     run.plot()
     fleet.plot()

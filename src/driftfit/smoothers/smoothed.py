@@ -69,7 +69,9 @@ class Smoothed:
         smoothed = cls(walk, solve(walk, keep, order_by), run, order_by)
         unknown = np.isinf(smoothed._path.var)
         if undetermined == "raise" and unknown.any():
-            names = ", ".join(name for name, one in zip(run.names, unknown.any(axis=0), strict=True) if one)
+            names = ", ".join(
+                name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
+            )
             raise ValueError(
                 f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {len(run.names)}); "
                 'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
