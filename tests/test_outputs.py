@@ -128,10 +128,10 @@ def test_stream_is_record_also_after_a_restart(tracker, tmp_path):
 
 def test_summary_and_pictures():
     y, u = coupled()
-    run = track(ARX(2, 1, ny=NAMES, intercept=True), Kalman(q=1e-5, r=0.01), y, u)
-    assert "a2[flow<-level]" in run.summary()
-    assert "intercept[level]" in run.summary()
-    assert len(run.plot().axes) == 2 * 6
+    run = track(ARX(1, 1, ny=NAMES), Kalman(q=1e-5, r=0.01), y, u)
+    assert "a1[flow<-level]" in run.summary()
+    assert "b1[level<-u]" in run.summary()
+    assert len(run.plot().axes) == 2 * 3
     assert "level 118" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
