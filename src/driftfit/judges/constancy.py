@@ -163,7 +163,8 @@ def _null(A: Array, V: Array, inverse: Array) -> Array:
 
 def _weights(cov: Array) -> Array:
     """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
-    return np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
+    weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
+    return weights
 
 
 def _each(S: Array, cov: Array, var: Array) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
+    from driftfit.diagnose import Diagnosis
     from driftfit.result import Track
     from driftfit.verdict import Verdict
 
@@ -17,3 +18,9 @@ class Judged:
         from driftfit.verdict import verdict
 
         return verdict(cast("Track", self), level, lags)
+
+    def diagnose(self) -> Diagnosis:
+        """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.diagnose`."""
+        from driftfit.diagnose import diagnose
+
+        return diagnose(cast("Track", self))
