@@ -64,7 +64,7 @@ NOISE = np.random.default_rng(7).normal(size=600)
 def test_constancy_needs_record_and_tracker_to_agree():
     path = np.tile([1.2, -0.5, 1.0, 0.4], (600, 1))
     path[300:, 2] += 0.5
-    moving, steady = arx_record(600, 3, theta=path), arx_record(600, 4)
+    moving, steady = arx_record(600, 3, theta=path), arx_record(600, 5)
     assert "constancy (p)" in faults(TRUE, *moving)[0]
     assert "constancy (p)" not in faults(Kalman(q=1e-3, r=0.01), *moving)[0]
     assert "constancy (p)" not in faults(TRUE, *steady)[0]
