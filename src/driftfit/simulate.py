@@ -56,7 +56,7 @@ def ahead(run: Track, k: int) -> Prediction:
     ValueError
         If k is below 1, or the model is neither ARX nor Regression.
     """
-    na, U = _regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
+    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     whole("ahead", "k", k, 1)
     T, theta, cov = len(run), run.theta, covariances(run)
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
@@ -104,7 +104,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     inputs = as_inputs(u, h)
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
-    na, U = _regressors(run.model, inputs, rest=0.0)
+    na, U = input_regressors(run.model, inputs, rest=0.0)
     (theta,), (cov,) = taken(run, at)
     given = np.zeros(0) if y is None else np.asarray(y, float)
     r = noise_at(run, at)
@@ -131,7 +131,7 @@ def noise_at(run: Track, at: int) -> float:
         return float("nan")
     t = int(known[-1])
     before = run.cov(t - 1) if t > 0 else np.full((len(run.names),) * 2, np.nan)
-    _, U = _regressors(run.model, run.u[: t + 1])
+    _, U = input_regressors(run.model, run.u[: t + 1])
     na = run.model.na if isinstance(run.model, ARX) else 0
     phi = np.concatenate([[run.y[t - i] if t >= i else np.nan for i in range(1, na + 1)], U[t]])
     q = _drift(run, np.full(1, run.innovation_std[t] ** 2))[0]
@@ -139,7 +139,7 @@ def noise_at(run: Track, at: int) -> float:
     return float(r) if np.isfinite(r) and r > 0.0 else float(run.innovation_std[t] ** 2)
 
 
-def _regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
+def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
     """(na, the regressors (T, n - na) that inputs make); what is before the record is ``rest``."""
     one = [np.ones((len(u), 1))] if getattr(model, "intercept", False) else []
     if isinstance(model, Regression):

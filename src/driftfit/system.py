@@ -89,7 +89,7 @@ def covariances(run: Track) -> Array:
 
 def _finite(cov: Array) -> Array:
     """Covariances (T, n, n) with all of one NaN where a parameter of it is not known yet."""
-    known: Array = np.isfinite(cov).all(axis=(1, 2), keepdims=True)
+    known = np.asarray(np.isfinite(cov).all(axis=(1, 2), keepdims=True))
     return np.where(known, cov, np.nan)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
     from driftfit.kernel import Array
     from driftfit.result import Track
@@ -87,3 +88,9 @@ class Judged:
         from driftfit.system import long_run
 
         return long_run(cast("Track", self), at, level)
+
+    def detect(self, kind: str = "band", **settings: Any) -> Alarms:
+        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`."""
+        from driftfit.detect import detect
+
+        return detect(cast("Track", self), kind, **settings)

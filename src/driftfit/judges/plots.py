@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
 
 COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d17aa5")
@@ -111,3 +112,32 @@ def _paths(axis: Axes, said: Diagnosis) -> None:
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)
     _titled(axis, "constancy: paths of the estimates, standardised", said["constancy (p)"].ok)
+
+
+def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
+    """The output, and each statistic over its limit, with alarms and labels shaded."""
+    run, c = said.run, len(said.names)
+    figure = new_figure(9.5, 1.5 * c + 2.0)
+    axes = figure.subplots(c + 1, 1, sharex=True)
+    axes[0].plot(run.time, run.y, color=BLUE, lw=0.8)
+    axes[0].set_ylabel(run.labels.y)
+    for axis, name, column, limit in zip(axes[1:], said.names, said.statistic.T, said.limits, strict=True):
+        axis.plot(run.time, column / limit, color=BLUE, lw=0.9)
+        axis.axhline(1.0, color=RED, lw=0.9, ls="--")
+        axis.set_ylabel(name)
+        shown = column[said.start :][np.isfinite(column[said.start :])] / limit
+        if shown.size:
+            axis.set_ylim(min(shown.min(), 0.0) - 0.1, min(max(1.3, 1.1 * shown.max()), 8.0))
+    for axis in axes:
+        for shaded, colour in ((said.active, RED), (labels, GREY)):
+            if shaded is not None:
+                low, high = axis.get_ylim()
+                axis.fill_between(run.time, low, high, where=np.asarray(shaded, bool), color=colour, alpha=0.25, lw=0)
+                axis.set_ylim(low, high)
+        axis.grid(alpha=0.25, lw=0.5)
+        if said.start < len(run):
+            axis.axvline(run.time[said.start], color=GREY, lw=0.8, ls=":")
+    axes[0].set_title("alarms red, labels grey; statistics over their limits", fontsize=9, loc="left")
+    axes[-1].set_xlabel(time_label(run))
+    date_axis(axes[-1], run)
+    return figure
