@@ -17,10 +17,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from driftfit import AdaptiveKalman, Regression, Track, track
+from driftfit import Kalman, Regression, Track, track, tune
 
 EVERY = 3600.0
 """One false alarm in an hour of samples."""
+STEP = 1.0
+"""Resolution of the flow meter, l/min."""
 MODEL = Regression(["pressure", "current"], intercept=True)
 
 
@@ -30,11 +32,16 @@ def records(path: str) -> dict[str, pl.DataFrame]:
     return {str(name[0]): part for name, part in data.group_by("experiment", maintain_order=True)}
 
 
-def followed(part: pl.DataFrame) -> Track:
-    """Flow (l/min) on pressure (bar) and current (A), each about its mean over the first 300 samples."""
+def followed(part: pl.DataFrame, reference: int) -> Track:
+    """Flow (l/min) on pressure (bar) and current (A), each about its mean in the reference.
+
+    Drift and noise are the most likely ones of the reference; the flow meter counts in steps, whose noise is the least.
+    """
     y = part["flow_lpm"].to_numpy()
     u = part.select("pressure_bar", "current_A").to_numpy()
-    return track(MODEL, AdaptiveKalman(), y, u - u[:300].mean(axis=0))
+    u = u - u[:reference].mean(axis=0)
+    found = tune(MODEL, Kalman(), y[:reference], u[:reference]).tracker
+    return track(MODEL, Kalman(q=found.q, r=max(found.r, STEP**2 / 12.0)), y, u)
 
 
 def main(path: str, figures: str | None = None) -> None:
@@ -43,8 +50,9 @@ def main(path: str, figures: str | None = None) -> None:
     for head in heads:
         table.add_column(head, justify="left" if head in heads[:2] else "right")
     for name, part in records(path).items():
-        run, labels = followed(part), part["anomaly"].to_numpy() > 0.5
+        labels = part["anomaly"].to_numpy() > 0.5
         reference = int(np.argmax(labels)) * 3 // 4
+        run = followed(part, reference)
         for kind, settings in (
             ("band", {}), ("band", {"calibrate": True, "at": reference}),
             ("innovation", {"window": 20}), ("innovation", {"window": 20, "calibrate": True, "at": reference}),
