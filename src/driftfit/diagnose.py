@@ -29,6 +29,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.compare import errors
+from driftfit.drivers import LARGEST
 from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.excitation import INDEX, Excitation, excitation
 from driftfit.judges.seen import Seen, regressors
@@ -116,9 +117,9 @@ class Diagnosis:
 
     def plot(self) -> Figure:
         """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""
-        from driftfit.judges.plots import plot_diagnosis
+        from driftfit.judges.plots import draw_diagnosis
 
-        return plot_diagnosis(self)
+        return draw_diagnosis(self)
 
 
 def diagnose(run: Track) -> Diagnosis:
@@ -156,7 +157,7 @@ def _whiteness(white: Whiteness) -> Check:
 def _inputs(run: Track, z: Array) -> list[Check]:
     if run.u.shape[1] == 0:
         return []
-    p = np.array([crossing(z, u).p for u in run.u.T])
+    p = np.array([crossing(z, u).p for u in np.where(np.abs(run.u) < LARGEST, run.u, np.nan).T])
     if np.isnan(p).all():
         return [Check("inputs (p)", float("nan"), 0.01, np.inf, "")]
     worst = int(np.nanargmin(p))

@@ -117,9 +117,9 @@ class Verdict:
         if np.isnan(self.p):
             return "The record cannot tell whether parameters move: too few samples, or regressors that do not span."
         if self.drifts:
-            return f"The parameters move: constants are rejected with p = {p_text(self.p)} (level {self.level:g})."
+            return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
         return (
-            f"No drift found: constant parameters are not rejected, p = {p_text(self.p)} (level {self.level:g}). "
+            f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
             "A drift that is small beside the noise cannot be ruled out."
         )
 
@@ -138,10 +138,10 @@ class Verdict:
         change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            return f"Following them pays: the one-step error is {size} than that of constants (p = {p_text(steady.p)})."
+            return f"Following them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
         return (
             f"Following them does not clearly pay here: the one-step error is {size} than that of constants "
-            f"(p = {p_text(steady.p)})."
+            f"({p_equals(steady.p)})."
         )
 
     def _caution(self) -> str:
@@ -179,6 +179,11 @@ class Verdict:
 def p_text(p: float) -> str:
     """A p-value as it is written."""
     return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+
+
+def p_equals(p: float) -> str:
+    """A p-value in a sentence."""
+    return f"p {p_text(p)}" if p < 1e-4 else f"p = {p_text(p)}"
 
 
 def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
@@ -94,3 +95,9 @@ class Judged:
         from driftfit.detect import detect
 
         return detect(cast("Track", self), kind, **settings)
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`."""
+        from driftfit.report import report
+
+        report(cast("Track", self), path, title)

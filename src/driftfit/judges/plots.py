@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d17aa5")
 
 
-def plot_diagnosis(said: Diagnosis) -> Figure:
+def draw_diagnosis(said: Diagnosis) -> Figure:
     """Six pictures on one page."""
     figure = new_figure(11.0, 8.2)
     axes = figure.subplots(3, 2)
