@@ -58,7 +58,7 @@ STYLE = """
 @page { size: A4; margin: 15mm; }
 body { margin: 0; background: var(--page); color: var(--ink);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 60rem; margin: 0 auto; padding: 1.5rem; }
+main { max-width: 64rem; margin: 0 auto; padding: 1.5rem; }
 h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
 .soft, figcaption, caption { color: var(--soft); font-size: .88rem; }
 .verdict { background: var(--card); border-left: .35rem solid var(--blue); padding: .8rem 1.1rem; margin: 1rem 0; }
@@ -66,7 +66,7 @@ h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2r
 .wide { overflow-x: auto; } table { border-collapse: collapse; width: 100%;
   margin-bottom: 1rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding-bottom: .3rem; caption-side: top; }
-th, td { padding: .3rem .6rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+td { font-size: .94rem; } th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
 th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child { text-align: left; }
 .bad { color: var(--red); font-weight: 600; } .good { color: var(--good); }
 figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
@@ -133,8 +133,8 @@ sample: at every time the estimate uses the past only, and the band says how wel
 <ul><li><b>Do the parameters move?</b> A test of constant parameters that outliers, a changing noise level and changing
 inputs do not fool. A small p means that constants would hardly give such a record.</li>
 <li><b>Does following them pay?</b> The error of predicting the next sample, beside three simple ways: repeating the
-last value (persistence), one set of constants fitted to all of the past (constant LS), and a small constant dynamic model
-(constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
+last value (persistence), one set of constants fitted to all of the past (constant LS), and a small constant dynamic
+model (constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
 <li><b>Diagnostics</b> say whether the bands can be trusted. What is out of bounds comes with what to try.</li></ul>"""
 
 
