@@ -66,7 +66,8 @@ h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2r
 .wide { overflow-x: auto; } table { border-collapse: collapse; width: 100%;
   margin-bottom: 1rem; font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding-bottom: .3rem; caption-side: top; }
-td { font-size: .94rem; } th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+td { font-size: .94rem; }
+th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
 th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child { text-align: left; }
 .bad { color: var(--red); font-weight: 600; } .good { color: var(--good); }
 figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
