@@ -108,6 +108,9 @@ def track(
         Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (a Track).")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write a page about the run (.html), to send to someone; not for fleets.")
+    ] = None,
 ) -> None:
     """Follow the parameters of a model through a record, or through a fleet of them."""
     with helpful():
@@ -116,6 +119,8 @@ def track(
         chosen = parse_tracker(tracker, p or [], own)
         if write_to is not None:
             check_ending(write_to)
+        if report is not None and by:
+            raise ValueError("--report: a page is about one series; leave out --by, or pick a series in Python.")
         signals: Any = {"y": y, "u": inputs, "data": file, "time": time, "by": by or None}
         with progress.status("tracking (the first run of a model and tracker compiles it)"):
             run: Any = run_track(bound, chosen, **signals, dt=parse_interval(dt), units=parse_units(unit))
@@ -125,6 +130,8 @@ def track(
             write(run, write_to)
         if plot is not None:
             run.plot().savefig(plot, dpi=150)
+        if report is not None:
+            run.report(report)
 
 
 @app.command(name="trackers")

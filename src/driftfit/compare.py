@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.drivers import LARGEST
+from driftfit.judges.seen import constant_least_squares
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.result import Track, root_mean_square
@@ -38,16 +39,32 @@ def persistence(y: Array) -> Array:
     return np.where(last >= 0, y[last], np.nan)
 
 
-def compare(run: Track) -> Comparison:
-    """Score a run beside persistence, constant least squares and constant ARX."""
+class Errors(NamedTuple):
+    """One-step errors of everyone, (T,) each, and which samples are scored."""
+
+    tracked: Array
+    persistence: Array
+    constant_ls: Array
+    constant_arx: Array
+    scored: Array
+
+
+def errors(run: Track) -> Errors:
+    """One-step errors of a run, of persistence, of constant least squares and of constant ARX."""
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     gaps = run._known[:, 0]  # 0 before the lags are filled
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
-    steady = track(run.model, RLS(1.0), y, u, time=time)
+    steady = constant_least_squares(run)["e"][:, 0]
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
-    errors = [run.innovation, y - persistence(y), steady.innovation, arx.innovation]
+    own = (run.innovation, y - persistence(y), steady, arx.innovation)
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
-    for error in errors:
+    for error in own:
         scored &= np.isfinite(error)
-    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in errors)
+    return Errors(*own, scored)
+
+
+def compare(run: Track) -> Comparison:
+    """Score a run beside persistence, constant least squares and constant ARX."""
+    *own, scored = errors(run)
+    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in own)
     return Comparison(tracked, last, ls, constant, int(scored.sum()))

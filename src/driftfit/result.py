@@ -15,6 +15,7 @@ import numpy as np
 
 from driftfit import storage
 from driftfit.drivers import drivers, output_type
+from driftfit.judges.methods import Judged
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import PLAIN, Labels
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from driftfit.summary import Summary
 
 
-class Track:
+class Track(Judged):
     """Parameters of a record, sample by sample.
 
     Attributes

@@ -1,0 +1,70 @@
+"""How often constants are said to move, and how often moving parameters are found.
+
+The level is 5 %. Regression on three inputs, and ARX(2, 2); noise that is steady, has outliers (5 % are ten times as
+large), is heavy-tailed (Student's t, 3 degrees of freedom), or changes its variance (four times the deviation in the
+last 30 %); and inputs that become three times as large half-way. "joint" is the share of records whose parameters are
+said to move, "named" the share in which at least one is named, "Hansen" what the joint statistic and the published
+table would say.
+
+Run: python benchmarks/verdict_error_rate.py [records a cell, 1000 by default]
+"""
+
+import sys
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from driftfit.judges.constancy import constancy
+from driftfit.judges.quadratic import quantile
+from driftfit.verdict import holm
+
+LEVEL = 0.05
+NOISES = ("steady", "outliers", "heavy tails", "changing noise", "changing noise and inputs")
+LIMIT = {n: quantile(np.tile(1.0 / (np.pi * np.arange(1, 400)) ** 2, n), LEVEL) for n in (3, 4)}
+
+
+def noise(kind: str, rng: np.random.Generator, T: int) -> np.ndarray:
+    e = rng.standard_t(3, size=T) if kind == "heavy tails" else rng.normal(size=T)
+    if kind == "outliers":
+        e *= np.where(rng.random(T) < 0.05, 10.0, 1.0)
+    if kind.startswith("changing"):
+        e *= np.where(np.arange(T) > 0.7 * T, 4.0, 1.0)
+    return e
+
+
+def record(model: str, kind: str, rng: np.random.Generator, T: int, jump: float) -> tuple[np.ndarray, np.ndarray]:
+    """Regressors and output; from sample T / 2 on the last parameter is larger by ``jump``."""
+    e = noise(kind, rng, T)
+    u = rng.normal(size=(T, 3)) * np.where(np.arange(T) < T // 2, 1.0, 3.0 if "inputs" in kind else 1.0)[:, None]
+    gain = 0.5 + jump * (np.arange(T) >= T // 2)
+    if model == "regression":
+        return u, u[:, 0] - u[:, 1] + gain * u[:, 2] + e
+    y, drive = np.zeros(T), u[:, 0]
+    for t in range(2, T):
+        y[t] = 1.1 * y[t - 1] - 0.5 * y[t - 2] + drive[t - 1] + gain[t] * drive[t - 2] + e[t]
+    return np.column_stack([y[1:-1], y[:-2], drive[1:-1], drive[:-2]]), y[2:]
+
+
+def main(records: int = 1000) -> None:
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell", width=100)
+    for head in ("model", "noise", "T", "joint", "named", "Hansen", "finds a jump of 0.5"):
+        table.add_column(head, justify="left" if head in ("model", "noise") else "right")
+    for model in ("regression", "arx"):
+        for kind in NOISES:
+            for T in (100, 300, 1000):
+                rng = np.random.default_rng([T, *model.encode(), *kind.encode()])
+                still = [constancy(*record(model, kind, rng, T, 0.0)) for _ in range(records)]
+                moved = [constancy(*record(model, kind, rng, T, 0.5)) for _ in range(records // 4)]
+                said = np.mean([test.p_joint < LEVEL for test in still])
+                named = np.mean([test.p_joint < LEVEL and holm(test.p_own, LEVEL).any() for test in still])
+                hansen = np.mean([test.joint > LIMIT[len(test.p)] for test in still])
+                found = np.mean([test.p_joint < LEVEL for test in moved])
+                shares = (f"{100.0 * share:.1f} %" for share in (said, named, hansen, found))
+                table.add_row(model, kind, str(T), *shares)
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main(*(int(given) for given in sys.argv[1:2]))

@@ -1,0 +1,303 @@
+"""Detect: alarms from a run, with a rate of false alarms that is set and not tuned.
+
+    "band"          a parameter has left its reference band:      max((theta - high) / std, (low - theta) / std) > z
+    "innovation"    the last W innovations are too large, or too one-sided, for what the run expects
+    "probability"   the probability of a change, from a tracker that carries hypotheses (`Bank`), is above a limit
+
+``every`` is the number of samples in which one false alarm may begin (an alarm that stays on counts once).
+
+* band: z is the normal quantile of 1 / (every c) for c parameters watched. The rate holds for a parameter that stands
+  at the very edge of its band, where the run's std is right; inside the band alarms are rarer, and successive estimates
+  are alike, so that what begins is rarer than what exceeds. The rate is a bound.
+* innovation: g = e / s; limits of the windowed sums of g^2 and of g from their exact rate of onsets
+  (`driftfit.judges.onsets`), half of the rate for each. With ``reference`` the g are normal scores of the
+  innovations among those of the reference, so that outliers and tails that were normal there are normal later.
+* probability: the limit is found by simulation. Records with constant parameters are made from the run (its inputs,
+  its parameters at ``at``, its standardised innovations redrawn) and tracked; the limit is exceeded by onsets at the
+  rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
+
+Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many
+runs as 5 every / T for a calibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from io import StringIO
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+from scipy import special
+
+from driftfit.judges.calibrate import limit_of, null_records
+from driftfit.judges.onsets import held, mean_limit, onsets, power_limit
+from driftfit.kernel import Array
+from driftfit.result import Track
+from driftfit.settings import near, one_of, whole
+from driftfit.summary import WIDTH, facts, table_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KINDS = ("band", "innovation", "probability")
+
+Reference = Mapping[str, tuple[float, float]] | int | None
+
+
+class Score(NamedTuple):
+    """Alarms against labels of what was wrong."""
+
+    events: int
+    """Stretches of samples with a true label."""
+    found: int
+    """Stretches during which an alarm was on."""
+    delay: float
+    """Median samples from the beginning of a found stretch to its alarm."""
+    false: int
+    """Alarms that began outside all stretches, and ended before the next one."""
+    normal: int
+    """Samples outside all stretches that were judged."""
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """What `Track.detect` returns; printing it shows a table.
+
+    Attributes
+    ----------
+    active : (T,) bool
+        An alarm is on.
+    onsets : (k,) int
+        Samples at which one begins.
+    statistic : (T, c)
+        What is compared; NaN where there is nothing to judge.
+    limits : (c,)
+        What it is compared with.
+    names : tuple of str
+        What the columns are: parameters, "power" and "mean" of the innovations, or "probability".
+    start : int
+        First sample that is judged; what comes before is the start of the run, or the reference.
+    """
+
+    kind: str
+    every: float
+    active: Array
+    onsets: Array
+    statistic: Array
+    limits: Array
+    names: tuple[str, ...]
+    start: int
+    run: Track = field(repr=False, compare=False)
+
+    def cause(self, t: int) -> str:
+        """The column that is furthest beyond its limit at sample t."""
+        ratio = np.where(np.isfinite(self.statistic[t]), self.statistic[t] / self.limits, -np.inf)
+        return self.names[int(np.argmax(ratio))]
+
+    def score(self, labels: Any) -> Score:
+        """Compare with labels (T,), true where something is wrong; ValueError for another length."""
+        wrong = np.asarray(labels).astype(bool)
+        if wrong.shape != self.active.shape:
+            raise ValueError(f"score: labels have shape {wrong.shape}, but the record has {len(self.active)} samples.")
+        first = onsets(wrong)
+        last = np.array([t + int(np.argmin(np.append(wrong[t:], False))) for t in first], int)
+        delays = []
+        for a, b in zip(first, last, strict=True):
+            on = np.flatnonzero(self.active[a:b])
+            delays += [int(on[0])] if len(on) else []
+        false = sum(not wrong[t] and not wrong[t : self._end(t)].any() for t in self.onsets)
+        delay = float(np.median(delays)) if delays else float("nan")
+        return Score(len(first), len(delays), delay, int(false), int(np.sum(~wrong[self.start :])))
+
+    def _end(self, t: int) -> int:
+        """The sample after the alarm that began at t."""
+        return t + int(np.argmin(np.append(self.active[t:], False)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        judged = len(self.active) - self.start
+        expected = judged / self.every
+        yield facts(
+            ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
+            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
+            ("Alarms", f"{len(self.onsets)}"),
+        )
+        table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
+        for t in self.onsets[:20]:
+            j = self.names.index(self.cause(int(t)))
+            stop = min(self._end(int(t)), len(self.active)) - 1
+            numbers = (f"{self.statistic[t, j]:.4g}", f"{self.limits[j]:.4g}")
+            table.add_row(self.run.time_text(int(t)), self.run.time_text(stop), Text(self.names[j]), *numbers)
+        yield table
+        if len(self.onsets) > 20:
+            yield Text(f" and {len(self.onsets) - 20} more", "dim")
+
+    def __str__(self) -> str:
+        text = StringIO()
+        Console(file=text, width=WIDTH, color_system=None).print(self)
+        return text.getvalue()
+
+    def plot(self, labels: Any = None) -> Figure:
+        """Statistics over their limits, alarms marked; labels (T,) are shaded."""
+        from driftfit.judges.plots import plot_alarms
+
+        return plot_alarms(self, labels)
+
+
+def detect(
+    run: Track,
+    kind: str = "band",
+    *,
+    every: float = 10_000.0,
+    reference: Reference = None,
+    window: int = 50,
+    hold: int = 0,
+    calibrate: bool = False,
+    at: int = -1,
+    seed: int = 0,
+) -> Alarms:
+    """Find alarms in a run.
+
+    Parameters
+    ----------
+    run : Track
+        What is watched.
+    kind : "band", "innovation" or "probability"
+        See the module.
+    every : number
+        Samples in which one false alarm may begin.
+    reference : mapping from names to (low, high), or a number of samples
+        For "band": where the parameters belong; or the first samples, whose range after the start of the run is the
+        band. For "innovation": the first samples, which are normal. They are not judged.
+    window : int
+        Samples in the sums of "innovation", at least 4.
+    hold : int
+        An alarm stays on for so many samples after what caused it.
+    calibrate : bool
+        Find the limits by simulation from the run instead of from theory ("probability" always does).
+    at : int
+        The sample whose parameters are true in that simulation.
+    seed : int
+        Of that simulation.
+
+    Raises
+    ------
+    ValueError
+        For a kind that is unknown, a reference that does not fit, or a tracker that has not what the kind needs.
+    """
+    one_of("detect", "kind", kind, KINDS)
+    if not every > 1.0:
+        raise ValueError(f"detect: every must be a number of samples above 1; got {every!r}.")
+    whole("detect", "window", window, 4)
+    whole("detect", "hold", hold, 0)
+    statistic, limits, names, start = _STATISTICS[kind](run, every, reference, window)
+    if calibrate or kind == "probability":
+        made = (_STATISTICS[kind](null, every, reference, window) for null in null_records(run, every, at, seed))
+        limits = limit_of(((part[0], part[3]) for part in made), every)
+    with np.errstate(invalid="ignore"):
+        active = held((statistic > limits).any(axis=1) & (np.arange(len(run)) >= start), hold)
+    return Alarms(kind, float(every), active, onsets(active), statistic, np.asarray(limits), names, start, run)
+
+
+def _band(run: Track, every: float, reference: Reference, window: int) -> tuple[Array, Array, tuple[str, ...], int]:
+    """How many standard deviations parameters are outside their bands."""
+    if not run.tracker.covariance:
+        raise ValueError(f"detect: {type(run.tracker).__name__} carries no covariance, so no band can be judged.")
+    start = _burn(run)
+    if isinstance(reference, Mapping):
+        unknown = [name for name in reference if name not in run.names]
+        if unknown:
+            raise ValueError(f"detect: there is no parameter {unknown[0]!r}; {near(unknown[0], run.names)}")
+        names = tuple(reference)
+        low, high = (np.array([float(pair[side]) for pair in reference.values()]) for side in (0, 1))
+        if not (low <= high).all():
+            raise ValueError(f"detect: a reference band is (low, high) with low <= high; got {dict(reference)!r}.")
+    else:
+        stop = _reference(run, reference, start)
+        names, part = run.names, run.theta[start:stop]
+        low, high, start = part.min(axis=0), part.max(axis=0), stop
+    columns = [run.names.index(name) for name in names]
+    theta, std = run.theta[:, columns], run.std[:, columns]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        outside = np.maximum(theta - high, low - theta) / std
+    z = NormalDist().inv_cdf(1.0 - 1.0 / (every * len(names)))
+    return np.where(np.isfinite(std), outside, np.nan), np.full(len(names), z), names, start
+
+
+def _reference(run: Track, reference: Any, start: int) -> int:
+    """The end of the reference."""
+    if reference is None:
+        raise ValueError(
+            'detect: say where the parameters belong, reference={"b1": (0.9, 1.1)}, or how many of the first samples '
+            "are normal, reference=500."
+        )
+    stop = whole("detect", "reference", reference, 1)
+    if not start + 20 <= stop < len(run):
+        raise ValueError(
+            f"detect: reference={stop} leaves too little: the run starts until sample {start}, and has {len(run)}."
+        )
+    return stop
+
+
+def _burn(run: Track) -> int:
+    return max(50, 5 * run.model.n)
+
+
+def _innovation(
+    run: Track, every: float, reference: Reference, window: int
+) -> tuple[Array, Array, tuple[str, ...], int]:
+    """Windowed sums of squares and of innovations, over the samples that were used."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        g = run.innovation / run.innovation_std
+    g, start, slack = np.where(np.isfinite(g), g, np.nan), _burn(run), 1.0
+    if isinstance(reference, Mapping):
+        raise ValueError('detect: the reference of "innovation" is a number of samples, such as reference=500.')
+    if reference is not None:
+        stop = _reference(run, reference, start)
+        known = np.sort(np.abs(g[start:stop][np.isfinite(g[start:stop])]))
+        g, start = normal_scores(g, known), stop
+        slack = np.sqrt(1.0 + window / max(len(known), 1))  # what is normal is itself an estimate
+    used = np.flatnonzero(np.isfinite(g) & (np.arange(len(g)) >= start))
+    statistic = np.full((len(run), 2), np.nan)
+    for column, values in enumerate((g[used] ** 2, g[used])):
+        total = np.concatenate([[0.0], np.cumsum(values)])
+        if len(used) >= window:
+            statistic[used[window - 1 :], column] = total[window:] - total[:-window]
+    statistic[:, 1] = np.abs(statistic[:, 1])
+    power, mean = power_limit(window, 2.0 * every), mean_limit(window, 2.0 * every)
+    limits = np.array([window + (power - window) * slack, mean * slack])
+    return _carried(statistic), limits, ("power", "mean"), start
+
+
+def normal_scores(g: Array, known: Array) -> Array:
+    """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
+    share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
+    return np.where(np.isfinite(g), -special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
+
+
+def _carried(statistic: Array) -> Array:
+    """The last statistic, where there is no new sample."""
+    place = np.maximum.accumulate(np.where(np.isfinite(statistic[:, 0]), np.arange(len(statistic)), -1))
+    return np.where((place >= 0)[:, None], statistic[place], np.nan)
+
+
+def _probability(
+    run: Track, every: float, reference: Reference, window: int
+) -> tuple[Array, Array, tuple[str, ...], int]:
+    """The probability of a change in the tracker's window."""
+    if CHANGE not in run.tracker.outputs:
+        raise ValueError(
+            f"detect: {type(run.tracker).__name__} carries no probability of a change; track with Bank, or use "
+            'kind="band" or kind="innovation".'
+        )
+    p = np.reshape(run._written(CHANGE), (len(run), -1))[:, :1]
+    return p, np.ones(1), ("probability",), _burn(run)
+
+
+CHANGE = "window"
+"""The field in which a tracker of hypotheses stores the probability of a change in its window."""
+
+_STATISTICS = {"band": _band, "innovation": _innovation, "probability": _probability}

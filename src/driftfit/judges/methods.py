@@ -1,0 +1,103 @@
+"""What can be asked of a run once it is there; `Track` inherits these."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from driftfit.detect import Alarms
+    from driftfit.diagnose import Diagnosis
+    from driftfit.kernel import Array
+    from driftfit.result import Track
+    from driftfit.simulate import Prediction
+    from driftfit.system import FrequencyResponse, LongRun, Response
+    from driftfit.verdict import Verdict
+
+
+class Judged:
+    """Questions to a run. Each is a module of its own, imported when it is asked."""
+
+    def verdict(self, level: float = 0.05, lags: int = 0) -> Verdict:
+        """Is the time variation real, which parameters move, and does following them pay? See `driftfit.verdict`."""
+        from driftfit.verdict import verdict
+
+        return verdict(cast("Track", self), level, lags)
+
+    def diagnose(self) -> Diagnosis:
+        """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.diagnose`."""
+        from driftfit.diagnose import diagnose
+
+        return diagnose(cast("Track", self))
+
+    def ahead(self, k: int) -> Prediction:
+        """Every output predicted from k samples before it, the inputs given; see `driftfit.simulate`."""
+        from driftfit.simulate import ahead
+
+        return ahead(cast("Track", self), k)
+
+    def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
+        """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.simulate`."""
+        from driftfit.simulate import simulate
+
+        return simulate(cast("Track", self), u, at, y)
+
+    def poles(self, at: Any = None) -> Array:
+        """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.system`."""
+        from driftfit.system import poles
+
+        return poles(cast("Track", self), at)
+
+    def largest_pole(self, at: Any = None) -> Response:
+        """Magnitude (T,) of the largest pole, with its standard deviation; below 1 the system is stable."""
+        from driftfit.system import largest_pole
+
+        return largest_pole(cast("Track", self), at)
+
+    def dc_gain(self, at: Any = None) -> Response:
+        """Gain (T, m) of every input for signals that stand, with its standard deviation."""
+        from driftfit.system import dc_gain
+
+        return dc_gain(cast("Track", self), at)
+
+    def step_response(self, h: int, input: int | str = 0, at: Any = -1) -> Response:
+        """Response (., h) to a unit step of an input, at the samples ``at`` (None: all), with std."""
+        from driftfit.system import step_response
+
+        return step_response(cast("Track", self), h, input, at)
+
+    def impulse_response(self, h: int, input: int | str = 0, at: Any = -1) -> Response:
+        """Response (., h) to a unit impulse of an input, at the samples ``at`` (None: all), with std."""
+        from driftfit.system import impulse_response
+
+        return impulse_response(cast("Track", self), h, input, at)
+
+    def frequency_response(self, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
+        """Magnitude and phase at w radians per sample, with std; see `driftfit.system`."""
+        from driftfit.system import frequency_response
+
+        return frequency_response(cast("Track", self), w, input, at)
+
+    def to_scipy(self, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
+        """The system of a sample as `scipy.signal.dlti`, from one input to y."""
+        from driftfit.system import to_scipy
+
+        return to_scipy(cast("Track", self), at, dt, input)
+
+    def long_run(self, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
+        """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""
+        from driftfit.system import long_run
+
+        return long_run(cast("Track", self), at, level)
+
+    def detect(self, kind: str = "band", **settings: Any) -> Alarms:
+        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`."""
+        from driftfit.detect import detect
+
+        return detect(cast("Track", self), kind, **settings)
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`."""
+        from driftfit.report import report
+
+        report(cast("Track", self), path, title)

@@ -1,0 +1,72 @@
+"""Limits of windowed sums for a rate of false alarms that is exact, and how often something begins.
+
+A sum over the last W samples of g_t^2 (or of g_t), g_t ~ N(0, 1) and independent, begins to exceed a limit c where it
+was below a sample before. Of the two sums W - 1 terms are the same, X, and one is exchanged, so that
+
+    P(begins) = E [ P(X + old <= c) P(X + new > c) ],     X ~ chi2(W - 1), old and new ~ chi2(1)
+
+(for |sum g|: X ~ N(0, W - 1), old and new ~ N(0, 1)). A limit for one false alarm in N samples has P(begins) = 1 / N.
+Counting samples above the limit instead, as if they were independent, is wrong by the length of an alarm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import optimize, special
+
+from driftfit.kernel import Array
+
+NODES = 2001
+
+
+def power_limit(W: int, every: float) -> float:
+    """c for the sum of W squares, W at least 4."""
+    top = W + 20.0 * np.sqrt(2.0 * W) + 60.0
+    grid = np.linspace(0.0, top, NODES)
+    weight = np.exp(special.xlogy(0.5 * (W - 1) - 1.0, grid / W) - 0.5 * (grid - W))
+    weight /= weight.sum()
+
+    def begins(c: float) -> float:
+        above = np.where(grid >= c, 1.0, special.chdtrc(1, np.maximum(c - grid, 0.0)))
+        return float(np.sum(weight * above * (1.0 - above)))
+
+    return _solve(begins, float(W), top, every)
+
+
+def mean_limit(W: int, every: float) -> float:
+    """c for the absolute sum of W terms, W at least 2."""
+    units = np.linspace(-10.0, 10.0, NODES)
+    grid, weight = units * np.sqrt(W - 1), np.exp(-0.5 * units**2)
+    weight /= weight.sum()
+
+    def begins(c: float) -> float:
+        inside = special.ndtr(c - grid) - special.ndtr(-c - grid)
+        return float(np.sum(weight * inside * (1.0 - inside)))
+
+    return _solve(begins, float(np.sqrt(W)), 12.0 * np.sqrt(W) + 12.0, every)
+
+
+def _solve(begins: Callable[[float], float], start: float, high: float, every: float) -> float:
+    """The larger c with this rate: between the most frequent onsets and the end of the range."""
+    grid = np.linspace(start, high, 200)
+    rates = np.array([begins(c) for c in grid])
+    most = int(np.argmax(rates))
+    if rates[most] <= 1.0 / every:
+        return float(grid[most])
+    return float(optimize.brentq(lambda c: begins(c) - 1.0 / every, grid[most], high, xtol=1e-8))
+
+
+def onsets(active: Array) -> Array:
+    """Samples at which something begins, given whether it holds (T,)."""
+    before = np.concatenate([[False], active[:-1]])
+    return np.flatnonzero(active & ~before)
+
+
+def held(active: Array, hold: int) -> Array:
+    """Alarms that stay on for ``hold`` samples after what caused them."""
+    if hold == 0:
+        return active
+    last = np.maximum.accumulate(np.where(active, np.arange(len(active)), -hold - 1))
+    return np.asarray(np.arange(len(active)) - last <= hold)

@@ -1,0 +1,316 @@
+"""Report: one self-contained page about a run, for someone who has never seen this library.
+
+Verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and what was skipped. Pictures
+are inline SVG in the colours of the page, which follow the reader's light or dark setting and turn light for print;
+nothing is loaded from anywhere. What a long record draws is an image inside the SVG, so that the page stays small.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from html import escape
+from io import StringIO
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.diagnose import Diagnosis, diagnose
+from driftfit.judges.plots import draw_diagnosis
+from driftfit.models.arx import ARX
+from driftfit.plots import (
+    BLUE,
+    GREY,
+    RED,
+    date_axis,
+    draw_innovation,
+    draw_parameter,
+    draw_prediction,
+    new_figure,
+    time_label,
+)
+from driftfit.result import Track
+from driftfit.summary import Summary, summarise
+from driftfit.system import dc_gain, largest_pole
+from driftfit.verdict import Verdict, p_text, verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LONG = 3000
+"""Records longer than this have the points of their pictures as an image inside the SVG."""
+
+INK = "#1b1b1b"
+"""Text and axes while a picture is drawn; becomes the ink of the page."""
+
+COLOURS = {INK: "ink", BLUE: "blue", RED: "red", GREY: "grey", "#b0b0b0": "rule"}
+
+STYLE = """
+:root { color-scheme: light dark; --page: #ffffff; --ink: #1d2126; --soft: #5d6670; --rule: #d9dee3; --card: #f5f7f9;
+  --blue: #1f5fa8; --red: #c23b22; --grey: #8a8a8a; --good: #23713b; }
+@media (prefers-color-scheme: dark) { :root { --page: #14171a; --ink: #e6e9ec; --soft: #9aa4ae; --rule: #343b42;
+  --card: #1d2226; --blue: #6aa9f0; --red: #f0806a; --grey: #8f979e; --good: #6cc48a; } }
+@media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
+  --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } body { font-size: 10pt; }
+  section, figure, tr { break-inside: avoid; } main { max-width: none; padding: 0; } }
+@page { size: A4; margin: 15mm; }
+body { margin: 0; background: var(--page); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+main { max-width: 64rem; margin: 0 auto; padding: 1.5rem; }
+h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+.soft, figcaption, caption { color: var(--soft); font-size: .88rem; }
+.verdict { background: var(--card); border-left: .35rem solid var(--blue); padding: .8rem 1.1rem; margin: 1rem 0; }
+.verdict p { margin: .3rem 0; } .verdict p:first-child { font-size: 1.15rem; font-weight: 600; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; width: 100%;
+  margin-bottom: 1rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; padding-bottom: .3rem; caption-side: top; }
+td { font-size: .94rem; }
+th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
+th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child { text-align: left; }
+.bad { color: var(--red); font-weight: 600; } .good { color: var(--good); }
+figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: .5rem 0; }
+dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margin: .2rem 0; }
+"""
+
+
+def report(run: Track, path: str | PathLike[str], title: str | None = None) -> None:
+    """Write a page about a run.
+
+    Parameters
+    ----------
+    run : Track
+        What `track` returned.
+    path : str or path
+        Where the page goes; ends in .html.
+    title : str or None
+        Its heading; the names of the signals otherwise.
+
+    Raises
+    ------
+    ValueError
+        If the path does not end in .html or .htm.
+    OSError
+        If it cannot be written.
+    """
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"report: the page is HTML, so its name ends in .html; got {str(path)!r}.")
+    Path(path).write_text(page(run, title), encoding="utf-8")
+
+
+def page(run: Track, title: str | None = None) -> str:
+    """The page as text."""
+    facts, said, health = summarise(run), verdict(run), diagnose(run)
+    heading = title or _heading(run)
+    sections = [
+        f"<h1>{escape(heading)}</h1>",
+        f'<p class="soft">{escape(_subtitle(run, facts))}</p>',
+        _verdict(said, health),
+        _section("Parameters over time", _figure(_parameters(run), run, PARAMETERS)),
+        _section("Parameters", _parameter_table(facts, said) + _system_table(run)),
+        _section("Predictions", _comparison(said) + _figure(_signals(run), run, SIGNALS)),
+        _section("Diagnostics", _checks(health) + _figure(draw_diagnosis(health), run, DIAGNOSTICS)),
+        _section("Settings, and what was left out", _settings(run, facts)),
+        _section("How to read this", READING),
+    ]
+    body = "\n".join(sections)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(heading)}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\n</main></body></html>\n"
+    )
+
+
+PARAMETERS = "Each parameter after every sample (line) with its 95 % band: what was known then, nothing looks ahead."
+SIGNALS = (
+    "Above: the output (dots) and its prediction one sample before. Below: the prediction error and its 95 % band."
+)
+DIAGNOSTICS = "The innovations (one-step errors), the excitation, and the constancy of the coefficients. Grey: limits."
+
+READING = """<p>The output is described as a sum of regressors times parameters. The parameters are followed sample by
+sample: at every time the estimate uses the past only, and the band says how well it was known then.</p>
+<ul><li><b>Do the parameters move?</b> A test of constant parameters that outliers, a changing noise level and changing
+inputs do not fool. A small p means that constants would hardly give such a record.</li>
+<li><b>Does following them pay?</b> The error of predicting the next sample, beside three simple ways: repeating the
+last value (persistence), one set of constants fitted to all of the past (constant LS), and a small constant dynamic
+model (constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
+<li><b>Diagnostics</b> say whether the bands can be trusted. What is out of bounds comes with what to try.</li></ul>"""
+
+
+def _heading(run: Track) -> str:
+    labels = run.labels
+    return f"{labels.y} from {', '.join(labels.u)}" if labels.u else f"Parameters of {labels.y}"
+
+
+def _subtitle(run: Track, facts: Summary) -> str:
+    parts = [f"{facts.samples} samples", facts.span, f"{facts.used} used", f"{facts.samples - facts.used} skipped"]
+    return ", ".join(part for part in parts if part)
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>\n{body}</section>"
+
+
+def _verdict(said: Verdict, health: Diagnosis) -> str:
+    count = len(health.sentences)
+    state = (
+        "All diagnostics are within their limits."
+        if health.ok
+        else (f"{count} of {len(health.checks)} diagnostics {'is' if count == 1 else 'are'} out of bounds, see below.")
+    )
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
+    return f'<div class="verdict">{lines}</div>'
+
+
+def _table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """A table; cells are HTML already."""
+    top = "".join(f"<th>{head}</th>" for head in heads)
+    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    return (
+        f'<div class="wide"><table><caption>{escape(caption)}</caption>'
+        f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
+    )
+
+
+def _parameter_table(facts: Summary, said: Verdict) -> str:
+    heads = ("parameter", "now", "95 % band", "range of the path", "p, constant", "moves")
+    tests = {moved.name: moved for moved in said.parameters}
+    rows = []
+    for row in facts.rows:
+        test = tests.get(row.name)
+        moved = (
+            ""
+            if test is None
+            else (f"{test.before:.4g} to {test.after:.4g}, {escape(test.when)}" if test.moves else "no")
+        )
+        cells = (f"{row.theta:.4g}", f"{row.low:.4g} to {row.high:.4g}", f"{row.path_low:.4g} to {row.path_high:.4g}")
+        p = "" if test is None else escape(p_text(test.p_own))
+        rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, p, moved))
+    caption = f"After the last sample; the range is that of the path after the first {facts.burn} samples."
+    return _table(caption, heads, rows)
+
+
+def _system_table(run: Track) -> str:
+    """Gain and largest pole of an ARX model at a few times; empty for other models."""
+    if not isinstance(run.model, ARX) or run.names != run.model.names or run.model.na == 0 or len(run) < 10:
+        return ""
+    T = len(run)
+    at = np.unique(np.linspace(min(max(50, 5 * run.model.n), T // 3), T - 1, 5).astype(int))
+    gain, pole = dc_gain(run, at), largest_pole(run, at)
+    names = run.model.inputs if isinstance(run.model.inputs, tuple) else [f"u{j + 1}" for j in range(run.model.m)]
+    heads = ("at", *(f"gain of {escape(str(name))}" for name in names), "largest pole")
+    rows = []
+    for k, t in enumerate(at):
+        gains = (f"{v:.4g} +- {s:.2g}" for v, s in zip(gain.value[k], gain.std[k], strict=True))
+        rows.append((escape(run.time_text(int(t))), *gains, f"{pole.value[k]:.4g} +- {pole.std[k]:.2g}"))
+    return _table("The system behind the parameters: steady-state gain; a pole below 1 is stable.", heads, rows)
+
+
+def _comparison(said: Verdict) -> str:
+    rows = [("this run", f"{said.rms:.5g}", "", "")]
+    for rival in said.rivals:
+        ratio = f"{rival.rms / said.rms:.3f}" if said.rms > 0.0 else ""
+        rows.append((rival.name, f"{rival.rms:.5g}", ratio, escape(p_text(rival.p))))
+    caption = f"One-step prediction error, root mean square, on {said.scored} samples that all could predict."
+    return _table(caption, ("", "error", "over this run", "p, no better"), rows)
+
+
+def _checks(health: Diagnosis) -> str:
+    rows = []
+    for check in health.checks:
+        low, high = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
+        state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
+        rows.append((check.name, f"{check.value:.4g}", low, high, "not known" if np.isnan(check.value) else state))
+    told = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
+    table = _table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
+    return table + (f"<ul>{told}</ul>" if told else "")
+
+
+def _settings(run: Track, facts: Summary) -> str:
+    from driftfit import __version__
+
+    missing_y, missing_u = int(np.sum(~np.isfinite(run.y))), int(np.sum(~np.isfinite(run.u).all(axis=1)))
+    pairs = [
+        ("Model", facts.model), ("Tracker", facts.tracker), ("Signals", facts.signals), ("Time", facts.span),
+        ("Samples", f"{facts.samples}, of which {facts.used} used and {facts.samples - facts.used} skipped"),
+        ("Missing", f"{missing_y} outputs, {missing_u} samples with a missing input"),
+        ("Rows left out", facts.dropped or "none"), ("Log-likelihood", f"{facts.loglik:.6g}"),
+        ("Made by", f"driftfit {__version__}"),
+    ]  # fmt: skip
+    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs if value)}</dl>"
+
+
+def _parameters(run: Track) -> Figure:
+    n = len(run.names)
+    columns = 1 if n <= 3 else 2
+    rows = -(-n // columns)
+    figure = new_figure(9.5, 1.55 * rows + 0.5)
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    for i, axis in enumerate(axes):
+        axis.set_visible(i < n)
+        if i < n:
+            draw_parameter(axis, run, i)
+            date_axis(axis, run)
+    for axis in axes[-columns:]:
+        axis.set_xlabel(time_label(run))
+    return figure
+
+
+def _signals(run: Track) -> Figure:
+    figure = new_figure(9.5, 4.6)
+    signal, error = figure.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.3])
+    draw_prediction(signal, run)
+    draw_innovation(error, run)
+    error.set_xlabel(time_label(run))
+    date_axis(error, run)
+    return figure
+
+
+def _figure(figure: Figure, run: Track, caption: str) -> str:
+    return f"<figure>{svg(figure, len(run) > LONG)}<figcaption>{escape(caption)}</figcaption></figure>\n"
+
+
+def svg(figure: Figure, thin: bool = False) -> str:
+    """A figure as SVG text whose colours are those of the page; ``thin`` makes images of what it draws of samples."""
+    import matplotlib
+
+    for axis in figure.axes:
+        _inked(axis)
+        for artist in (*axis.lines, *axis.collections, *axis.patches):
+            artist.set_rasterized(thin)
+    figure.patch.set_alpha(0.0)
+    text = StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": figure.axes[0].get_ylabel() or "driftfit"}):
+        figure.savefig(text, format="svg", dpi=110, metadata={"Date": None, "Creator": None}, transparent=True)
+    drawn = text.getvalue()
+    drawn = drawn[drawn.index("<svg") :]
+    drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.S)
+    for colour, name in COLOURS.items():
+        drawn = drawn.replace(colour, f"var(--{name})")
+    drawn = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", drawn)
+    return drawn
+
+
+def _inked(axis: object) -> None:
+    """Give text, ticks and frame of an axis the ink of the page."""
+    from matplotlib.axes import Axes
+
+    assert isinstance(axis, Axes)
+    for side in axis.spines.values():
+        side.set_edgecolor(INK)
+        side.set_linewidth(0.6)
+    axis.tick_params(colors=INK, which="both")
+    legend = axis.get_legend()
+    titles = [axis.title, axis._left_title] if hasattr(axis, "_left_title") else [axis.title]
+    words = [
+        axis.xaxis.label,
+        axis.yaxis.label,
+        axis.xaxis.get_offset_text(),
+        axis.yaxis.get_offset_text(),
+        *axis.texts,
+    ]
+    for word in (*titles, *words, *(legend.get_texts() if legend else ())):
+        if word.get_color() in ("black", "k", "#000000"):
+            word.set_color(INK)

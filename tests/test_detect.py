@@ -1,0 +1,204 @@
+"""Alarms: rates of false alarms by simulation, what they find, and how they are scored."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import arx_record
+
+from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
+from driftfit.detect import Alarms, normal_scores
+from driftfit.judges.onsets import held, mean_limit, onsets, power_limit
+from driftfit.kernel import exp, kernel
+from driftfit.trackers.kalman import INDEPENDENT
+
+K = Kalman(q=1e-3, r=0.01)
+
+
+def moving(values, window):
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return total[window:] - total[:-window]
+
+
+@pytest.mark.parametrize("window", [4, 20, 100])
+@pytest.mark.parametrize("every", [100.0, 1000.0])
+def test_onset_limits_have_the_rate_that_they_promise(window, every):
+    """A million normal numbers: the count of onsets is within four standard errors of the promise."""
+    g = np.random.default_rng(window).normal(size=1_000_000)
+    for limit, series in (
+        (power_limit(window, every), moving(g**2, window)),
+        (mean_limit(window, every), np.abs(moving(g, window))),
+    ):
+        found, expected = len(onsets(series > limit)), 1e6 / every
+        assert abs(found - expected) < 4.0 * np.sqrt(2.0 * expected)
+
+
+def jump_record(T=3000, at=2000, size=1.0, seed=3):
+    path = np.tile([1.2, -0.5, 1.0, 0.4], (T, 1))
+    path[at:, 2] += size
+    return arx_record(T, seed, theta=path)
+
+
+def test_band_alarm_finds_a_jump_and_names_it():
+    run = track(ARX(2, 2), K, *jump_record())
+    said = run.detect("band", every=1e5, reference={"b1": (0.7, 1.3), "b2": (0.1, 0.7)})
+    assert len(said.onsets) >= 1
+    assert 2000 <= said.onsets[0] < 2040
+    assert said.cause(int(said.onsets[0])) == "b1"
+    assert said.limits == pytest.approx(stats.norm.isf(1.0 / 2e5))
+    outside = np.maximum(run.theta[:, 2] - 1.3, 0.7 - run.theta[:, 2]) / run.std[:, 2]
+    assert said.statistic[100:, 0] == pytest.approx(outside[100:])
+    learned = run.detect("band", every=1e5, reference=1500)
+    assert learned.start == 1500
+    assert learned.onsets[0] >= 2000
+
+
+def test_band_alarm_rate_at_the_edge_of_the_band():
+    """Parameters that walk and stand at the edge: alarms begin no more often than promised."""
+    begun = count = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u, theta = rng.normal(size=4000), 1.0 + np.cumsum(0.03 * rng.normal(size=4000))
+        run = track(Regression(1), Kalman(q=9e-4, r=0.25), theta * u + 0.5 * rng.normal(size=4000), u)
+        z = (run.theta[:, 0] - theta) / run.std[:, 0]  # how far outside a band that ends at the truth
+        begun += len(onsets(z[50:] > stats.norm.isf(1.0 / 200.0)))
+        count += 3950
+    assert begun <= 1.2 * count / 200.0
+    assert begun > 0.1 * count / 200.0
+
+
+@pytest.mark.parametrize("reference", [None, 1000])
+def test_innovation_alarm_rate(reference):
+    """A constant system: onsets at the rate that was set."""
+    begun, expected = 0, 0.0
+    for seed in range(8):
+        y, u = arx_record(6000, 40 + seed)
+        run = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u)
+        said = run.detect("innovation", every=300.0, window=20, reference=reference)
+        begun += len(said.onsets)
+        expected += (6000 - said.start) / 300.0
+    assert 0.5 * expected < begun < 1.5 * expected
+
+
+def test_innovation_alarm_finds_louder_noise_and_a_bias():
+    y, u = arx_record(3000, 4)
+    noise = 0.2 * np.random.default_rng(1).normal(size=3000)
+    louder = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + np.where(np.arange(3000) > 2000, noise, 0.0), u)
+    said = louder.detect("innovation", every=1e5)
+    assert 2000 <= said.onsets[0] < 2060
+    assert said.cause(int(said.onsets[0])) == "power"
+    offset = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + 0.3 * (np.arange(3000) > 2000), u).detect(
+        "innovation", every=1e5
+    )
+    assert 2000 <= offset.onsets[0] < 2060
+    assert "mean" in {offset.cause(t) for t in range(2000, 2200)}
+
+
+def test_normal_scores_bound_outliers():
+    known = np.sort(np.abs(np.random.default_rng(0).standard_t(2, size=2000)))
+    g = np.random.default_rng(1).standard_t(2, size=100_000)
+    scores = normal_scores(g, known)
+    assert np.mean(scores**2) == pytest.approx(1.0, abs=0.06)
+    assert np.abs(scores).max() < 4.0
+    assert np.isnan(normal_scores(np.array([np.nan]), known)[0])
+
+
+@kernel
+def store(o, s, l):
+    o.window[l] = s.window[l]
+
+
+@kernel
+def doubt(s, l):
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l]
+    s.window[l] = 1.0 - exp(-0.5 * s.ok[l] * s.e[l] * s.e[l] / s.s[l])
+
+
+@dataclass(frozen=True)
+class Doubtful(Kalman):
+    """A Kalman filter that calls the share of smaller innovations a probability."""
+
+    outputs: ClassVar[tuple[str, ...]] = ("window",)
+
+    def state(self, n):
+        return {**super().state(n), "window": 0.0}
+
+    @property
+    def steps(self):
+        return INDEPENDENT._replace(report=doubt, store=store)
+
+
+def test_probability_alarm_is_calibrated_by_simulation():
+    u, v = np.random.default_rng(2).normal(size=(2, 5000))
+    run = track(Regression(1), Doubtful(q=0.0, r=1.0), u + v, u)
+    said = run.detect("probability", every=250.0)
+    # onsets of independent exceedances: p (1 - p) = 1 / 250, and 1 - p = exp(-z^2 / 2) ...
+    z = stats.norm.isf((1.0 - np.sqrt(1.0 - 4.0 / 250.0)) / 4.0)
+    assert said.limits[0] == pytest.approx(1.0 - np.exp(-0.5 * z * z), abs=0.02)
+    assert 8 <= len(said.onsets) <= 34
+    with pytest.raises(ValueError, match="Bank"):
+        track(ARX(2, 2), K, *arx_record(100, 1)).detect("probability")
+
+
+def test_calibration_agrees_with_theory_where_theory_holds():
+    y, u = arx_record(5000, 8)
+    run = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u)
+    theory = run.detect("innovation", every=500.0, window=20)
+    simulated = run.detect("innovation", every=500.0, window=20, calibrate=True)
+    assert simulated.limits == pytest.approx(theory.limits, rel=0.15)
+
+
+def test_score_by_hand():
+    active = np.zeros(20, bool)
+    active[[3, 8, 9, 15]] = True
+    labels = np.zeros(20, int)
+    labels[6:12] = 1
+    labels[17:] = 1
+    said = Alarms("band", 10.0, active, onsets(active), np.zeros((20, 1)), np.ones(1), ("b1",), 2, None)
+    got = said.score(labels)
+    assert (got.events, got.found, got.delay, got.false, got.normal) == (2, 1, 2.0, 2, 9)
+    with pytest.raises(ValueError, match="20 samples"):
+        said.score(labels[:5])
+
+
+def test_held_alarms():
+    active = np.array([False, True, False, False, True, False, False, False])
+    assert held(active, 0).tolist() == active.tolist()
+    assert held(active, 2).tolist() == [False, True, True, True, True, True, True, False]
+    assert onsets(held(active, 2)).tolist() == [1]
+
+
+def test_table_and_picture():
+    run = track(ARX(2, 2), K, *jump_record())
+    said = run.detect("band", every=1e4, reference=1500)
+    assert "b1" in str(said)
+    assert "one false alarm in 10000 samples" in str(said)
+    assert len(said.plot(np.arange(3000) > 2000).axes) == 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "match"),
+    [
+        ("bands", {}, "kind"),
+        ("band", {}, "where the parameters belong"),
+        ("band", {"reference": {"b9": (0, 1)}}, "no parameter"),
+        ("band", {"reference": {"b1": (1, 0)}}, "low <= high"),
+        ("band", {"reference": 60}, "too little"),
+        ("innovation", {"reference": {"b1": (0, 1)}}, "number of samples"),
+        ("innovation", {"window": 2}, "window"),
+        ("innovation", {"every": 1.0}, "every"),
+    ],
+)
+def test_wrong_settings(kind, settings, match):
+    run = track(ARX(2, 2), K, *arx_record(400, 1))
+    with pytest.raises(ValueError, match=match):
+        run.detect(kind, **settings)
+
+
+def test_a_tracker_without_covariance_has_no_band():
+    run = track(ARX(2, 2), AugmentedFLS(mu=10.0), *arx_record(400, 1))
+    with pytest.raises(ValueError, match="no covariance"):
+        run.detect("band", reference={"b1": (0.0, 1.0)})

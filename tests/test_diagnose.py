@@ -1,0 +1,115 @@
+"""Diagnostics: each number against a naive one, and each fault found under its own name."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import arx_record
+
+from driftfit import ARX, RLS, AugmentedFLS, Kalman, track
+from driftfit.diagnose import holds_constant
+from driftfit.judges.excitation import excitation
+
+TRUE = Kalman(q=0.0, r=0.01)
+
+
+def faults(tracker, y, u):
+    said = track(ARX(2, 2), tracker, y, u).diagnose()
+    return {check.name for check in said.checks if not check.ok}, said
+
+
+def test_a_true_model_has_no_faults():
+    found, said = faults(TRUE, *arx_record(600, 3))
+    assert not found
+    assert said.ok
+    assert said.sentences == ()
+    assert "Everything is within its limits" in str(said)
+
+
+def test_numbers_are_what_plain_numpy_gives():
+    y, u = arx_record(600, 3)
+    _, said = faults(TRUE, y, u)
+    run = said.run
+    z = (run.innovation / run.innovation_std)[50:]
+    inside = z[np.abs(z) <= 3.0 * 1.4826 * np.median(np.abs(z))]
+    assert said["noise level"].value == pytest.approx(np.mean(inside**2) / 0.9733)
+    assert said["outliers"].value == np.mean(np.abs(z) > 4.0)
+    held = np.clip(z - np.median(z), -4.0, 4.0)
+    assert said["symmetry"].value == pytest.approx(stats.skew(held))
+    clipped = np.clip(z, *(np.array([-1, 1]) * 3.0 * 1.4826 * np.median(np.abs(z))))
+    r = [np.sum(clipped[k:] * clipped[:-k]) / np.sum(clipped**2) for k in range(1, 21)]
+    assert said.white.r == pytest.approx(r)
+    assert said["constancy (p)"].value == run.verdict().p
+
+
+@pytest.mark.parametrize(
+    ("name", "tracker", "spoil"),
+    [
+        ("noise level", Kalman(q=0.0, r=0.001), lambda y: y),
+        ("steady noise", TRUE, lambda y: y + np.where(np.arange(600) > 400, 0.6, 0.0) * NOISE),
+        ("outliers", TRUE, lambda y: y + np.where(np.arange(600) % 50 == 49, 3.0, 0.0)),
+        ("whiteness (p)", Kalman(q=1.0, r=0.01), lambda y: y),
+    ],
+)
+def test_each_fault_has_its_name_and_its_sentence(name, tracker, spoil):
+    y, u = arx_record(600, 3)
+    found, said = faults(tracker, spoil(y), u)
+    assert name in found
+    assert said[name].advice in said.sentences
+    assert said[name].advice in " ".join(str(said).split())
+
+
+NOISE = np.random.default_rng(7).normal(size=600)
+
+
+def test_constancy_needs_record_and_tracker_to_agree():
+    path = np.tile([1.2, -0.5, 1.0, 0.4], (600, 1))
+    path[300:, 2] += 0.5
+    moving, steady = arx_record(600, 3, theta=path), arx_record(600, 5)
+    assert "constancy (p)" in faults(TRUE, *moving)[0]
+    assert "constancy (p)" not in faults(Kalman(q=1e-3, r=0.01), *moving)[0]
+    assert "constancy (p)" not in faults(TRUE, *steady)[0]
+    assert "constancy (p)" in faults(Kalman(q=1e-2, r=0.01), *steady)[0]
+
+
+def test_trackers_that_hold_constant():
+    y, u = arx_record(60, 1)
+    kinds = [(RLS(1.0), True), (RLS(0.99), False), (TRUE, True), (Kalman(q=1e-3, r=0.1), False)]
+    for tracker, expected in kinds:
+        assert holds_constant(track(ARX(2, 2), tracker, y, u)) is expected
+
+
+def test_lost_excitation_is_found_and_named():
+    y, u = arx_record(600, 3)
+    quiet = u.copy()
+    quiet[200:330] = 0.0
+    found, said = faults(TRUE, y, quiet)
+    assert "excitation" in found
+    assert "b1" in said["excitation"].advice
+
+
+def test_eigenvalues_of_windows():
+    phi = np.random.default_rng(2).normal(size=(200, 3)) * [1.0, 100.0, 0.01]
+    got = excitation(phi, 50)
+    scaled = phi / np.sqrt(np.mean(phi**2, axis=0))
+    assert got.at.tolist() == [49, 74, 99, 124, 149, 174, 199]
+    expected = np.linalg.eigvalsh(scaled[25:75].T @ scaled[25:75] / 50)
+    assert got.eigenvalues[1] == pytest.approx(expected)
+    assert got.condition[1] == pytest.approx(np.linalg.cond(scaled[25:75]), rel=1e-6)
+    assert len(excitation(phi[:30]).at) == 0
+
+
+def test_short_records_and_trackers_without_covariance_are_diagnosed_too():
+    y, u = arx_record(600, 3)
+    for tracker, T in ((AugmentedFLS(mu=10.0), 600), (TRUE, 12)):
+        said = track(ARX(2, 2), tracker, y[:T], u[:T]).diagnose()
+        assert np.isnan(said["noise level"].value)
+        assert said["noise level"].ok
+        assert "not known" in str(said)
+        said.plot()
+
+
+def test_picture_has_six_panels_and_marks_what_is_out_of_bounds():
+    y, u = arx_record(600, 3)
+    figure = track(ARX(2, 2), Kalman(q=0.0, r=0.001), y, u).diagnose().plot()
+    assert len(figure.axes) == 6
+    assert "out of bounds" in figure.axes[2].get_title(loc="left")

@@ -1,0 +1,138 @@
+"""The report: one page that needs nothing else, says what the judges say, and escapes what users name."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import polars as pl
+import pytest
+from support import arx_record, damaged
+from typer.testing import CliRunner
+
+from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
+from driftfit.cli import app
+from driftfit.report import LONG, page, svg
+
+K = Kalman(q=1e-3, r=0.01)
+OPEN = {"meta", "br", "img", "link", "hr"}
+
+
+class Balance(HTMLParser):
+    """Fails where elements are not closed in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.stack, self.text, self.tags = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in OPEN:
+            self.stack.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def read(text):
+    parser = Balance()
+    parser.feed(text)
+    assert not parser.stack
+    return parser
+
+
+@pytest.fixture(scope="module")
+def run():
+    y, u = damaged(*arx_record(400, 3))
+    return track(ARX(2, 2), K, y, u)
+
+
+def test_page_is_whole_and_loads_nothing(run, tmp_path):
+    path = tmp_path / "page.html"
+    run.report(path, title="Pump <7> & valve")
+    text = path.read_text()
+    parsed = read(text)
+    assert "Pump &lt;7&gt; &amp; valve" in text
+    assert parsed.tags.count("svg") == 3
+    assert not {"script", "link", "iframe"} & set(parsed.tags)
+    loaded = re.findall(r'(?:src|href)="([^"#][^"]*)"', text)
+    assert all(target.startswith("data:") for target in loaded)
+    assert "url(http" not in text
+    assert "prefers-color-scheme: dark" in text
+    assert "@media print" in text
+
+
+def test_page_says_what_the_judges_say(run):
+    text = " ".join(" ".join(read(page(run)).text).split())
+    said, health = run.verdict(), run.diagnose()
+    for sentence in (*said.sentences, *health.sentences):
+        assert " ".join(sentence.split()) in text
+    assert text.index(said.sentences[0]) < text.index("Parameters over time")
+    for name in run.names:
+        assert name in text
+    assert f"{said.rms:.5g}" in text
+    assert f"{len(run) - int(run.ok.sum())} skipped" in text
+    assert "largest pole" in text
+
+
+def test_pictures_take_the_colours_of_the_page(run):
+    drawn = svg(run.diagnose().plot())
+    assert "var(--ink)" in drawn
+    assert "var(--blue)" in drawn
+    assert "#1f5fa8" not in drawn
+    assert "<image" not in drawn
+    assert drawn == svg(run.diagnose().plot())
+
+
+def test_long_records_stay_small():
+    T = 4 * LONG
+    y, u = arx_record(T, 1)
+    text = page(track(ARX(2, 2), K, y, u))
+    assert "<image" in text
+    assert len(text) < 1_500_000
+
+
+def test_other_models_and_trackers(tmp_path):
+    y, u = arx_record(300, 2)
+    for model, tracker in ((Regression(1), K), (ARX(2, 2), AugmentedFLS(mu=10.0))):
+        read(page(track(model, tracker, y, u)))
+    read(page(track(ARX(2, 2), K, y[:30], u[:30])))
+
+
+def test_names_from_a_table_are_escaped():
+    y, u = arx_record(200, 4)
+    data = pl.DataFrame({"a<b": y, "u&v": u})
+    text = page(track(ARX(2, 2), K, "a<b", "u&v", data=data))
+    read(text)
+    assert "a<b" not in text
+
+
+def test_wrong_ending(run, tmp_path):
+    with pytest.raises(ValueError, match=r"\.html"):
+        run.report(tmp_path / "page.pdf")
+
+
+def test_command_line_writes_a_page(tmp_path):
+    y, u = arx_record(300, 2)
+    pl.DataFrame({"y": y, "u": u, "unit": np.repeat(["a", "b"], 150)}).write_csv(tmp_path / "r.csv")
+    base = [
+        "track",
+        str(tmp_path / "r.csv"),
+        "--y",
+        "y",
+        "--u",
+        "u",
+        "--model",
+        "arx:2,2",
+        "-p",
+        "q=1e-3",
+        "-p",
+        "r=0.01",
+    ]
+    done = CliRunner().invoke(app, [*base, "--report", str(tmp_path / "r.html")])
+    assert done.exit_code == 0, done.output
+    read((tmp_path / "r.html").read_text())
+    fleet = CliRunner().invoke(app, [*base, "--by", "unit", "--report", str(tmp_path / "f.html")])
+    assert fleet.exit_code == 2

@@ -1,0 +1,213 @@
+"""The verdict: distribution of the test, its error rate, what it names, and the comparison that it carries."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import THETA, arx_record, damaged
+
+from driftfit import ARX, RLS, Kalman, Regression, track
+from driftfit.judges.constancy import constancy, robust_fit, shift
+from driftfit.judges.paired import newey_west, paired
+from driftfit.judges.quadratic import quantile, tail
+from driftfit.judges.whiteness import crossing, whiteness
+from driftfit.verdict import holm
+
+BRIDGE = 1.0 / (np.pi * np.arange(1, 400)) ** 2
+"""Weights of the integral of a squared Brownian bridge."""
+
+
+def record(T, seed, noise="steady", n=3):
+    """A regression with constant coefficients in noise of some kind."""
+    rng = np.random.default_rng(seed)
+    phi, e = rng.normal(size=(T, n)), rng.normal(size=T)
+    if noise == "outliers":
+        e *= np.where(rng.random(T) < 0.05, 10.0, 1.0)
+    if noise == "changing":
+        e *= np.where(np.arange(T) > 0.7 * T, 4.0, 1.0)
+        phi[T // 2 :] *= 3.0
+    return phi, phi @ np.arange(1.0, n + 1.0) + e
+
+
+@pytest.mark.parametrize(
+    ("weights", "law"), [(np.ones(5), stats.chi2(5)), (np.full(40, 0.5), stats.chi2(40, scale=0.5))]
+)
+def test_tail_of_equal_weights_is_chi_square(weights, law):
+    for p in (0.9, 0.5, 0.05, 1e-4):
+        assert tail(weights, law.ppf(1.0 - p)) == pytest.approx(p, abs=1e-6)
+
+
+def test_tail_of_unequal_weights_is_what_a_simulation_says():
+    weights = np.array([3.0, 1.0, 0.5, 0.25, 0.1])
+    draws = np.random.default_rng(0).chisquare(1.0, (400_000, 5)) @ weights
+    for x in (2.0, 8.0, 20.0):
+        assert tail(weights, x) == pytest.approx(np.mean(draws > x), abs=0.003)
+
+
+@pytest.mark.parametrize(("n", "published"), [(1, 0.470), (2, 0.749), (3, 1.01), (4, 1.24), (5, 1.47)])
+def test_stationary_null_is_the_published_table(n, published):
+    """Hansen (1992), table 1, 5 %; his numbers are simulated."""
+    assert quantile(np.tile(BRIDGE, n), 0.05) == pytest.approx(published, abs=0.012)
+
+
+@pytest.mark.parametrize("noise", ["steady", "changing"])
+def test_null_is_that_of_a_naive_simulation(noise):
+    """Multiplying the scores by independent signs of mean zero, with regressors fixed, gives the same p-values."""
+    phi, y = record(240, 3, noise)
+    got = constancy(phi, y)
+    scores = phi * got.fit.psi[:, None]
+    rng, G = np.random.default_rng(1), np.linalg.inv(phi.T @ (phi * got.fit.inside[:, None]))
+    A = np.cumsum(phi[:, :, None] * phi[:, None, :] * got.fit.inside[:, None, None], axis=0)
+    V = scores.T @ scores
+    own = np.cumsum(scores, axis=0)
+    L = np.mean(np.einsum("ti,ij,tj->t", own, np.linalg.inv(V), own))
+    beyond = []
+    for _ in range(1500):
+        F = np.cumsum(scores * rng.normal(size=(240, 1)), axis=0)
+        S = F - A @ G @ F[-1]
+        beyond.append(np.mean(np.einsum("ti,ij,tj->t", S, np.linalg.inv(V), S)) > L)
+    assert got.joint == pytest.approx(L, rel=0.03)
+    assert got.p_joint == pytest.approx(np.mean(beyond), abs=0.04)
+
+
+@pytest.mark.parametrize("noise", ["steady", "outliers", "changing"])
+def test_error_rate(noise):
+    """At level 0.1 within three standard errors of 120 records; the full table is benchmarks/verdict_error_rate.py."""
+    said = [constancy(*record(150, seed, noise)).p_joint < 0.1 for seed in range(120)]
+    assert abs(np.mean(said) - 0.1) < 3.0 * np.sqrt(0.09 / 120)
+
+
+def test_correlated_noise_needs_lags():
+    def p(seed, lags):
+        rng = np.random.default_rng(seed)
+        phi, e = np.ones((400, 1)), rng.normal(size=400)
+        for t in range(1, 400):
+            e[t] += 0.5 * e[t - 1]
+        return constancy(phi, 1.0 + e, lags).p_joint
+
+    plain, allowed = (np.mean([p(seed, lags) < 0.05 for seed in range(60)]) for lags in (0, 10))
+    assert plain > 0.2
+    assert allowed < 0.15
+
+
+def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
+    rng = np.random.default_rng(5)
+    T = 600
+    common = rng.normal(size=(T, 1))
+    phi = 0.8 * common + 0.6 * rng.normal(size=(T, 3))
+    theta = np.tile([1.0, 2.0, -1.0], (T, 1))
+    theta[350:, 1] = 2.6
+    y = np.sum(phi * theta, axis=1) + 0.5 * rng.normal(size=T)
+    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi).verdict()
+    assert said.drifts
+    assert said.moving == ("theta2",)
+    moved = said.parameters[1]
+    assert abs(moved.at - 350) < 15
+    assert moved.before == pytest.approx(2.0, abs=0.1)
+    assert moved.after == pytest.approx(2.6, abs=0.1)
+    assert 0.6 / moved.std > 5.0
+    assert said.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
+
+
+def test_shift_is_least_squares_on_both_sides():
+    phi, y = record(200, 8)
+    y[120:] += phi[120:, 0]
+    got = shift(phi, y, 120, 0)
+    one, two = (np.linalg.lstsq(phi[part], y[part])[0][0] for part in (slice(120), slice(120, None)))
+    assert (got.before, got.after) == (pytest.approx(one, abs=0.05), pytest.approx(two, abs=0.05))
+    assert got.std == pytest.approx(np.sqrt(1 / 120 + 1 / 80), rel=0.3)
+
+
+def test_robust_fit_is_the_minimum_of_hubers_loss():
+    phi, y = record(200, 9, "outliers")
+    fit = robust_fit(phi, y)
+    assert np.abs(phi.T @ fit.psi).max() < 1e-6 * np.abs(phi * fit.psi[:, None]).sum()
+    clean = np.linalg.lstsq(phi, y)[0]
+    truth = np.arange(1.0, 4.0)
+    assert np.abs(fit.theta - truth).max() < np.abs(clean - truth).max()
+
+
+def test_verdict_of_constants_and_of_a_jump():
+    y, u = arx_record(500, 2)
+    steady = track(ARX(2, 2), Kalman(q=1e-4, r=0.01), y, u).verdict()
+    assert not steady.drifts
+    assert not steady.pays
+    assert steady.moving == ()
+    assert "No drift found" in str(steady)
+    path = np.where(np.arange(500)[:, None] < 250, THETA, THETA + np.array([0.0, 0.0, 0.5, 0.0]))
+    moved = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(500, 2, theta=path)).verdict()
+    assert moved.drifts
+    assert moved.pays
+    assert "b1" in moved.moving
+    assert moved.p < 1e-4
+    assert "b1 from" in str(moved)
+
+
+def test_comparison_is_that_of_the_summary():
+    y, u = damaged(*arx_record(400, 5))
+    run = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u)
+    said, comparison = run.verdict(), run.summary().comparison
+    assert (said.rms, *(rival.rms for rival in said.rivals)) == comparison[:4]
+    assert said.scored == comparison.samples
+    assert said.samples == int(run.ok.sum())
+
+
+def test_paired_is_the_textbook_formula():
+    rng = np.random.default_rng(3)
+    own, rival = rng.normal(size=(2, 300))
+    d = rival**2 - own**2
+    centred, lags = d - d.mean(), int(4 * 3 ** (2 / 9))
+    v = np.mean(centred**2) + 2 * sum(
+        (1 - k / (lags + 1)) * np.sum(centred[k:] * centred[:-k]) / 300 for k in range(1, lags + 1)
+    )
+    got = paired("rival", rival, own)
+    assert newey_west(d) == pytest.approx(v, rel=1e-12)
+    assert got.t == pytest.approx(d.mean() / np.sqrt(v / 300), rel=1e-12)
+    assert got.p == pytest.approx(stats.norm.sf(got.t), rel=1e-9)
+    assert got.rms == pytest.approx(np.sqrt(np.mean(rival**2)))
+
+
+def test_records_that_can_tell_nothing():
+    y, u = arx_record(20, 1)
+    said = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict()
+    assert np.isnan(said.p)
+    assert not said.drifts
+    assert "cannot tell" in said.sentences[0]
+    same = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
+    assert np.isnan(same.p)
+    none = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), np.full(100, np.nan), np.ones(100)).verdict()
+    assert none.samples == 0
+
+
+def test_weights_are_the_noise_that_the_test_takes_out():
+    phi, y = record(300, 12)
+    weights = np.where(np.arange(300) < 200, 1.0, 0.04)
+    y = phi @ np.arange(1.0, 4.0) + (y - phi @ np.arange(1.0, 4.0)) / np.sqrt(weights)
+    root = np.sqrt(weights)
+    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, phi, weights=weights).verdict()
+    assert said.p == pytest.approx(constancy(phi * root[:, None], y * root).p_joint, rel=1e-9)
+
+
+def test_holm_by_hand():
+    assert holm(np.array([0.01, 0.04, 0.03]), 0.05).tolist() == [True, False, False]
+    assert holm(np.array([0.001, 0.02, 0.03]), 0.05).tolist() == [True, True, True]
+    assert holm(np.array([np.nan, 0.001]), 0.05).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 5}, {"lags": -1}])
+def test_wrong_settings(wrong):
+    y, u = arx_record(60, 1)
+    with pytest.raises(ValueError, match="verdict"):
+        track(ARX(2, 2), RLS(1.0), y, u).verdict(**wrong)
+
+
+def test_whiteness_does_not_mistake_changing_variance_for_correlation():
+    """p-values of uncorrelated noise whose variance moves stay uniform; correlated noise is found."""
+    p = []
+    for seed in range(200):
+        z = np.random.default_rng(seed).normal(size=300) * np.where(np.arange(300) % 100 < 50, 1.0, 4.0)
+        p.append(whiteness(z).p)
+    assert 0.0 <= np.mean(np.array(p) < 0.1) < 0.2
+    z = np.random.default_rng(0).normal(size=300)
+    assert whiteness(z[1:] + 0.5 * z[:-1]).p < 1e-4
+    assert crossing(z[1:], z[:-1]).p > 0.001
+    assert crossing(z[1:] + 0.5 * z[:-1], z[1:]).p < 1e-6
