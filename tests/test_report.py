@@ -126,6 +126,8 @@ def test_command_line_writes_a_page(tmp_path):
         "u",
         "--model",
         "arx:2,2",
+        "--tracker",
+        "kalman",
         "-p",
         "q=1e-3",
         "-p",

@@ -71,9 +71,9 @@ def test_null_is_that_of_a_naive_simulation(noise):
 
 @pytest.mark.parametrize("noise", ["steady", "outliers", "changing"])
 def test_error_rate(noise):
-    """At level 0.1 within three standard errors of 120 records; the full table is benchmarks/verdict_error_rate.py."""
-    said = [constancy(*record(150, seed, noise)).p_joint < 0.1 for seed in range(120)]
-    assert abs(np.mean(said) - 0.1) < 3.0 * np.sqrt(0.09 / 120)
+    """At level 0.2 within three standard errors of 50 records; the full table is benchmarks/verdict_error_rate.py."""
+    said = [constancy(*record(120, seed, noise)).p_joint < 0.2 for seed in range(50)]
+    assert abs(np.mean(said) - 0.2) < 3.0 * np.sqrt(0.16 / 50)
 
 
 def test_correlated_noise_needs_lags():

@@ -254,7 +254,7 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
         others = [other for other, at in trackers.found().items() if key.strip() in {f.name for f in given_fields(at)}]
         if key.strip() not in known and others:
             raise ValueError(
-                f"-p {entry}: {kind.__name__} has no setting {key.strip()!r}; {', '.join(others)} have it."
+                f"-p {entry}: {kind.__name__} has no setting {key.strip()!r}; that is one of {', '.join(others)}."
             )
         add_setting(f"-p {entry}", settings, known, key.strip(), parse_value(value, ","))
     return build(f"--with {own}" if own else f"--tracker {name}", kind, settings)
