@@ -38,6 +38,11 @@ def persistence(y: Array) -> Array:
     return np.where(last >= 0, y[last], np.nan)
 
 
+def _error(run: Track) -> Array:
+    """Error of the prediction of y; the innovation of a model may be that of something else."""
+    return np.where(np.isfinite(run.innovation), run.y - run.prediction, np.nan)
+
+
 def compare(run: Track) -> Comparison:
     """Score a run beside persistence, constant least squares and constant ARX."""
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
@@ -45,7 +50,7 @@ def compare(run: Track) -> Comparison:
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
     steady = track(run.model, RLS(1.0), y, u, time=time)
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
-    errors = [run.innovation, y - persistence(y), steady.innovation, arx.innovation]
+    errors = [_error(run), y - persistence(y), _error(steady), arx.innovation]
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
     for error in errors:
         scored &= np.isfinite(error)

@@ -140,7 +140,8 @@ class Track:
         """Gaussian log-likelihood of the one-step predictions; the diffuse likelihood after a diffuse start.
 
         Sum over used samples of -1/2 (log 2 pi s + e^2 / s), and -1/2 log F for each sample that determined a new
-        direction. NaN for trackers without an innovation variance.
+        direction; a model whose innovation is not that of y adds its log Jacobian. NaN for trackers without an
+        innovation variance.
         """
         if not self.tracker.covariance:
             return float("nan")
@@ -150,6 +151,8 @@ class Track:
         total = -0.5 * np.sum(np.log(2.0 * np.pi * s) + e * e / s)
         if "F" in _names(self._tile):
             total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
+        if hasattr(self.model, "log_jacobian"):
+            total += np.sum(self.model.log_jacobian(self.theta[counted], self.y[counted]))
         return float(total)
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
