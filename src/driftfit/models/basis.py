@@ -49,7 +49,7 @@ def basis_of(value: Any) -> Basis | None:
     if value is None or isinstance(value, Basis):
         return value
     if isinstance(value, Mapping) and value.get("class") in _kinds():
-        return cast(Basis, _kinds()[value["class"]].from_settings(dict(value["settings"])))
+        return _kinds()[value["class"]].from_settings(dict(value["settings"]))
     raise ValueError(f"a block takes one of {', '.join(_kinds())}, or None for the identity; got {value!r}.")
 
 

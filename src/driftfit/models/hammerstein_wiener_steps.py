@@ -146,9 +146,9 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
         rising = envelope(now[D], curve, level)
         cells[RISING] = 1.0 if rising else 0.0
         if right < level[0]:
-            return cells[LOW]
+            return float(cells[LOW])
         if right >= level[grid - 1]:
-            return cells[LOW] + (grid - 1) * cells[STEP]
+            return float(cells[LOW] + (grid - 1) * cells[STEP])
         below, above = 0, grid - 1
         while above - below > 1:
             middle = (below + above) // 2
@@ -168,7 +168,7 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
                     value += now[D, k] * now[G, k]
                     slope += now[D, k] * now[H, k]
                 y = min(max(y + (right - value) / slope, low), high) if slope > 0.0 else y
-        return y
+        return float(y)
 
     inverse = _named(solve, g, slopes)
 

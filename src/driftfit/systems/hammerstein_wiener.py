@@ -317,7 +317,8 @@ def example(number: int, seed: int = 0, T: int = 5000, snr_db: float | None = No
         }  # fmt: skip
     while True:
         try:
-            found = simulate(CUBIC, **laws, T=T, rng=np.random.default_rng(seed), snr_db=snr_db)
+            groups = (laws[name] for name in "abcd")
+            found = simulate(CUBIC, *groups, T=T, rng=np.random.default_rng(seed), snr_db=snr_db)
         except NotMonotoneError:
             seed += 1000
             continue
