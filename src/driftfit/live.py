@@ -241,7 +241,8 @@ class Live:
             from driftfit.blocks.paths import Separator
 
             self._separator = Separator(self.model)
-        return self._separator(self._tile["theta"][0, :, 0], method)
+        groups: Groups = self._separator(self._tile["theta"][0, :, 0], method)
+        return groups
 
     @property
     def learning(self) -> Array:

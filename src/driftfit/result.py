@@ -152,7 +152,7 @@ class Track:
         total = -0.5 * np.sum(np.log(2.0 * np.pi * s) + e * e / s)
         if "F" in _names(self._tile):
             total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
-        if hasattr(self.model, "log_jacobian"):
+        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
             total += np.sum(self.model.log_jacobian(self.theta[counted], self.y[counted]))
         return float(total)
 

@@ -23,6 +23,7 @@ from driftfit.blocks.least_squares import refine
 from driftfit.blocks.separate import METHODS, separate
 from driftfit.drivers import drivers, output_type
 from driftfit.kernel import Array
+from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.settings import one_of
 
@@ -300,7 +301,7 @@ def covariances(run: Track) -> Any:
 class Separator:
     """Separates one theta after another, for streams: the arrays are made once."""
 
-    def __init__(self, model: HammersteinWiener) -> None:
+    def __init__(self, model: Model) -> None:
         if not isinstance(model, HammersteinWiener):
             raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
         self.model = model

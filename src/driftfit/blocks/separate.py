@@ -107,7 +107,7 @@ def rank_one(M: Array, W: Array, left: Array, right: Array) -> float:
     for i in range(p):
         right[i] = right[i] / guard(head)
     right[0] = 1.0
-    return np.sqrt(second / top)
+    return float(np.sqrt(second / top))
 
 
 @shared

@@ -26,8 +26,9 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from driftfit.kernel import Array, kernel
-from driftfit.models.curves import Basis, Curves, Functions
+from driftfit.kernel import Array
+from driftfit.models import curve_kernels
+from driftfit.models.curves import Basis, Functions
 from driftfit.models.splines import BSpline, PiecewiseLinear
 from driftfit.settings import numbers, whole
 
@@ -58,27 +59,13 @@ def _kinds() -> dict[str, type[Basis]]:
                                              Functions)}  # fmt: skip
 
 
-@kernel
-def _powers(x: float, p: Array, out: Array) -> None:
-    power = x
-    for k in range(out.shape[0]):
-        out[k] = power
-        power = power * x
-
-
-@kernel
-def _power_slopes(x: float, p: Array, out: Array) -> None:
-    power = 1.0
-    for k in range(out.shape[0]):
-        out[k] = (k + 1) * power
-        power = power * x
-
-
 @dataclass(frozen=True)
 class Polynomial(Basis):
     """Raw powers x .. x^degree; from degree 4 on, `Legendre` is the better choice and a warning says so."""
 
     degree: int
+
+    code: ClassVar[int] = curve_kernels.POWERS
 
     def __post_init__(self) -> None:
         self._set("degree", whole("Polynomial", "degree", self.degree, 1))
@@ -93,10 +80,6 @@ class Polynomial(Basis):
     @property
     def n(self) -> int:
         return self.degree
-
-    @property
-    def curves(self) -> Curves:
-        return Curves(_powers, _power_slopes)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -130,7 +113,7 @@ class _Orthogonal(Basis):
         return cast("tuple[float, float]", self.range)
 
     @property
-    def parameters(self) -> Array:
+    def own_numbers(self) -> Array:
         low, high = self.range
         return np.array([0.5 * (low + high), 0.5 * (high - low)])
 
@@ -139,81 +122,18 @@ class _Orthogonal(Basis):
         return tuple(f"{type(self).__name__[0].replace('C', 'T').replace('L', 'P')}{k + 1}" for k in range(self.degree))
 
 
-@kernel
-def _legendre(x: float, p: Array, out: Array) -> None:
-    s = (x - p[0]) / p[1]
-    before, now = 1.0, s
-    for k in range(out.shape[0]):
-        out[k] = now
-        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
-        before, now = now, after
-
-
-@kernel
-def _legendre_slopes(x: float, p: Array, out: Array) -> None:
-    # P'_(k+1) = P'_(k-1) + (2 k + 1) P_k
-    s = (x - p[0]) / p[1]
-    before, now = 1.0, s
-    slope_before, slope = 0.0, 1.0
-    for k in range(out.shape[0]):
-        out[k] = slope / p[1]
-        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
-        slope_after = slope_before + (2 * k + 3) * now
-        before, now = now, after
-        slope_before, slope = slope, slope_after
-
-
 @dataclass(frozen=True)
 class Legendre(_Orthogonal):
     """Legendre polynomials P_1 .. P_degree of s = (x - middle) / half-width on ``range`` = (low, high)."""
 
-    @property
-    def curves(self) -> Curves:
-        return Curves(_legendre, _legendre_slopes)
-
-
-@kernel
-def _chebyshev(x: float, p: Array, out: Array) -> None:
-    s = (x - p[0]) / p[1]
-    before, now = 1.0, s
-    for k in range(out.shape[0]):
-        out[k] = now
-        before, now = now, 2.0 * s * now - before
-
-
-@kernel
-def _chebyshev_slopes(x: float, p: Array, out: Array) -> None:
-    s = (x - p[0]) / p[1]
-    before, now = 1.0, s
-    slope_before, slope = 0.0, 1.0
-    for k in range(out.shape[0]):
-        out[k] = slope / p[1]
-        slope_before, slope = slope, 2.0 * now + 2.0 * s * slope - slope_before
-        before, now = now, 2.0 * s * now - before
+    code: ClassVar[int] = curve_kernels.LEGENDRE
 
 
 @dataclass(frozen=True)
 class Chebyshev(_Orthogonal):
     """Chebyshev polynomials T_1 .. T_degree of s = (x - middle) / half-width on ``range`` = (low, high)."""
 
-    @property
-    def curves(self) -> Curves:
-        return Curves(_chebyshev, _chebyshev_slopes)
-
-
-@kernel
-def _dead_zone(x: float, p: Array, out: Array) -> None:
-    above, below = x >= p[0], x <= p[1]
-    out[0] = x if above or below or x != x else 0.0
-    out[1] = -1.0 if above else 0.0
-    out[2] = -1.0 if below else 0.0
-
-
-@kernel
-def _dead_zone_slopes(x: float, p: Array, out: Array) -> None:
-    out[0] = 1.0 if x >= p[0] or x <= p[1] else 0.0
-    out[1] = 0.0
-    out[2] = 0.0
+    code: ClassVar[int] = curve_kernels.CHEBYSHEV
 
 
 @dataclass(frozen=True)
@@ -227,6 +147,7 @@ class DeadZone(Basis):
     u_max: float
     start: float = 0.01
 
+    code: ClassVar[int] = curve_kernels.DEAD_ZONE
     adaptive: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -238,11 +159,7 @@ class DeadZone(Basis):
         return 3
 
     @property
-    def curves(self) -> Curves:
-        return Curves(_dead_zone, _dead_zone_slopes)
-
-    @property
-    def parameters(self) -> Array:
+    def own_numbers(self) -> Array:
         return np.array([self.start, -self.start, self.u_max])
 
     @property
@@ -255,4 +172,4 @@ class DeadZone(Basis):
 
     def known(self, p1: float, p2: float) -> Functions:
         """The basis with thresholds that are known, for simulations."""
-        return Functions(_dead_zone, _dead_zone_slopes, 3, (p1, p2, self.u_max), self.names)
+        return Functions(curve_kernels.dead_zone, curve_kernels.dead_zone_slopes, 3, (p1, p2, self.u_max), self.names)

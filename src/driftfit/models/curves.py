@@ -17,6 +17,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from driftfit.kernel import Array, Driver, kernel
+from driftfit.models import curve_kernels
 from driftfit.settings import Settings, numbers, whole
 
 
@@ -28,20 +29,22 @@ class Curves(NamedTuple):
 
 
 @lru_cache
-def over(function: Any) -> Driver:
+def fill(function: Any) -> Driver:
     """A compiled loop of a basis function over an array."""
 
     @Driver
-    def fill(x: Array, p: Array, out: Array) -> None:
+    def each(x: Array, p: Array, out: Array) -> None:
         for i in range(x.shape[0]):
             function(x[i], p, out[i])
 
-    return fill
+    return each
 
 
 class Basis(Settings, ABC):
     """A set of functions of one variable, without a constant."""
 
+    code: ClassVar[int] = -1
+    """The kind, as `driftfit.models.curve_kernels` knows it."""
     adaptive: ClassVar[bool] = False
     """Whether the functions depend on their own coefficients, which then are fed back at every sample."""
 
@@ -51,14 +54,19 @@ class Basis(Settings, ABC):
         """Number of functions."""
 
     @property
-    @abstractmethod
     def curves(self) -> Curves:
         """The compiled functions."""
+        return Curves(curve_kernels.values, curve_kernels.slopes)
+
+    @property
+    def own_numbers(self) -> Array:
+        """Numbers of the basis, (k,)."""
+        return np.zeros(0)
 
     @property
     def parameters(self) -> Array:
-        """Numbers that the compiled functions need, (k,) with k at least 1."""
-        return np.zeros(1)
+        """What the compiled functions get as p: the code of the kind, and the numbers of the basis."""
+        return np.concatenate([[float(self.code)], self.own_numbers])
 
     @property
     def expected(self) -> tuple[float, float]:
@@ -86,7 +94,7 @@ class Basis(Settings, ABC):
     def _at(self, function: Any, x: Any) -> Array:
         points = np.asarray(x, dtype=float)
         out = np.empty((points.size, self.n))
-        over(function)(np.ascontiguousarray(points.ravel()), self.parameters.copy(), out)
+        fill(function)(np.ascontiguousarray(points.ravel()), self.parameters.copy(), out)
         return out.reshape(*points.shape, self.n)
 
     def plain(self) -> dict[str, Any]:

@@ -38,22 +38,19 @@ FLOOR = 1e-4
 """Least variance of the equation error under measurement noise."""
 
 # places in `cells`: the grid, what was seen, where the output block is defined, and results
-LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN = range(11)
-# rows of `now`: functions of the present output, their slopes, and d; functions of the present input
-G, H, D, F = range(4)
+LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW = range(12)
 
 
 def memory(structure: Structure, delay: int, into: Any, out: Any, limits: tuple[float, float]) -> dict[str, Any]:
     """Fields of the record; ``into`` and ``out`` are the numbers of the bases."""
     na, nb, n_in, n_out, _ = structure
-    cells = np.zeros(11)
+    cells = np.zeros(12)
     cells[[LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED]] = np.inf, -np.inf, *limits, 1.0, np.nan
-    now = np.zeros((4, max(n_in, n_out)))
-    now[D, 0] = 1.0
     return {
         "f_lag": np.full((n_in, nb + delay), np.nan), "u_past": np.full(nb + delay, np.nan),
         "g_lag": np.full((n_out, max(na, 1)), np.nan), "h_lag": np.full((n_out, max(na, 1)), np.nan),
-        "now": now, "into": into, "out": out, "curve": np.zeros((n_out, GRID)), "level": np.zeros(GRID),
+        "g_now": np.zeros(n_out), "h_now": np.zeros(n_out), "d_now": np.eye(1, n_out)[0], "f_now": np.zeros(n_in),
+        "into": into, "out": out, "curve": np.zeros((n_out, GRID)), "level": np.zeros(GRID),
         "cells": cells,
     }  # fmt: skip
 
@@ -133,17 +130,19 @@ def _named(function: Any, *parts: Any) -> Any:
 
 
 @lru_cache
-def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tuple[Any, Any]:
-    """``regress`` and ``push`` of one lane, for one pair of kinds of basis."""
-    f, g, slopes = into.values, out.values, out.slopes
-    kind = f"{linear:d}{adaptive:d}"
+def inverse_of(out: Curves) -> Any:
+    """A shared function that inverts the output block on the grid."""
+    g, slopes = out.values, out.slopes
 
-    def solve(right: float, now: Array, numbers: Array, curve: Array, level: Array, cells: Array) -> float:
+    def solve(
+        right: float, g_now: Array, h_now: Array, d_now: Array, numbers: Array, curve: Array, level: Array,
+        cells: Array,
+    ) -> float:  # fmt: skip
         """The output at which the estimated output block has the value ``right``, within the grid."""
         if not (cells[STEP] > 0.0 and abs(right) < LARGEST):
             return np.nan
         n_out, grid = curve.shape
-        rising = envelope(now[D], curve, level)
+        rising = envelope(d_now, curve, level)
         cells[RISING] = 1.0 if rising else 0.0
         if right < level[0]:
             return float(cells[LOW])
@@ -161,41 +160,53 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
         y = low + cells[STEP] * (right - level[below]) / (level[below + 1] - level[below])
         if rising:
             for _ in range(NEWTON):
-                g(y, numbers, now[G, :n_out])
-                slopes(y, numbers, now[H, :n_out])
+                g(y, numbers, g_now)
+                slopes(y, numbers, h_now)
                 value, slope = 0.0, 0.0
                 for k in range(n_out):
-                    value += now[D, k] * now[G, k]
-                    slope += now[D, k] * now[H, k]
+                    value += d_now[k] * g_now[k]
+                    slope += d_now[k] * h_now[k]
                 y = min(max(y + (right - value) / slope, low), high) if slope > 0.0 else y
         return float(y)
 
-    inverse = _named(solve, g, slopes)
+    return _named(solve, g, slopes)
+
+
+@lru_cache
+def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
+    """``regress`` and ``push`` of one lane, for one pair of kinds of basis."""
+    f, g, slopes = into.values, out.values, out.slopes
+    inverse = inverse_of(out)
 
     def lane_regress(
-        u: float, y: float, dt: float, orders: tuple[int, int, int], variance: float, theta: Array, phi: Array,
-        f_lag: Array, u_past: Array, g_lag: Array, h_lag: Array, now: Array, into: Array, out: Array, curve: Array,
+        u: float, y: float, dt: float, orders: tuple[int, int, int, int, int], variance: float, theta: Array,
+        phi: Array, f_lag: Array, u_past: Array, g_lag: Array, h_lag: Array, g_now: Array, h_now: Array, d_now: Array,
+        f_now: Array, into: Array, out: Array, curve: Array,
         level: Array, cells: Array,
     ) -> tuple[float, float, float]:  # fmt: skip
         """Fill phi; returns (z, dt, factor of the noise variance)."""
-        na, nb, nk = orders
+        na, nb, nk, linear, adaptive = orders
         n_in, n_out, depth = f_lag.shape[0], g_lag.shape[0], u_past.shape[0]
         at_d = na + nb
         at_bc = at_d + n_out - 1
         at_ad = at_bc + nb * (n_in - 1)
         if dt > GAP:
-            u_past[:] = np.nan
-            f_lag[:] = np.nan
-            g_lag[:] = np.nan
+            for j in range(depth):
+                u_past[j] = np.nan
+                for k in range(n_in):
+                    f_lag[k, j] = np.nan
+            for i in range(g_lag.shape[1]):
+                for k in range(n_out):
+                    g_lag[k, i] = np.nan
         for j in range(depth - 1, 0, -1):
             u_past[j] = u_past[j - 1]
             for k in range(n_in):
                 f_lag[k, j] = f_lag[k, j - 1]
         u_past[0] = u
-        for j in range(depth if adaptive else 1):
-            f(u_past[j], into, now[F, :n_in])
+        for j in range(depth if adaptive > 0 else 1):
+            f(u_past[j], into, f_now)
             for k in range(n_in):
-                f_lag[k, j] = now[F, k]
+                f_lag[k, j] = f_now[k]
         started = 1.0
         for j in range(nb):
             phi[na + j] = -f_lag[0, nk + j]
@@ -211,39 +222,40 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
             if i < at_d or i >= at_bc:
                 started = started if abs(phi[i]) < LARGEST else cells[STARTED]
         cells[STARTED] = started
-        right = past(theta, phi, now[D], cells[MINIMAL] > 0.0, na, nb, n_in, n_out)
-        if linear:
+        right = past(theta, phi, d_now, cells[MINIMAL] > 0.0, na, nb, n_in, n_out)
+        if linear > 0:
             cells[PREDICTED] = right
         else:
-            cells[PREDICTED] = inverse(right, now, out, curve, level, cells)
+            cells[PREDICTED] = inverse(right, g_now, h_now, d_now, out, curve, level, cells)
         seen = abs(y) < LARGEST
         point = y if seen else cells[PREDICTED]
-        g(point, out, now[G, :n_out])
-        slopes(point, out, now[H, :n_out])
+        g(point, out, g_now)
+        slopes(point, out, h_now)
         for k in range(n_out):
-            seen = seen and abs(now[G, k]) < LARGEST
+            seen = seen and abs(g_now[k]) < LARGEST
         for k in range(n_out - 1):
-            phi[at_d + k] = now[G, k + 1]
+            phi[at_d + k] = g_now[k + 1]
+        cells[RAW] = y if seen else np.nan
         if seen:
             cells[LOWEST] = min(cells[LOWEST], y)
             cells[HIGHEST] = max(cells[HIGHEST], y)
-        factor = noise_factor(theta, now[D], now[H], h_lag, na, n_out, variance) if variance > 0.0 else 1.0
-        return -now[G, 0] if seen else np.nan, dt if started > 0.0 else 0.0, factor
+        factor = noise_factor(theta, d_now, h_now, h_lag, na, n_out, variance) if variance > 0.0 else 1.0
+        return -g_now[0] if seen else np.nan, dt if started > 0.0 else 0.0, factor
 
     def lane_push(
-        seen: bool, ok: bool, orders: tuple[int, int, int], theta: Array, g_lag: Array, h_lag: Array, now: Array,
-        into: Array, out: Array, curve: Array, cells: Array, n_in: int,
+        seen: bool, ok: bool, orders: tuple[int, int, int, int, int], theta: Array, g_lag: Array, h_lag: Array,
+        g_now: Array, h_now: Array, into: Array, out: Array, curve: Array, cells: Array, n_in: int,
     ) -> None:  # fmt: skip
         """The present output among the lags (a missing one stays missing), thresholds, and the grid."""
-        na, nb, _ = orders
+        na, nb, _, linear, adaptive = orders
         n_out, grid = curve.shape
         for k in range(n_out):
             for i in range(g_lag.shape[1] - 1, 0, -1):
                 g_lag[k, i] = g_lag[k, i - 1]
                 h_lag[k, i] = h_lag[k, i - 1]
-            g_lag[k, 0] = now[G, k] if seen else np.nan
-            h_lag[k, 0] = now[H, k]
-        if adaptive and ok:
+            g_lag[k, 0] = g_now[k] if seen else np.nan
+            h_lag[k, 0] = h_now[k]
+        if adaptive > 0 and ok:
             x_c, at_bc = na + nb, na + nb + n_out - 1
             for k in range(2):
                 total, size = 0.0, 0.0
@@ -252,9 +264,9 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
                     total += theta[na + j] * theta[at_bc + k * nb + j] if cells[MINIMAL] == 0.0 else 0.0
                 threshold = total / size if cells[MINIMAL] == 0.0 else theta[x_c + k]
                 if abs(threshold) < LARGEST:
-                    top, bottom = INSIDE * into[2] * (1 - k), -INSIDE * into[2] * k
-                    into[k] = min(max(threshold, bottom), top)
-        if not linear and cells[LOWEST] <= cells[HIGHEST]:
+                    top, bottom = INSIDE * into[3] * (1 - k), -INSIDE * into[3] * k
+                    into[1 + k] = min(max(threshold, bottom), top)
+        if linear == 0 and cells[LOWEST] <= cells[HIGHEST]:
             last = cells[LOW] + (grid - 1) * cells[STEP]
             short = cells[LOWEST] < cells[LOW] and cells[LOW] > cells[BOTTOM]
             if cells[STEP] == 0.0 or short or (cells[HIGHEST] > last and last < cells[TOP]):
@@ -263,12 +275,10 @@ def _lane_steps(into: Curves, out: Curves, linear: bool, adaptive: bool) -> tupl
                 cells[LOW] = max(cells[LOWEST] - margin, cells[BOTTOM])
                 cells[STEP] = (min(cells[HIGHEST] + margin, cells[TOP]) - cells[LOW]) / (grid - 1)
                 for i in range(grid):
-                    g(min(cells[LOW] + i * cells[STEP], cells[TOP]), out, now[H, :n_out])
+                    g(min(cells[LOW] + i * cells[STEP], cells[TOP]), out, h_now)
                     for k in range(n_out):
-                        curve[k, i] = now[H, k]
+                        curve[k, i] = h_now[k]
 
-    lane_regress.__qualname__ += kind
-    lane_push.__qualname__ += kind
     return _named(lane_regress, f, g, slopes), _named(lane_push, g)
 
 
@@ -278,15 +288,17 @@ def build(
 ) -> ModelSteps:
     """The steps of one structure; ``linear`` says that the output block is the identity, ``sigma`` that r follows."""
     na, nb, n_in, _, _ = structure
-    lane_regress, lane_push = _lane_steps(into, out, linear, adaptive)
+    lane_regress, lane_push = _lane_steps(into, out)
+    orders = (na, nb, nk, int(linear), int(adaptive))
     variance = 0.0 if sigma is None else sigma * sigma
 
     @kernel
     def regress(s: State, l: int) -> None:
         s.cells[GIVEN, l] = s.noise[l]
         s.y[l], s.dt[l], factor = lane_regress(
-            s.u[0, l], s.y[l], s.dt[l], (na, nb, nk), variance, s.theta[:, l], s.phi[:, l], s.f_lag[:, :, l],
-            s.u_past[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l], s.now[:, :, l], s.into[:, l], s.out[:, l],
+            s.u[0, l], s.y[l], s.dt[l], orders, variance, s.theta[:, l], s.phi[:, l], s.f_lag[:, :, l],
+            s.u_past[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l], s.g_now[:, l], s.h_now[:, l], s.d_now[:, l],
+            s.f_now[:, l], s.into[:, l], s.out[:, l],
             s.curve[:, :, l], s.level[:, l], s.cells[:, l],
         )  # fmt: skip
         s.noise[l] *= factor
@@ -296,8 +308,8 @@ def build(
         s.noise[l] = s.cells[GIVEN, l]
         s.y_hat[l] = s.cells[PREDICTED, l]
         lane_push(
-            s.seen[l] > 0.0, s.ok[l] > 0.0, (na, nb, nk), s.theta[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l],
-            s.now[:, :, l], s.into[:, l], s.out[:, l], s.curve[:, :, l], s.cells[:, l], n_in,
+            s.seen[l] > 0.0, s.ok[l] > 0.0, orders, s.theta[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l],
+            s.g_now[:, l], s.h_now[:, l], s.into[:, l], s.out[:, l], s.curve[:, :, l], s.cells[:, l], n_in,
         )  # fmt: skip
 
     return ModelSteps(regress, push)

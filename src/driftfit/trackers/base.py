@@ -46,6 +46,13 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    output_error: ClassVar[bool] = False
+    """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
+
+    @classmethod
+    def own_model(cls) -> Model | None:
+        """An example of the models that this tracker works on, where those are not all: what general tests use."""
+        return None
 
     @abstractmethod
     def state(self, n: int) -> Mapping[str, Any]:
