@@ -50,8 +50,11 @@ class Tracker(Settings, ABC):
     """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
 
     @classmethod
-    def own_model(cls) -> Model | None:
-        """An example of the models that this tracker works on, where those are not all: what general tests use."""
+    def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
+        """The model for a linear record of these lags, where the tracker does not work on all: for general tests.
+
+        Its theta begins with -a_1 .. -a_na, b_1 .. b_nb of the `ARX` for that record.
+        """
         return None
 
     @abstractmethod

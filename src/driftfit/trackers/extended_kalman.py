@@ -28,7 +28,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.kernel import State, kernel
 from driftfit.models.base import Model
-from driftfit.models.basis import Polynomial
+from driftfit.models.basis import PiecewiseLinear
 from driftfit.models.block_products import Structure
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.hammerstein_wiener_steps import MINIMAL
@@ -180,9 +180,9 @@ class ExtendedKalman(Tracker):
         self._set("inflation", numbers("ExtendedKalman", "inflation", self.inflation, ndim=0, low=0.0))
 
     @classmethod
-    def own_model(cls) -> HammersteinWiener:
-        """A linear record is one with c_2 = 0."""
-        return HammersteinWiener(2, 2, input=Polynomial(2))
+    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
+        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
+        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The state for n minimal parameters."""

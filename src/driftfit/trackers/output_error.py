@@ -27,7 +27,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array, State, kernel, shared
 from driftfit.models.base import Model
-from driftfit.models.basis import Polynomial
+from driftfit.models.basis import PiecewiseLinear
 from driftfit.models.curves import Curves
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.hammerstein_wiener_steps import GIVEN, PREDICTED, RAW, STARTED, STEP, inverse_of
@@ -39,8 +39,8 @@ FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
 REACH = 3.0
 """Ranges of F within which w is held."""
-LARGEST_P = 1e8
-"""Variances are held below this: an unstable estimate must not overflow before it is put right."""
+LARGEST_VARIANCE = 1e20
+"""Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
 
 
 @shared
@@ -106,7 +106,13 @@ def advance(
     for x in range(n_w, N):
         S[0, x] = moved[x]
         S[x, 0] = S[0, x]
-    S[0, 0] = min(own, LARGEST_P)
+    S[0, 0] = own
+    if own > LARGEST_VARIANCE:
+        shrink = np.sqrt(LARGEST_VARIANCE / own)
+        for x in range(N):
+            S[0, x] *= shrink
+            S[x, 0] = S[0, x]
+        S[0, 0] = LARGEST_VARIANCE
     w[0] = min(max(total, -reach), reach)
 
 
@@ -259,9 +265,9 @@ class OutputError(Tracker):
         self._set("theta0", numbers("OutputError", "theta0", self.theta0))
 
     @classmethod
-    def own_model(cls) -> HammersteinWiener:
-        """A linear record is one with c_2 = 0."""
-        return HammersteinWiener(2, 2, input=Polynomial(2))
+    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
+        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
+        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The part of the state that depends on the number n of minimal parameters alone."""
