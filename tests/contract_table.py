@@ -14,3 +14,28 @@ def ready(kind, values=VALUES, **settings):
     unknown = set(kind.required) - values.keys() - settings.keys()
     assert not unknown, f"{kind.__name__}: give the required settings {sorted(unknown)} a value in contract_table.py"
     return kind(**{name: values[name] for name in kind.required if name not in settings} | settings)
+
+
+def model_of(tracker, model):
+    """The model of a test, or what takes its place for a tracker that works on its own models only.
+
+    ``ARX(na, nb)`` of one input becomes a model of the same lags, ``Regression(n)`` one on n present and past inputs.
+    """
+    lags = (model.na, model.nb, 1) if hasattr(model, "na") else (0, model.m, 0)
+    return (tracker.own_model(*lags) or model).bind(1 if tracker.own_model(*lags) else model.m)
+
+
+def as_arx(tracker, theta, na=2, nb=2):
+    """Paths of ARX parameters from those of the model that `model_of` gave."""
+    own = tracker.own_model(na, nb, 1)
+    return theta if own is None else theta[:, : na + nb] * ([-1.0] * na + [1.0] * nb)
+
+
+def unusable(tracker, model, signal, first, last=None):
+    """The samples that a tracker cannot use when a signal is missing from ``first`` to ``last``."""
+    last = first if last is None else last
+    if signal == "u":
+        return list(range(first + 1, last + 3))  # nk = 1, nb = 2: the input of a sample is in phi of the next two
+    if tracker.output_error or not hasattr(model, "touched"):
+        return list(range(first, last + 1))
+    return sorted({t for place in range(first, last + 1) for t in model.touched(place, signal)})

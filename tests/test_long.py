@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from contract_table import SLOW, ready
+from contract_table import SLOW, as_arx, model_of, ready
 from support import THETA, arx_record
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
@@ -23,10 +23,11 @@ def drifting(T):
 def test_a_drifting_system_is_followed_to_the_end(tracker):
     path = drifting(LONG)
     y, u = arx_record(LONG, 1, theta=path)
-    run = track(ARX(2, 2), tracker, y, u)
+    run = track(model_of(tracker, ARX(2, 2)), tracker, y, u)
+    theta = as_arx(tracker, run.theta)
     steady = track(ARX(2, 2), RLS(1.0), y, u)
     for part in (slice(1000, 50_000), slice(50_000, LONG)):
-        error = root_mean_square(run.theta[part] - path[part])
+        error = root_mean_square(theta[part] - path[part])
         assert error < 0.12
         assert error < 0.5 * root_mean_square(steady.theta[part] - path[part])
         assert root_mean_square(run.innovation[part]) < 1.4 * 0.1
@@ -52,10 +53,11 @@ def test_an_unstable_system_with_bounded_output(tracker):
     y[np.random.default_rng(3).random(LONG) < 0.05] = np.nan
     for start in range(10_000, LONG, 10_000):
         y[start : start + 300] = np.nan
-    run = track(ARX(1, 1), tracker, y, u)
-    assert np.isfinite(run.theta).all()
+    run = track(model_of(tracker, ARX(1, 1)), tracker, y, u)
+    theta = as_arx(tracker, run.theta, 1, 1)
+    assert np.isfinite(theta).all()
     assert np.nanmax(np.abs(run.prediction)) < 10.0
-    np.testing.assert_allclose(run.theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=0.05)
+    np.testing.assert_allclose(theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=0.05)
     assert root_mean_square(run.innovation[run.ok][1000:]) < 0.2
 
 
@@ -65,10 +67,11 @@ def test_a_structure_that_changes_half_way(tracker):
     half = LONG // 2
     path = np.where(np.arange(LONG)[:, None] < half, [0.7, 0.0, 1.0, 0.0], THETA)
     y, u = arx_record(LONG, 4, theta=path)
-    run = track(ARX(2, 2), tracker, y, u)
-    np.testing.assert_allclose(run.theta[half - 2000 : half].mean(axis=0), path[0], atol=0.05)
-    np.testing.assert_allclose(run.theta[half + 1000 : half + 3000].mean(axis=0), THETA, atol=0.05)
-    np.testing.assert_allclose(run.theta[-2000:].mean(axis=0), THETA, atol=0.05)
+    run = track(model_of(tracker, ARX(2, 2)), tracker, y, u)
+    theta = as_arx(tracker, run.theta)
+    np.testing.assert_allclose(theta[half - 2000 : half].mean(axis=0), path[0], atol=0.05)
+    np.testing.assert_allclose(theta[half + 1000 : half + 3000].mean(axis=0), THETA, atol=0.05)
+    np.testing.assert_allclose(theta[-2000:].mean(axis=0), THETA, atol=0.05)
     if tracker.covariance:  # the term is told from 0 only where it exists
         low, high = run.band()
         outside = (low[:, 1] > 0.0) | (high[:, 1] < 0.0)

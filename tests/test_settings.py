@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from contract_table import model_of
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.trackers import found
@@ -60,7 +61,8 @@ def test_wrong_settings_are_named(build, says):
 
 @pytest.mark.parametrize("kind", list(found().values()), ids=list(found()))
 def test_missing_settings_are_named_with_the_way_to_give_them(kind):
-    for run in (lambda: track(Regression(1), kind(), ONES, ONES), lambda: Live(Regression(1), kind())):
+    model = model_of(kind, Regression(1))
+    for run in (lambda: track(model, kind(), ONES, ONES), lambda: Live(model, kind())):
         if kind.required:
             way_out = f"{kind.__name__}({', '.join(f'{name}=...' for name in kind.required)})"
             with pytest.raises(ValueError, match=re.escape(way_out)):

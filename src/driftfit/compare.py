@@ -39,6 +39,11 @@ def persistence(y: Array) -> Array:
     return np.where(last >= 0, y[last], np.nan)
 
 
+def _error(y: Array, prediction: Array, innovation: Array) -> Array:
+    """Error of the prediction of y; the innovation of a model may be that of something else."""
+    return np.where(np.isfinite(innovation), y - prediction, np.nan)
+
+
 class Errors(NamedTuple):
     """One-step errors of everyone, (T,) each, and which samples are scored."""
 
@@ -54,9 +59,10 @@ def errors(run: Track) -> Errors:
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     gaps = run._known[:, 0]  # 0 before the lags are filled
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
-    steady = constant_least_squares(run)["e"][:, 0]
+    steady = constant_least_squares(run)
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
-    own = (run.innovation, y - persistence(y), steady, arx.innovation)
+    tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
+    own = (tracked, y - persistence(y), constant, arx.innovation)
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
     for error in own:
         scored &= np.isfinite(error)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numba import types
@@ -18,6 +18,9 @@ from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.storage import fields, load_state, save_state
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, Run, carried, fresh_tile
+
+if TYPE_CHECKING:
+    from driftfit.blocks.paths import Groups
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
@@ -60,6 +63,7 @@ class Live:
         self.dt = dt
         self._last: Any = None if warm_start is None else warm_start.end().last
         self._ignored = 0
+        self._separator: Any = None
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
@@ -230,6 +234,15 @@ class Live:
     def cov(self) -> Array:
         """Covariance of theta, (n, n)."""
         return self.tracker.cov(self._lane())
+
+    def blocks(self, method: str = "svd-joint") -> Groups:
+        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, but for "gls"."""
+        if self._separator is None:
+            from driftfit.blocks.paths import Separator
+
+            self._separator = Separator(self.model)
+        groups: Groups = self._separator(self._tile["theta"][0, :, 0], method)
+        return groups
 
     @property
     def learning(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC
 from functools import cached_property
@@ -25,6 +25,7 @@ from driftfit.warm import End, fresh_tile
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.blocks.paths import Blocks
     from driftfit.forecast import Forecast
     from driftfit.smoothers.smoothed import Smoothed
     from driftfit.summary import Summary
@@ -141,7 +142,8 @@ class Track(Judged):
         """Gaussian log-likelihood of the one-step predictions; the diffuse likelihood after a diffuse start.
 
         Sum over used samples of -1/2 (log 2 pi s + e^2 / s), and -1/2 log F for each sample that determined a new
-        direction. NaN for trackers without an innovation variance.
+        direction; a model whose innovation is not that of y adds its log Jacobian. NaN for trackers without an
+        innovation variance.
         """
         if not self.tracker.covariance:
             return float("nan")
@@ -151,6 +153,8 @@ class Track(Judged):
         total = -0.5 * np.sum(np.log(2.0 * np.pi * s) + e * e / s)
         if "F" in _names(self._tile):
             total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
+        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
+            total += np.sum(self.model.log_jacobian(self.theta[counted], self.y[counted]))
         return float(total)
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
@@ -242,6 +246,22 @@ class Track(Judged):
         if convert is None:
             raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
         return cast("tuple[Array, list[Array]]", convert(self.theta))
+
+    def blocks(self, method: str = "svd-joint", input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+        """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
+
+        ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see `driftfit.blocks.separate`;
+        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`.
+        """
+        from driftfit.blocks.paths import blocks_of
+
+        return blocks_of(self, method, input, output, at)
+
+    def plot_blocks(self, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
+        """The static curves at some samples, and the coefficients over time; a matplotlib figure."""
+        from driftfit.blocks.plots import plot_blocks
+
+        return plot_blocks(self, method, times)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file, without pickle; complete or not at all."""

@@ -135,6 +135,7 @@ def track(
     one_of("track", "keep", keep, ("std", "cov"))
     records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
     bound = model.bind(records.labels.u or records.u.shape[1])
+    bound.inspect(records.y, records.u)
     if by is None and isinstance(tracker, Tracker):
         return _one(bound, _checked(tracker, keep), records, keep, warm_start, dt)
     if by is None and not isinstance(tracker, Tracker):

@@ -1,7 +1,7 @@
 """The contract: what every tracker that stands in the folder promises. A new file there is tested by being there."""
 
 import pytest
-from contract_table import ready
+from contract_table import model_of, ready
 
 from driftfit import ARX
 from driftfit.trackers import found
@@ -13,5 +13,5 @@ def tracker(request):
 
 
 @pytest.fixture
-def model():
-    return ARX(2, 2).bind(1)
+def model(tracker):
+    return model_of(tracker, ARX(2, 2).bind(1))

@@ -70,6 +70,9 @@ class Model(Settings, ABC):
     def steps(self) -> ModelSteps:
         """The compiled ``regress`` and ``push``."""
 
+    def inspect(self, y: Array, u: Array) -> None:
+        """Warn of data that do not suit the model; `track` calls it with the whole record, y (T,), u (T, m)."""
+
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
         response: Array = np.eye(1, h)[0]

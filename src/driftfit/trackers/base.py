@@ -46,6 +46,16 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    output_error: ClassVar[bool] = False
+    """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
+
+    @classmethod
+    def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
+        """The model for a linear record of these lags, where the tracker does not work on all: for general tests.
+
+        Its theta begins with -a_1 .. -a_na, b_1 .. b_nb of the `ARX` for that record.
+        """
+        return None
 
     @abstractmethod
     def state(self, n: int) -> Mapping[str, Any]:

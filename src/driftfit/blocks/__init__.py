@@ -1,0 +1,1 @@
+"""The blocks of a Hammerstein-Wiener model: separation, gauges, free runs, diagnostics, pictures."""

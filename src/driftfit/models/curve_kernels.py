@@ -1,0 +1,195 @@
+"""The compiled functions of all bases that the library brings, behind one pair for every kind.
+
+``values(x, p, out)`` and ``slopes(x, p, out)`` fill ``out`` (n,) with the functions and their derivatives at x; p[0] is
+the code of the kind and the rest its own numbers. One pair means one compilation for every combination of bases.
+
+B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs stands at
+the end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.kernel import Array, kernel, shared
+
+POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE = range(6)
+
+
+@kernel
+def powers(x: float, p: Array, out: Array) -> None:
+    power = x
+    for k in range(out.shape[0]):
+        out[k] = power
+        power = power * x
+
+
+@kernel
+def power_slopes(x: float, p: Array, out: Array) -> None:
+    power = 1.0
+    for k in range(out.shape[0]):
+        out[k] = (k + 1) * power
+        power = power * x
+
+
+@kernel
+def legendre(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    for k in range(out.shape[0]):
+        out[k] = now
+        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
+        before, now = now, after
+
+
+@kernel
+def legendre_slopes(x: float, p: Array, out: Array) -> None:
+    # P'_(k+1) = P'_(k-1) + (2 k + 1) P_k
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    slope_before, slope = 0.0, 1.0
+    for k in range(out.shape[0]):
+        out[k] = slope / p[1]
+        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
+        slope_after = slope_before + (2 * k + 3) * now
+        before, now = now, after
+        slope_before, slope = slope, slope_after
+
+
+@kernel
+def chebyshev(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    for k in range(out.shape[0]):
+        out[k] = now
+        before, now = now, 2.0 * s * now - before
+
+
+@kernel
+def chebyshev_slopes(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    slope_before, slope = 0.0, 1.0
+    for k in range(out.shape[0]):
+        out[k] = slope / p[1]
+        slope_before, slope = slope, 2.0 * now + 2.0 * s * slope - slope_before
+        before, now = now, 2.0 * s * now - before
+
+
+@kernel
+def dead_zone(x: float, p: Array, out: Array) -> None:
+    above, below = x >= p[0], x <= p[1]
+    out[0] = x if above or below or x != x else 0.0
+    out[1] = -1.0 if above else 0.0
+    out[2] = -1.0 if below else 0.0
+
+
+@kernel
+def dead_zone_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 1.0 if x >= p[0] or x <= p[1] else 0.0
+    out[1] = 0.0
+    out[2] = 0.0
+
+
+@kernel
+def hinges(x: float, p: Array, out: Array) -> None:
+    out[0] = x
+    for k in range(1, out.shape[0]):
+        away = x - p[k - 1]
+        out[k] = max(0.0, away) if p[k - 1] >= 0.0 else min(0.0, away)
+        out[k] = away if away != away else out[k]
+
+
+@kernel
+def hinge_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 1.0
+    for k in range(1, out.shape[0]):
+        beyond = x > p[k - 1] if p[k - 1] >= 0.0 else x < p[k - 1]
+        out[k] = 1.0 if beyond else 0.0
+
+
+@kernel
+def local_splines(x: float, p: Array, degree: int) -> int:
+    """The degree + 1 B-splines that are not zero at x, into the scratch at the end of p; returns their span."""
+    order, count = int(p[0]), int(p[1])
+    at, work = 2, 2 + count
+    span = order
+    while span < count - order - 2 and x >= p[at + span + 1]:
+        span += 1
+    p[work] = 1.0
+    for j in range(1, degree + 1):
+        saved = 0.0
+        for r in range(j):
+            right, left = p[at + span + r + 1] - x, x - p[at + span + 1 - j + r]
+            share = p[work + r] / (right + left)
+            p[work + r] = saved + right * share
+            saved = left * share
+        p[work + j] = saved
+    return span
+
+
+@kernel
+def splines(x: float, p: Array, out: Array) -> None:
+    order, count = int(p[0]), int(p[1])
+    work, anchor = 2 + count, 2 + count + order + 1
+    inside = x >= p[2] and x <= p[1 + count]
+    for k in range(out.shape[0]):
+        out[k] = -p[anchor + k] if inside else np.nan
+    if inside:
+        span = local_splines(x, p, order)
+        for r in range(order + 1):
+            k = span - order + r - 1  # the first of all is left out
+            if k >= 0:
+                out[k] += p[work + r]
+
+
+@kernel
+def spline_slopes(x: float, p: Array, out: Array) -> None:
+    order, count = int(p[0]), int(p[1])
+    work = 2 + count
+    inside = x >= p[2] and x <= p[1 + count]
+    for k in range(out.shape[0]):
+        out[k] = 0.0 if inside else np.nan
+    if inside and order > 0:
+        span = local_splines(x, p, order - 1)
+        for r in range(order):
+            k = span - order + 1 + r  # the lower B-spline that starts at knot k
+            slope = order * p[work + r] / (p[2 + k + order] - p[2 + k])
+            if k - 1 >= 0:
+                out[k - 1] += slope
+            if k - 2 >= 0:
+                out[k - 2] -= slope
+
+
+@shared
+def values(x: float, p: Array, out: Array) -> None:
+    code, own = p[0], p[1:]
+    if code == POWERS:
+        powers(x, own, out)
+    elif code == LEGENDRE:
+        legendre(x, own, out)
+    elif code == CHEBYSHEV:
+        chebyshev(x, own, out)
+    elif code == HINGES:
+        hinges(x, own, out)
+    elif code == SPLINES:
+        splines(x, own, out)
+    else:
+        dead_zone(x, own, out)
+
+
+@shared
+def slopes(x: float, p: Array, out: Array) -> None:
+    code, own = p[0], p[1:]
+    if code == POWERS:
+        power_slopes(x, own, out)
+    elif code == LEGENDRE:
+        legendre_slopes(x, own, out)
+    elif code == CHEBYSHEV:
+        chebyshev_slopes(x, own, out)
+    elif code == HINGES:
+        hinge_slopes(x, own, out)
+    elif code == SPLINES:
+        spline_slopes(x, own, out)
+    else:
+        dead_zone_slopes(x, own, out)

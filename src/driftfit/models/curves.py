@@ -1,0 +1,177 @@
+"""Static curves f(x) = sum_k c_k f_k(x): what every basis offers, and functions of your own.
+
+A basis gives `value(x)` and `derivative(x)`, (..., n) each, and the compiled ``values(x, p, out)``, ``slopes(x, p,
+out)`` for steps. Its numbers p (``parameters``) live in the record, so that another range needs no other code.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from driftfit.kernel import Array, Driver, kernel
+from driftfit.models import curve_kernels
+from driftfit.settings import Settings, numbers, whole
+
+
+class Curves(NamedTuple):
+    """The compiled functions of a basis: ``values(x, p, out)`` and ``slopes(x, p, out)`` fill ``out`` (n,)."""
+
+    values: Any
+    slopes: Any
+
+
+@lru_cache
+def fill(function: Any) -> Driver:
+    """A compiled loop of a basis function over an array."""
+
+    @Driver
+    def each(x: Array, p: Array, out: Array) -> None:
+        for i in range(x.shape[0]):
+            function(x[i], p, out[i])
+
+    return each
+
+
+class Basis(Settings, ABC):
+    """A set of functions of one variable, without a constant."""
+
+    code: ClassVar[int] = -1
+    """The kind, as `driftfit.models.curve_kernels` knows it."""
+    adaptive: ClassVar[bool] = False
+    """Whether the functions depend on their own coefficients, which then are fed back at every sample."""
+
+    @property
+    @abstractmethod
+    def n(self) -> int:
+        """Number of functions."""
+
+    @property
+    def curves(self) -> Curves:
+        """The compiled functions."""
+        return Curves(curve_kernels.values, curve_kernels.slopes)
+
+    @property
+    def own_numbers(self) -> Array:
+        """Numbers of the basis, (k,)."""
+        return np.zeros(0)
+
+    @property
+    def parameters(self) -> Array:
+        """What the compiled functions get as p: the code of the kind, and the numbers of the basis."""
+        return np.concatenate([[float(self.code)], self.own_numbers])
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """Where data are expected."""
+        return (-np.inf, np.inf)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Where the functions are defined; a sample outside is missing."""
+        return (-np.inf, np.inf)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the functions are, in the order of the coefficients."""
+        return tuple(f"f{k + 1}" for k in range(self.n))
+
+    def value(self, x: Any) -> Array:
+        """The functions at x (...), as (..., n)."""
+        return self._at(self.curves.values, x)
+
+    def derivative(self, x: Any) -> Array:
+        """Their derivatives at x (...), as (..., n)."""
+        return self._at(self.curves.slopes, x)
+
+    def _at(self, function: Any, x: Any) -> Array:
+        points = np.asarray(x, dtype=float)
+        out = np.empty((points.size, self.n))
+        fill(function)(np.ascontiguousarray(points.ravel()), self.parameters.copy(), out)
+        return out.reshape(*points.shape, self.n)
+
+    def plain(self) -> dict[str, Any]:
+        """The basis as plain data; see `basis_of`."""
+        return {"class": type(self).__name__, "settings": self.settings()}
+
+
+@dataclass(frozen=True)
+class Functions(Basis):
+    """Functions of your own.
+
+    Parameters
+    ----------
+    values, slopes : functions (x, p, out) that Numba can compile
+        Fill ``out`` (n,) with the functions, and with their derivatives, at the number x. They may use numpy, math,
+        numbers and ``driftfit.kernel`` functions. To be saved they must stand in a module that can be imported.
+    n : int
+        How many functions.
+    numbers : sequence
+        What they get as the array p.
+    labels : sequence of str or None
+        What the functions are called.
+    """
+
+    values: Any
+    slopes: Any
+    n: int = 1
+    numbers: Any = (0.0,)
+    labels: Any = None
+
+    def __post_init__(self) -> None:
+        self._set("n", whole("Functions", "n", self.n, 1))
+        given = numbers("Functions", "numbers", self.numbers)
+        self._set("numbers", given if isinstance(given, tuple) else (given,))
+        for name in ("values", "slopes"):
+            self._set(name, _imported(getattr(self, name)))
+        if self.labels is not None:
+            self._set("labels", tuple(str(label) for label in self.labels))
+            if len(self.labels) != self.n:
+                raise ValueError(f"Functions: {len(self.labels)} labels were given for {self.n} functions.")
+
+    @property
+    def curves(self) -> Curves:
+        return Curves(_compiled(self.values), _compiled(self.slopes))
+
+    @property
+    def parameters(self) -> Array:
+        return np.array(self.numbers)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.labels or super().names
+
+    def settings(self) -> dict[str, Any]:
+        return super().settings() | {name: _place(getattr(self, name)) for name in ("values", "slopes")}
+
+
+@lru_cache
+def _compiled(function: Callable[..., Any]) -> Any:
+    """A function of the user's as a kernel."""
+    return function if hasattr(function, "identity") else kernel(getattr(function, "py_func", function))
+
+
+def _place(function: Any) -> str:
+    """Where a function can be imported from."""
+    source = getattr(function, "py_func", function)
+    return f"{source.__module__}:{source.__qualname__}"
+
+
+def _imported(function: Any) -> Any:
+    """A function, or the one that stands at ``module:name``."""
+    if isinstance(function, str):
+        module, _, name = function.partition(":")
+        try:
+            return getattr(import_module(module), name)
+        except (ImportError, AttributeError):
+            raise ValueError(f"Functions: {function!r} cannot be imported; it must stand in a module.") from None
+    if not (callable(function) or isinstance(function, Dispatcher)):
+        raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {function!r}.")
+    return function

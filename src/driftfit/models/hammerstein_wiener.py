@@ -1,0 +1,202 @@
+"""Hammerstein-Wiener: a static curve, a linear system, and another static curve, all of which may drift.
+
+    v_t = sum_k c_k f_k(u_t),  c_1 = 1                                input block
+    w_t = -sum_{i=1..na} a_i w_{t-i} + sum_{j=1..nb} b_j v_{t-nk-j+1}  linear block
+    sum_k d_k g_k(y_t) = w_t,  d_1 = 1                                inverse of the output block, increasing
+
+In terms of what is measured this is a regression on products of the parameters (`driftfit.models.block_products`):
+
+    z_t = -g_1(y_t) = phi_t' theta_t
+    phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
+
+Any tracker follows theta (stage one); `driftfit.blocks` separates a, b, c, d from it. The regression is exact only with
+products of the time of each factor; products of one time leave an error of second order in the drift.
+
+The prediction of a run is of y, through the inverted output block; innovation, innovation_std and loglik are of the
+equation error, with the Jacobian F'(y_t) in the likelihood, since phi_t holds y_t. Nothing is filled: a missing output
+makes the samples t .. t + na unusable, a missing input t + nk .. t + nk + nb - 1.
+
+The signs of a are those of polynomials A(z) = 1 + a_1 z^-1 + ..; `ARX` has the opposite. Use it where both curves or
+one of them matter; a linear system is an `ARX`. Least squares is consistent for data without measurement noise only:
+phi holds y. ``output_noise`` weighs samples by what noise of that standard deviation does to the equation, which lowers
+the variance and not the bias; `driftfit.trackers.output_error` has neither.
+
+Source: Feng and Hong (2021), Int. J. Systems Science 52(16); Bai (1998), Automatica 34(3). Departures: all columns of
+the input carry a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from driftfit.drivers import LARGEST, ModelSteps
+from driftfit.kernel import Array
+from driftfit.models import hammerstein_wiener_steps as steps
+from driftfit.models.base import Model
+from driftfit.models.basis import Basis, Polynomial, basis_of
+from driftfit.models.block_products import Structure
+from driftfit.settings import numbers, whole
+
+IDENTITY = Polynomial(1)
+FLATTEST = 1e-3
+"""The least slope of the output block that the likelihood takes for real."""
+UNIT = 10.0
+"""Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
+
+
+@dataclass(frozen=True)
+class HammersteinWiener(Model):
+    """Hammerstein-Wiener model with one input and one output.
+
+    Parameters
+    ----------
+    na, nb : int
+        Lags of w and of v in the linear block; nb at least 1.
+    nk : int
+        Delay of the input in samples; 0 uses the present input.
+    input, output : Basis or None
+        Functions of the input block, and of the inverse of the output block. None is the identity, so that
+        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model.
+    intercept : bool
+        Add one constant; those of the two blocks cannot be told apart.
+    output_noise : number or None
+        Standard deviation of white noise on y. The noise variance of the equation then is r times
+        sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
+    name : str or None
+        Name of the input.
+
+    Raises
+    ------
+    ValueError
+        For orders that are not whole, a dead zone in the output block, or several inputs.
+    """
+
+    na: int
+    nb: int
+    nk: int = 1
+    input: Any = None
+    output: Any = None
+    intercept: bool = False
+    output_noise: float | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, low in (("na", 0), ("nb", 1), ("nk", 0)):
+            self._set(name, whole("HammersteinWiener", name, getattr(self, name), low))
+        for name in ("input", "output"):
+            self._set(name, basis_of(getattr(self, name)))
+        if self.output is not None and self.output.adaptive:
+            raise ValueError("HammersteinWiener: a dead zone is not one-to-one, so it can only be the input block.")
+        if self.output_noise is not None:
+            sigma = numbers("HammersteinWiener", "output_noise", self.output_noise, ndim=0, low=0.0, strict=True)
+            self._set("output_noise", sigma)
+
+    def settings(self) -> dict[str, Any]:
+        given = super().settings()
+        return given | {k: v.plain() for k, v in given.items() if isinstance(v, Basis)}
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any]) -> Self:
+        bases = {name: basis_of(settings.get(name)) for name in ("input", "output")}
+        return super().from_settings(settings | bases)
+
+    def bind(self, inputs: int | Sequence[str]) -> HammersteinWiener:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if count != 1:
+            raise ValueError(f"HammersteinWiener: the model has 1 input, but u has {count} columns.")
+        return self if isinstance(inputs, int) or self.name is not None else replace(self, name=inputs[0])
+
+    @property
+    def m(self) -> int:
+        return 1
+
+    @property
+    def into(self) -> Basis:
+        """Functions of the input block."""
+        return self.input if isinstance(self.input, Basis) else IDENTITY
+
+    @property
+    def out(self) -> Basis:
+        """Functions of the inverse of the output block."""
+        return self.output if isinstance(self.output, Basis) else IDENTITY
+
+    @property
+    def structure(self) -> Structure:
+        """The orders, and where the parameters stand in theta."""
+        return Structure(self.na, self.nb, self.into.n, self.out.n, self.intercept)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.structure.names
+
+    @property
+    def linear(self) -> bool:
+        """Whether the output block is the identity."""
+        return self.out == IDENTITY
+
+    def memory(self) -> Mapping[str, Any]:
+        return steps.memory(self.structure, self.nk, self.into.parameters, self.out.parameters, self.out.limits)
+
+    @property
+    def steps(self) -> ModelSteps:
+        adaptive = self.into.adaptive
+        return steps.build(
+            self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive, self.output_noise
+        )
+
+    def touched(self, t: int, signal: str) -> range:
+        """The samples that cannot be used when "y" or "u" is missing at t."""
+        if signal == "y":
+            return range(t, t + self.na + 1)
+        return range(t + self.nk, t + self.nk + self.nb)
+
+    def output_weights(self, theta: Array) -> Array:
+        """d (..., n_out) with d_1 = 1 from theta (..., n), or from the minimal xi (..., n_x)."""
+        at = self.structure.starts[0]
+        if theta.shape[-1] != self.n:
+            at += self.into.n - 1
+        d = theta[..., at : at + self.out.n - 1]
+        return np.concatenate([np.ones((*theta.shape[:-1], 1)), d], axis=-1)
+
+    def slope(self, theta: Array, y: Array) -> Array:
+        """F'(y; d), the slope of the inverse of the output block; theta (..., n) or xi (..., n_x), y (...)."""
+        found: Array = np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1)
+        return found
+
+    def log_jacobian(self, theta: Array, y: Array) -> Array:
+        """log max(F'(y_t; d_t), 1e-3) with the estimate after the sample: what turns the density of z into that of y.
+
+        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
+        y integrates to 1 with the estimate after the sample, and to more with the one before.
+        """
+        with np.errstate(invalid="ignore"):
+            found: Array = np.log(np.maximum(self.slope(theta, y), FLATTEST))
+        return found
+
+    def inspect(self, y: Array, u: Array) -> None:
+        """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
+        for what, basis, data in (("u", self.into, u[:, 0]), ("y", self.out, y)):
+            seen = data[np.abs(data) < LARGEST]
+            low, high = basis.expected
+            outside = int(np.sum((seen < low) | (seen > high)))
+            if outside:
+                effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
+                warnings.warn(
+                    f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
+                    f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
+                    UserWarning,
+                    stacklevel=4,
+                )
+            size = float(np.sqrt(np.mean(seen * seen))) if seen.size else 0.0
+            if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
+                warnings.warn(
+                    f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
+                    f"scaled; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
+                    UserWarning,
+                    stacklevel=4,
+                )

@@ -1,0 +1,243 @@
+"""Separation: exact products, gauges, generalised least squares, and what the methods do when it becomes hard."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from support import same
+
+from driftfit import AugmentedFLS, Kalman, Live, Regression, track
+from driftfit.blocks.least_squares import jacobian, refine
+from driftfit.blocks.paths import split
+from driftfit.blocks.separate import METHODS
+from driftfit.models.basis import Legendre, Polynomial
+from driftfit.models.block_products import Structure
+from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.systems.hammerstein_wiener import simulate
+
+SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
+K = Kalman(q=1e-6, r=1e-4, p0=1e2, theta0=0.01)
+
+
+def model_of(na, nb, n_in, n_out, intercept=False):
+    return HammersteinWiener(
+        na, nb, input=Legendre(n_in, (-1, 1)), output=Legendre(n_out, (-1, 1)), intercept=intercept
+    )
+
+
+def record(T=300, seed=0):
+    rng = np.random.default_rng(seed)
+    return simulate(
+        SMALL, [-0.5], [0.5, -0.3], [0.3], [0.1], T=T, rng=rng, u=rng.uniform(-1, 1, T), equation_noise=0.01
+    )
+
+
+@given(
+    na=st.integers(0, 4), nb=st.integers(1, 4), n_in=st.integers(1, 5), n_out=st.integers(1, 5), seed=st.integers(0, 99)
+)
+def test_exact_products_come_apart_exactly(na, nb, n_in, n_out, seed):
+    """Item 5 of the specification."""
+    model = model_of(na, nb, n_in, n_out)
+    rng = np.random.default_rng(seed)
+    xi = rng.uniform(0.2, 1.0, (3, model.structure.n_x)) * rng.choice([-1.0, 1.0], (3, model.structure.n_x))
+    theta = model.structure.products(xi)
+    for method in METHODS[:3]:
+        a, b, c, d, quality = split(model, theta, method)
+        if method == "svd" and na == 0:
+            assert same(d[:, 1:], theta[:, nb : nb + n_out - 1])
+        assert_allclose(model.structure.minimal(a, b, c, d), xi, rtol=1e-10, atol=1e-10)
+        assert (c[:, 0] == 1.0).all()
+        assert (d[:, 0] == 1.0).all()
+        if method != "average":
+            assert quality.max() < 1e-12
+
+
+@given(nb=st.integers(1, 4), n_in=st.integers(1, 5), seed=st.integers(0, 99))
+def test_the_rank_one_fit_is_that_of_the_library(nb, n_in, seed):
+    model = model_of(1, nb, n_in, 2)
+    theta = np.random.default_rng(seed).normal(size=(2, model.n))
+    _, b, c, _, quality = split(model, theta, "svd")
+    at = model.structure.starts[1]
+    for t in range(2):
+        M = np.concatenate([theta[t, 1 : 1 + nb], theta[t, at : at + nb * (n_in - 1)]]).reshape(n_in, nb).T
+        U, s, V = np.linalg.svd(M)
+        assert_allclose(np.outer(b[t], c[t]), s[0] * np.outer(U[:, 0], V[0]), atol=1e-10)
+        second = s[1] / s[0] if len(s) > 1 else 0.0
+        assert quality[t, 0] == pytest.approx(second, abs=1e-10)
+
+
+def test_the_joint_fit_is_the_least_squares_fit_with_a_known_corner():
+    from scipy.optimize import minimize
+
+    model = model_of(2, 1, 1, 3)
+    theta = np.random.default_rng(3).normal(size=(1, model.n)) * 0.3
+    a, _, _, d, _ = split(model, theta, "svd-joint")
+    A = np.concatenate([theta[0, :2], theta[0, 5:9]]).reshape(3, 2).T
+    target = np.vstack([[1.0, *theta[0, 3:5]], A])
+
+    def off(x):
+        return np.sum((np.outer([1.0, *x[:2]], [1.0, *x[2:]]) - target)[np.s_[:]] ** 2)
+
+    found = minimize(off, np.concatenate([a[0], d[0, 1:]]), options={"gtol": 1e-12})
+    assert_allclose(np.concatenate([a[0], d[0, 1:]]), found.x, atol=1e-5)
+    assert off(np.concatenate([a[0], d[0, 1:]])) <= found.fun + 1e-12
+
+
+@pytest.mark.parametrize("intercept", [False, True])
+def test_the_jacobian_against_differences(intercept):
+    """Item 6: central differences, and the compiled one."""
+    structure = Structure(2, 3, 3, 4, intercept)
+    xi = np.random.default_rng(1).normal(size=structure.n_x)
+    J = structure.jacobian(xi)
+    for x in range(structure.n_x):
+        step = 1e-6 * (np.arange(structure.n_x) == x)
+        numeric = (structure.products(xi + step) - structure.products(xi - step)) / 2e-6
+        assert_allclose(J[:, x], numeric, atol=1e-7)
+    compiled = np.empty((structure.n_x, structure.n))
+    jacobian(xi, tuple(structure[:4]), compiled)
+    assert same(compiled.T, J)
+
+
+def test_generalised_least_squares():
+    """Item 6: never worse than where it began, stationary, its covariance that of the delta method."""
+    s = record()
+    run = track(SMALL, K, s.y, s.u, keep="cov")
+    joint, gls = run.blocks(), run.blocks("gls")
+    structure = SMALL.structure
+    for t in (20, 100, 299):
+        W = np.linalg.inv(run.cov(t))
+
+        def cost(xi, t=t, W=W):
+            off = run.theta[t] - structure.products(xi)
+            return off @ W @ off
+
+        assert gls.cost[t] == pytest.approx(cost(gls.xi[t]), rel=1e-5)
+        assert cost(gls.xi[t]) <= cost(joint.xi[t])
+        J = structure.jacobian(gls.xi[t])
+        slope = J.T @ W @ (run.theta[t] - structure.products(gls.xi[t]))
+        assert np.abs(slope / np.sqrt(np.diag(J.T @ W @ J))).max() < 1e-3
+        assert_allclose(gls.cov[t], np.linalg.inv(J.T @ W @ J), rtol=1e-5, atol=1e-12)
+        assert np.linalg.eigvalsh(gls.cov[t]).min() > 0.0
+        assert same(gls.cov[t], gls.cov[t].T)
+    replayed = track(SMALL, K, s.y, s.u).blocks("gls")
+    assert_allclose(replayed.xi, gls.xi, rtol=1e-12, atol=1e-12)
+    off = (gls.xi - s.xi) / np.sqrt(np.einsum("tii->ti", gls.cov))
+    assert 0.3 < np.sqrt(np.mean(off[50:] ** 2)) < 2.0
+    assert (gls.std.c[:, 0] == 0.0).all()
+    theta, P = np.ones((1, 3)), np.full((1, 3, 3), np.inf)
+    xi, cov, value = np.ones((1, 3)), np.empty((1, 3, 3)), np.empty(1)
+    refine(theta, P, (1, 2, 1, 1), xi, cov, value)
+    assert same(xi, np.ones((1, 3)))
+    assert np.isnan(cov).all()
+    with pytest.raises(ValueError, match="carries none"):
+        track(SMALL, AugmentedFLS(1.0), s.y, s.u).blocks("gls")
+
+
+def test_gauges_describe_one_system():
+    s = record()
+    found = track(SMALL, K, s.y, s.u).blocks("gls")
+    u, y = np.linspace(-1, 1, 4), np.linspace(-0.5, 0.5, 4)
+    t = 200
+    for input, output in (("b1", "d1"), ("c1", "slope"), ("b1", "slope")):
+        other = found.gauge(input, output, at=0.2)
+        scale = found.output_curve(y, t) / other.output_curve(y, t)
+        assert_allclose(scale, scale[0])
+        assert_allclose(
+            np.outer(other.input_curve(u, t), other.b[t]) * scale[0], np.outer(found.input_curve(u, t), found.b[t])
+        )
+        assert same(other.a, found.a)
+        if input == "b1":
+            assert_allclose(other.b[:, 0], 1.0)
+            assert other.std.b[t, 0] < 1e-9 * found.std.b[t, 0] + 1e-12
+        if output == "slope":
+            assert_allclose(other.slope(0.2), 1.0)
+        rng = np.random.default_rng(0)  # the delta method against draws
+        draws = rng.multivariate_normal(found.xi[t], found.cov[t] * 1e-6, 4000)
+        _, b, c, d = SMALL.structure.groups(draws)
+        level = d @ SMALL.out.derivative(0.2) if output == "slope" else 1.0
+        gain = b[:, 0] / level if input == "b1" else 1.0
+        assert np.std(c[:, 1] * gain) * 1e3 == pytest.approx(other.std.c[t, 1], rel=0.1)
+        assert np.std(d[:, 1] / level) * 1e3 == pytest.approx(other.std.d[t, 1], rel=0.1)
+        assert np.std(b[:, 1] / level / gain) * 1e3 == pytest.approx(other.std.b[t, 1], rel=0.1)
+    with pytest.raises(ValueError, match="already"):
+        other.gauge()
+    with pytest.raises(ValueError, match="c_1 = d_1 = 1"):
+        _ = other.xi
+    assert same(track(SMALL, K, s.y, s.u).blocks(input="b1").b[:, 0], found.gauge("b1").b[:, 0])
+
+
+def test_a_vanishing_b_spikes_in_the_average_alone():
+    theta = SMALL.structure.products(np.array([[-0.5, 1e-4, 0.6, 0.5, 0.2]]))
+    theta[:, 4] += 0.01  # b_1 c_2
+    exact = np.array([0.0001, 0.6])
+    assert_allclose(split(SMALL, theta, "svd-joint")[1][0], exact, atol=0.02)
+    assert np.abs(split(SMALL, theta, "average")[2][0]).max() > 10.0
+    s = simulate(SMALL, [-0.5], [0.001, 0.5], [0.3], [0.1], T=100, rng=np.random.default_rng(1))
+    run = track(SMALL, K, s.y, s.u)
+    with pytest.warns(UserWarning, match="spikes"):
+        run.blocks("average")
+    run.blocks("svd-joint")
+
+
+def test_a_weak_first_function_warns_of_the_gauge():
+    xi = np.repeat([[-0.5, 1e-5, 2e-5, 1e5, 0.2]], 3, axis=0)
+    s = record(T=40)
+    run = track(SMALL, K, s.y, s.u)
+    run._out["theta"][..., 0] = SMALL.structure.products(xi[:1])
+    with pytest.warns(UserWarning, match="bad gauge"):
+        run.blocks()
+
+
+def test_what_is_undetermined_stays_finite():
+    """All b near zero: c is anybody's guess, the quality says so."""
+    model = model_of(1, 2, 3, 2)
+    theta = np.zeros((2, model.n))
+    theta[1] = 1e-9 * np.random.default_rng(2).normal(size=model.n)
+    for method in METHODS[:3]:
+        a, b, c, d, quality = split(model, theta, method)
+        assert all(np.isfinite(part).all() for part in (a, b, c, d)), method
+    assert quality[1, 0] > 0.01
+    bad = split(model, np.full((1, model.n), np.nan), "svd-joint")
+    assert np.isnan(bad[1]).all() or np.isnan(bad[4]).any()
+
+
+def test_live_blocks_are_those_of_the_record():
+    s = record(T=120)
+    run, live = track(SMALL, K, s.y, s.u), Live(SMALL, K)
+    found = {method: run.blocks(method) for method in METHODS[:3]}
+    for t in range(120):
+        live.update(float(s.y[t]), float(s.u[t]))
+        for method, path in found.items():
+            now = live.blocks(method)
+            for part, whole in zip(now, (path.a, path.b, path.c, path.d), strict=True):
+                assert same(part, whole[t])
+    with pytest.raises(ValueError, match="'svd-joint'"):
+        live.blocks("gls")
+
+
+def test_names_and_refusals():
+    s = record(T=60)
+    run = track(SMALL, K, s.y, s.u)
+    found = run.blocks()
+    assert found.names == (("a1",), ("b1", "b2"), ("c1", "c2"), ("d1", "d2"))
+    assert found.radius[-1] == pytest.approx(abs(found.a[-1, 0]))
+    assert len(found) == 60
+    assert np.isnan(found.std.b).all()
+    with pytest.raises(ValueError, match="method must be one of"):
+        run.blocks("pca")
+    with pytest.raises(ValueError, match="Regression has none"):
+        track(Regression(1), AugmentedFLS(1.0), s.y, s.u).blocks()
+    with pytest.raises(ValueError, match="output must be one of"):
+        run.blocks(output="unit")
+
+
+def test_the_picture_has_its_panels():
+    s = record(T=120)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = track(SMALL, K, s.y, s.u).plot_blocks("gls", times=[50, -1])
+    assert [axis.get_ylabel() for axis in figure.axes] == ["v", "y", "a", "b", "c", "d"]
+    assert len(figure.axes[0].lines) == 2

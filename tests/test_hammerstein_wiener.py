@@ -1,0 +1,455 @@
+"""Stage one of Hammerstein-Wiener models: columns, the exact regression, the filter, missing data, bases, warnings."""
+
+import json
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.polynomial import chebyshev, legendre
+from scipy.interpolate import BSpline as ScipyBSpline
+from support import same
+
+from driftfit import ARX, RLS, Kalman, Live, Track, track
+from driftfit.drivers import TrackerSteps, unknown
+from driftfit.kernel import kernel, nothing
+from driftfit.models.basis import (
+    BSpline,
+    Chebyshev,
+    DeadZone,
+    Functions,
+    Legendre,
+    PiecewiseLinear,
+    Polynomial,
+    basis_of,
+)
+from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.systems.drift import RandomWalk
+from driftfit.systems.hammerstein_wiener import CUBIC, NotMonotoneError, example, invert, simulate
+from driftfit.trackers.base import Tracker
+
+SMALL = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2))
+K = Kalman(q=1e-5, r=1e-4, p0=1e4, theta0=0.01)
+PAPER = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
+
+
+@kernel
+def copy(o, s, l):
+    for i in range(s.phi.shape[0]):
+        o.phi[i, l] = s.phi[i, l]
+    o.y[l] = s.y[l]
+
+
+@dataclass(frozen=True)
+class Still(Tracker):
+    """Keeps theta0 and shows the regression; it compiles in a moment, whatever the order."""
+
+    theta0: tuple = ()
+    covariance = False
+    outputs = ("phi", "y")
+
+    def state(self, n):
+        return {"theta": np.array(self.theta0) if self.theta0 else np.zeros(n)}
+
+    @property
+    def steps(self):
+        return TrackerSteps(nothing, nothing, unknown, store=copy)
+
+
+def seen_by(model, y, u):
+    """phi (T, n) and z (T,) as a tracker sees them."""
+    run = track(model, Still(), y, u)
+    return run._written("phi"), run._written("y")
+
+
+def rows(model, y, u):
+    """phi and z as the model's equations say, a list of columns at a time; NaN where a lag lies before the record."""
+    T = len(y)
+
+    def late(x, k):
+        return np.concatenate([np.full(min(k, T), np.nan), x[: max(T - k, 0)]])
+
+    f, g = model.into.value(u), model.out.value(y)
+    a, b, nk = range(1, model.na + 1), range(model.nb), model.nk
+    columns = [late(g[:, 0], i) for i in a] + [-late(f[:, 0], nk + j) for j in b]
+    columns += [g[:, k] for k in range(1, model.out.n)]
+    columns += [-late(f[:, k], nk + j) for k in range(1, model.into.n) for j in b]
+    columns += [late(g[:, k], i) for k in range(1, model.out.n) for i in a]
+    return np.stack(columns + ([np.ones(T)] if model.intercept else []), axis=1), -g[:, 0]
+
+
+def joseph(phi, z, q, r, p0, theta0):
+    """The textbook filter with the Joseph form, symmetrised; theta (T, n) and P (T, n, n)."""
+    n = phi.shape[1]
+    theta, P = np.full(n, theta0), p0 * np.eye(n)
+    path = []
+    for x, value in zip(phi, z, strict=True):
+        if np.isfinite(x).all():
+            M = P + q * np.eye(n)
+            k = M @ x / (x @ M @ x + r)
+            theta = theta + k * (value - x @ theta)
+            left = np.eye(n) - np.outer(k, x)
+            P = left @ M @ left.T + r * np.outer(k, k)
+            P = 0.5 * (P + P.T)
+        path.append((theta, P))
+    return np.array([t for t, _ in path]), np.array([P for _, P in path])
+
+
+def test_columns_are_those_written_by_hand():
+    rng = np.random.default_rng(0)
+    y, u = rng.normal(size=(2, 6))
+    phi, z = seen_by(CUBIC, y, u)
+    by_hand = [
+        y[4], y[3], -u[4], -u[3], y[5] ** 2, y[5] ** 3,
+        -(u[4] ** 2), -(u[3] ** 2), -(u[4] ** 3), -(u[3] ** 3), y[4] ** 2, y[3] ** 2, y[4] ** 3, y[3] ** 3,
+    ]  # fmt: skip
+    np.testing.assert_allclose(phi[5], by_hand, rtol=1e-15)
+    assert z[5] == -y[5]
+    assert CUBIC.names == (
+        "a1", "a2", "b1", "b2", "d2", "d3", "b1*c2", "b2*c2", "b1*c3", "b2*c3", "a1*d2", "a2*d2", "a1*d3", "a2*d3",
+    )  # fmt: skip
+
+
+ORDERS = [(2, 2, 3, 3, 1), (1, 3, 2, 4, 1), (3, 1, 4, 1, 2), (0, 2, 2, 3, 1), (1, 1, 1, 2, 0)]
+
+
+@pytest.mark.parametrize(("na", "nb", "n_in", "n_out", "nk"), ORDERS)
+def test_the_regression_is_exact_without_noise(na, nb, n_in, n_out, nk):
+    """Item 1 of the specification: with constants, and with lagged products of a random walk."""
+    c, d = [0.3, -0.2, 0.05][: n_in - 1], [0.1, 0.3, 0.02][: n_out - 1]
+    if n_out == 2:
+        d = [0.05]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = HammersteinWiener(na, nb, nk, Polynomial(n_in), Polynomial(n_out))
+    rng = np.random.default_rng(1)
+    a, b = [-0.5, 0.2, -0.1][:na], [0.3, -0.2, 0.1][:nb]
+    u = rng.uniform(-1.0, 1.0, 200)
+    constant = simulate(model, a, b, c, d, T=200, rng=rng, u=u)
+    for s in (constant, constant._replace(u=u)):
+        phi, z = rows(model, s.y, s.u)
+        residual = np.sum(phi * s.theta, axis=1) - z
+        used = np.isfinite(residual)
+        assert used[max(na, nk + nb) :].all()
+        assert np.abs(residual[used]).max() <= 1e-12
+        got, _ = seen_by(model, s.y, s.u)
+        assert same(got[used], phi[used])
+
+
+def test_walking_parameters_need_lagged_products():
+    s = example(1, 0, T=600)
+    phi, z = rows(s.model, s.y, s.u)
+    assert np.abs(np.sum(phi * s.theta, axis=1) - z)[2:].max() <= 1e-12
+    now = s.model.structure.products(s.xi)
+    error = (np.sum(phi * now, axis=1) - z)[2:]
+    assert 1e-4 < np.sqrt(np.mean(error**2)) < 0.02
+
+
+def test_the_signs_of_the_input_columns_matter():
+    """Item 2: without the minus signs least squares gives -b."""
+    s = simulate(CUBIC, [-0.6, 0.4], [0.7, -0.36], [0.4, -0.7], [-0.4, 0.6], T=400, rng=np.random.default_rng(2))
+    phi, z = rows(s.model, s.y, s.u)
+    phi, z = phi[2:].copy(), z[2:]
+    phi[:, [2, 3, 6, 7, 8, 9]] *= -1.0
+    assert np.abs(phi @ s.theta[3] - z).max() > 0.1
+    np.testing.assert_allclose(np.linalg.lstsq(phi, z, rcond=None)[0][2:4], [-0.7, 0.36], atol=1e-9)
+
+
+def test_the_filter_is_the_textbook_filter():
+    """Items 7, 8 and 11: Joseph form, identities (46) and (47), scaling, a scalar prior, least squares."""
+    rng = np.random.default_rng(3)
+    s = simulate(SMALL, [-0.5], [0.5], [0.3], [0.1], T=150, rng=rng, u=rng.uniform(-1.5, 1.5, 150))
+    phi, z = rows(SMALL, s.y, s.u)
+    for p0, tolerance in ((100.0, 1e-9), (1e8, 1e-6)):
+        run = track(SMALL, Kalman(q=10.0, r=0.01, p0=p0, theta0=0.01), s.y, s.u)
+        theta, P = joseph(phi, z, 10.0, 0.01, p0, 0.01)
+        np.testing.assert_allclose(run.theta, theta, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(run.cov(140), P[140], rtol=1e-4, atol=1e-4)
+        root = track(SMALL, Kalman(q=10.0, r=0.01, p0=p0, theta0=0.01, form="sqrt"), s.y, s.u)
+        np.testing.assert_allclose(root.theta, theta, rtol=tolerance, atol=tolerance)
+        assert same(run.cov(100), run.cov(100).T)
+    run = track(SMALL, K, s.y, s.u)
+    x, before, after = phi[50], run.cov(49), run.cov(50)
+    M = before + 1e-5 * np.eye(5)
+    np.testing.assert_allclose(np.linalg.inv(after), np.linalg.inv(M) + np.outer(x, x) / 1e-4, rtol=1e-6)
+    np.testing.assert_allclose(M @ x / (x @ M @ x + 1e-4), after @ x / 1e-4, rtol=1e-7)
+    run = track(SMALL, Kalman(q=10.0, r=0.01, p0=100.0, theta0=0.01), s.y, s.u)
+    scaled = track(SMALL, Kalman(q=73.0, r=0.073, p0=730.0, theta0=0.01), s.y, s.u)
+    np.testing.assert_allclose(scaled.theta, run.theta, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(scaled.std[5:], np.sqrt(7.3) * run.std[5:], rtol=1e-6)
+    theta = track(SMALL, Kalman(q=0.0, r=1e-6, p0=1e8), s.y[:20], s.u[:20]).theta[-1]
+    np.testing.assert_allclose(theta, s.theta[-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("theta0", [0.01, 10.0, 1000.0])
+def test_any_start_is_forgotten_within_thirty_samples(theta0):
+    """Item 12, on the products."""
+    s = example(2, 1, T=260)
+    run = track(s.model, Kalman(q=10.0, r=0.01, p0=1e8, theta0=theta0), s.y, s.u)
+    error = np.linalg.norm(run.theta[:, :6] - s.model.structure.products(s.xi)[:, :6], axis=1)
+    assert error[5] > 0.15
+    assert (error[30:] < 0.15).all()
+
+
+def test_hammerstein_and_wiener_are_the_general_model_with_identities():
+    """Item 14, column for column."""
+    rng = np.random.default_rng(5)
+    y, u = rng.normal(size=(2, 40))
+    for given, written in (
+        ({"input": Polynomial(3)}, {"input": Polynomial(3), "output": Polynomial(1)}),
+        ({"output": Polynomial(3)}, {"input": Polynomial(1), "output": Polynomial(3)}),
+    ):
+        short, long = (HammersteinWiener(2, 2, **bases) for bases in (given, written))
+        assert short.names == long.names
+        assert same(seen_by(short, y, u)[0][2:], rows(short, y, u)[0][2:])
+        assert same(seen_by(long, y, u)[0], seen_by(short, y, u)[0])
+        one, other = (track(m, Still((0.1,) * short.n), y, u).prediction for m in (short, long))
+        assert same(one, other)
+
+
+def test_identity_blocks_are_an_arx_with_other_signs():
+    rng = np.random.default_rng(6)
+    y, u = rng.normal(size=(2, 60))
+    phi, z = seen_by(HammersteinWiener(2, 2), y, u)
+    lags, _ = seen_by(ARX(2, 2), y, u)
+    assert same(phi * [1, 1, -1, -1], lags)
+    assert same(z, -y)
+    theta = (0.5, -0.2, 0.3, 0.1)
+    run = track(HammersteinWiener(2, 2), Still((-0.5, 0.2, 0.3, 0.1)), y, u)
+    expected = np.sum(lags * theta, axis=1)
+    np.testing.assert_allclose(run.prediction[2:], expected[2:], rtol=1e-14)
+
+
+def test_the_prediction_is_the_root_of_the_equation():
+    s = example(1, 2, T=400)
+    run = track(s.model, PAPER, s.y, s.u)
+    t = np.arange(60, 400)
+    theta = run.theta[t - 1]
+    phi, _ = rows(s.model, s.y, s.u)
+    right = -np.sum(np.delete(phi[t] * theta, [4, 5], axis=1), axis=1)
+    root = run.prediction[t]
+    inside = (root > s.y[:60].min()) & (root < s.y[:60].max())
+    assert inside.mean() > 0.9
+    level = root + theta[:, 4] * root**2 + theta[:, 5] * root**3
+    np.testing.assert_allclose(level[inside], right[inside], atol=1e-9)
+    assert np.sqrt(np.mean((s.y - run.prediction)[t] ** 2)) < 0.05 * s.y.std()
+    equation = -s.y[t] - np.sum(phi[t] * theta, axis=1)
+    np.testing.assert_allclose(run.innovation[t], equation, rtol=1e-7, atol=1e-12)
+
+
+def test_a_missing_value_makes_the_samples_it_touches_unusable():
+    s = example(1, 4, T=300)
+    clean = track(s.model, K, s.y, s.u)
+    for signal, needed in (("y", [100, 101, 102]), ("u", [101, 102])):
+        record = {"y": s.y.copy(), "u": s.u.copy()}
+        record[signal][100] = np.nan
+        run = track(s.model, K, **record)
+        assert np.flatnonzero(~run.ok)[2:].tolist() == needed == list(s.model.touched(100, signal))
+        assert same(run.theta[:100], clean.theta[:100])
+        assert same(run.theta[needed], np.repeat(run.theta[needed[0] - 1][None], len(needed), axis=0))
+        np.testing.assert_allclose(run.std[102], np.sqrt(run.std[99] ** 2 + 1e-5 * (needed[-1] - 99)), rtol=0.2)
+        np.testing.assert_allclose(run.theta[-1], clean.theta[-1], atol=0.02)
+    hole = s.y.copy()
+    hole[100] = np.nan
+    assert np.isfinite(track(s.model, K, hole, s.u).prediction[100])  # its lags are there
+    both = s.u.copy()
+    both[200] = np.inf
+    assert np.flatnonzero(~track(s.model, K, hole, both).ok)[2:].tolist() == [100, 101, 102, 201, 202]
+
+
+def test_live_and_fleet_say_what_the_record_says(tmp_path):
+    s = example(1, 5, T=200)
+    y = s.y.copy()
+    y[[50, 51, 90]] = np.nan
+    run = track(s.model, K, y, s.u)
+    live = Live(s.model, K)
+    for t in range(200):
+        if t == 95:
+            live.save(tmp_path / "state")
+            live = Live.load(tmp_path / "state")
+        said = live.update(float(y[t]), float(s.u[t]))
+        assert same(said[:2], (run.prediction[t], run.innovation[t]))
+        assert same(live.theta, run.theta[t])
+    fleet = track(s.model, K, np.stack([y, s.y]), np.stack([s.u, s.u]), by="row")
+    assert same(fleet[0].theta, run.theta)
+    run.save(tmp_path / "run")
+    assert same(Track.load(tmp_path / "run").prediction, run.prediction)
+    for kind in (y.tolist(), y.astype(np.float32), y.astype(object)):
+        assert track(s.model, K, kind, s.u).ok.sum() == run.ok.sum()
+
+
+def test_a_hammerstein_fleet_in_lanes_is_each_series_alone():
+    model = SMALL
+    rng = np.random.default_rng(7)
+    ys, us = [], []
+    for seed in range(12):
+        s = simulate(
+            model, [-0.5], [0.5], [0.2], [0.05], T=80, rng=rng, u=np.random.default_rng(seed).uniform(-1, 1, 80)
+        )
+        ys.append(s.y)
+        us.append(s.u)
+    fleet = track(model, K, np.stack(ys), np.stack(us), by="row")
+    for key in (0, 5, 11):
+        alone = track(model, K, ys[key], us[key])
+        for name in ("theta", "prediction", "innovation_std"):
+            assert same(getattr(fleet[key], name), getattr(alone, name)), name
+
+
+def test_other_trackers_follow_it_too():
+    rng = np.random.default_rng(4)
+    u = rng.uniform(-1.5, 1.5, 800)
+    s = simulate(SMALL, [-0.5], [0.5], [RandomWalk(0.3, 2e-3)], [0.1], T=800, rng=rng, u=u)
+    run = track(SMALL, RLS(0.95), s.y, s.u)
+    assert np.median(np.abs(run.theta[100:, :2] - s.theta[100:, :2])) < 0.02
+    scored = run.summary().comparison
+    assert scored.tracked < 0.1 * scored.persistence
+    assert scored.tracked < 0.5 * scored.constant_ls
+
+
+def test_noise_aware_variances():
+    """Section 8, a slow twin of the factor."""
+    s = example(3, 1, T=200, snr_db=20.0)
+    sigma = s.sigma
+    model = HammersteinWiener(2, 2, input=Polynomial(3), output=Polynomial(3), output_noise=sigma)
+    run = track(model, Kalman(q=4e-6, r=1.0, p0=1.0, theta0=0.01), s.y, s.u, keep="cov")
+    phi, _ = rows(model, s.y, s.u)
+    for t in (3, 4, 50, 199):
+        before = run.theta[t - 1]
+        slope = [1.0 + 2.0 * before[4] * s.y[t - i] + 3.0 * before[5] * s.y[t - i] ** 2 for i in range(3)]
+        r = sigma**2 * np.sum(np.array([1.0, before[0], before[1]]) ** 2 * np.array(slope) ** 2) + 1e-4
+        M = run.cov(t - 1) + 4e-6 * np.eye(14)
+        np.testing.assert_allclose(run.innovation_std[t] ** 2, phi[t] @ M @ phi[t] + r, rtol=1e-7)
+    live = Live(model, Kalman(q=4e-6, r=1.0, p0=1.0, theta0=0.01))
+    for t in range(200):
+        live.update(float(s.y[t]), float(s.u[t]))
+    assert same(live.theta, run.theta[-1])
+
+
+def test_bases_are_what_they_say():
+    x = np.linspace(-1.9, 3.2, 23)
+    s = (x - 1.0) / 3.0
+    np.testing.assert_allclose(Legendre(5, (-2, 4)).value(x), legendre.legvander(s, 5)[:, 1:], atol=1e-14)
+    np.testing.assert_allclose(Chebyshev(5, (-2, 4)).value(x), chebyshev.chebvander(s, 5)[:, 1:], atol=1e-14)
+    np.testing.assert_allclose(Polynomial(3).value(x), x[:, None] ** [1, 2, 3])
+    bends = PiecewiseLinear([-1.0, 0.0, 2.0])
+    np.testing.assert_allclose(bends.value([-3.0, 1.0, 5.0]), [[-3, -2, 0, 0], [1, 0, 1, 0], [5, 0, 5, 3]])
+    for degree in (1, 2, 3):
+        spline = BSpline(degree, [-2.0, -1.0, 0.5, 1.0, 3.3], anchor=0.3)
+        ends = np.pad(spline.knots, degree, mode="edge")
+        twin = [
+            ScipyBSpline(ends, row, degree)(x) - ScipyBSpline(ends, row, degree)(0.3)
+            for row in np.eye(len(ends) - degree - 1)[1:]
+        ]
+        np.testing.assert_allclose(spline.value(x), np.stack(twin, axis=1), atol=1e-14)
+        assert spline.n == len(twin) == len(spline.names)
+        assert np.isnan(spline.value(3.31)).all()
+    zone = DeadZone(3.0).known(1.0, -0.5)
+    np.testing.assert_allclose(zone.value([2.0, 0.5, -2.0]) @ [1.0, 1.0, -0.5], [1.0, 0.0, -1.5])
+
+
+@pytest.mark.parametrize(
+    "basis",
+    [
+        Polynomial(3), Legendre(4, (-2, 4)), Chebyshev(4, (-2, 4)), PiecewiseLinear([-1.0, 1.0]),
+        BSpline(3, [-2.0, 0.0, 4.0]), DeadZone(3.0),
+    ],
+    ids=repr,
+)  # fmt: skip
+def test_derivatives_and_settings_of_bases(basis):
+    x = np.linspace(-1.93, 3.17, 19)
+    numeric = (basis.value(x + 1e-6) - basis.value(x - 1e-6)) / 2e-6
+    np.testing.assert_allclose(basis.derivative(x), numeric, atol=1e-7)
+    assert basis_of(json.loads(json.dumps(basis.plain()))) == basis
+    model = HammersteinWiener(1, 1, input=basis, intercept=True)
+    again = HammersteinWiener.from_settings(json.loads(json.dumps(model.settings())))
+    assert (again, hash(again), again.names) == (model, hash(model), model.names)
+
+
+def swing(x, p, out):
+    out[0] = x + p[0] * np.sin(x)
+    out[1] = np.tanh(x)
+
+
+def swing_slopes(x, p, out):
+    out[0] = 1.0 + p[0] * np.cos(x)
+    out[1] = 1.0 - np.tanh(x) ** 2
+
+
+def test_functions_of_the_user(tmp_path):
+    own = Functions(swing, swing_slopes, 2, (0.3,), ("sway", "bend"))
+    np.testing.assert_allclose(own.value([0.5])[0], [0.5 + 0.3 * np.sin(0.5), np.tanh(0.5)])
+    model = HammersteinWiener(1, 1, output=own)
+    rng = np.random.default_rng(8)
+    s = simulate(model, [-0.5], [0.5], d=[0.4], T=100, rng=rng)
+    run = track(model, Kalman(q=0.0, r=1e-6, p0=1e6), s.y, s.u)
+    np.testing.assert_allclose(run.theta[-1], s.theta[-1], atol=1e-3)
+    run.save(tmp_path / "run")
+    assert Track.load(tmp_path / "run").model == model
+    with pytest.raises(ValueError, match="cannot be imported"):
+        Functions("nowhere:f", "nowhere:g")
+
+
+def test_inversion_and_what_cannot_be_inverted():
+    """Item 4 of the specification."""
+    rng = np.random.default_rng(9)
+    w = rng.normal(size=50) * 2.0
+    d = np.repeat([[1.0, -0.4, 0.6]], 50, axis=0)
+    y = invert(Polynomial(3), d, w)
+    assert np.abs(y - 0.4 * y**2 + 0.6 * y**3 - w).max() <= 1e-12
+    for basis, weights in (
+        (Polynomial(3), [1.0, -1.2, 0.3]), (Polynomial(2), [1.0, 0.6]), (PiecewiseLinear([0.5]), [1.0, -1.5]),
+    ):  # fmt: skip
+        with pytest.raises(NotMonotoneError, match="sample 0"):
+            invert(basis, np.array([weights]), [-0.9 if basis == Polynomial(2) else 0.45])
+    with pytest.raises(NotMonotoneError, match="does not reach w"):
+        invert(Polynomial(2), np.array([[1.0, 0.1]]), [-10.0])
+    with pytest.raises(NotMonotoneError, match="unstable from sample 0"):
+        simulate(HammersteinWiener(1, 1), [-1.5], [1.0], T=200, rng=rng)
+
+
+def test_what_does_not_fit_warns_and_names_the_remedy():
+    with pytest.warns(UserWarning, match=r"use Legendre\(5"):
+        Polynomial(5)
+    rng = np.random.default_rng(10)
+    y, u = rng.normal(size=(2, 50))
+    with pytest.warns(UserWarning, match=r"u has a root mean square of .* use Legendre\(2"):
+        track(HammersteinWiener(1, 1, input=Polynomial(2)), Still(), y, 100.0 * u)
+    with pytest.warns(UserWarning, match=r"samples of y lie outside .* Legendre and are beyond"):
+        track(HammersteinWiener(1, 1, output=Legendre(2, (-1, 1))), Still(), y, u)
+    with pytest.warns(UserWarning, match=r"samples of u lie outside .* BSpline and are missing"):
+        run = track(HammersteinWiener(1, 1, input=BSpline(2, (-1, 0, 1))), Still(), y, u)
+    assert np.flatnonzero(~run.ok[2:]).tolist() == [t - 1 for t in np.flatnonzero(np.abs(u[:-1]) > 1) if t > 0]
+    for wrong, says in (
+        (lambda: PiecewiseLinear([0.0, 1.0, 1.0]), "twice"),
+        (lambda: Legendre(3, (1, 1)), "low below high"),
+        (lambda: HammersteinWiener(1, 0), "nb must be a whole number of at least 1"),
+        (lambda: HammersteinWiener(1, 1, output=DeadZone(1.0)), "not one-to-one"),
+        (lambda: HammersteinWiener(1, 1, input="cubic"), "takes one of"),
+        (lambda: HammersteinWiener(1, 1, output_noise=0.0), "output_noise"),
+        (lambda: HammersteinWiener(1, 1).bind(2), "1 input"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            wrong()
+
+
+@pytest.mark.parametrize("u", [np.zeros(80), np.full(80, 0.7)])
+def test_dull_inputs_leave_a_finite_state(u):
+    run = track(SMALL, K, np.zeros(80) + u, u)
+    assert np.isfinite(run.theta).all()
+    assert np.isfinite(run.std).all()
+
+
+def test_the_likelihood_of_y_integrates_to_one():
+    """Item 13: the estimate after the sample belongs into the Jacobian, the one before is only first order."""
+    d, M, R = np.array([-0.2, 0.3]), 2e-3 * np.eye(2), 0.05
+    model = HammersteinWiener(0, 1, output=Polynomial(3))
+    y = np.linspace(-6.0, 6.0, 20_001)
+    phi = np.stack([y**2, y**3], axis=1)
+    e = 1.0 - y - phi @ d
+    s = np.einsum("ti,ij,tj->t", phi, M, phi) + R
+    after = d + (phi @ M) * (e / s)[:, None]
+    density = np.exp(-0.5 * e * e / s) / np.sqrt(2.0 * np.pi * s)
+    theta = np.concatenate([np.zeros((len(y), 1)), after], axis=1)
+    assert np.trapezoid(density * model.slope(theta, y), y) == pytest.approx(1.0, abs=1e-4)
+    theta[:, 1:] = d
+    assert 1.004 < np.trapezoid(density * model.slope(theta, y), y) < 1.02
