@@ -25,7 +25,6 @@ from llvmlite.binding import add_symbol
 from numba import carray, njit, types
 from numba.core import cgutils
 from numba.core.datamodel import models, register_default
-from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 
 Array = npt.NDArray[Any]
@@ -122,7 +121,7 @@ def core(function: Callable[..., Any]) -> Any:
 
 
 class Outside(types.ExternalFunction):
-    """A machine that steps call by its symbol, with the address of a table, so that it is compiled once for all drivers.
+    """A machine that steps call by its symbol, with the address of a table: compiled once for all drivers.
 
     What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
     compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.

@@ -46,14 +46,20 @@ from driftfit.hypotheses.plan import (
     number,
 )
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
-from driftfit.kernel import Array, core, floats, outside, wholes
+from driftfit.kernel import Array, core, floats, kernel, outside, wholes
 
-LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, COUNT = range(10)
-"""Counters of a bank; COUNT is how many there are."""
-IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, IN_VALID, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT, SIZE = (
-    range(17)
-)
+LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, COUNT = range(11)
+"""Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
+it begins with the next sample.
+"""
+WAITING, READY = 0, -1
+(
+    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, IN_VALID, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
+    SQUARES, TIMES, SIZE,
+) = range(19)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out."""
+HEAD = 4
+"""Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
 
 @core
@@ -140,8 +146,8 @@ def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lags: Array, theta: Array, cov: Array, na: int,
-    unknown: bool, same: bool,
+    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lags: Array, theta: Array, cov: Array,
+    na: int, unknown: bool, same: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite."""
     n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
@@ -168,9 +174,7 @@ def advance(
     blur(B, L, n, prior, Hm, Qt, maps, theta0, alike, C, m, factor)
     spread(C, Z, m, L, g, h, y_hat)
     variance_factor(B, L, unknown, factor)
-    now[Y_HAT], now[S2] = expect(
-        B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch
-    )
+    now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
 
     if now[IN_OK] > 0.0:
         K = reduce(
@@ -254,6 +258,20 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
 
 
 @core
+def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lags: Array, na: int) -> None:
+    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
+    n, H = len(theta), lags.shape[1]
+    lags[0, 0] = 1.0
+    y_hat = B[WEIGHT, :1]
+    y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
+    push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
+    now[LAST] = now[IN_Y] if now[IN_SEEN] > 0.0 else now[LAST]
+    many[CLOCK] += 1
+    if many[SETTLED] == READY:
+        begin(B, T, theta, P, now[TIMES], max(now[SQUARES], now[LEAST] * now[TIMES]), many, H)
+
+
+@core
 def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
     """The one leaf that a bank starts from."""
     n = len(theta)
@@ -268,34 +286,60 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
             at += 1
     for row in range(len(T)):
         T[row, 0] = 1.0 if row % (H + 1) == H else 0.0
-    many[LEAVES], many[GROUPS], many[EXPANDED] = 1, 1, 1
+    many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
-ARRAYS = (
-    "A", "B", "T", "T2", "X", "links", "group", "slots", "many", "now", "prior", "phi", "Q", "sizes", "c", "factors",
-    "maps", "theta0", "sensors", "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "decided", "parts",
-    "root", "samples", "Qt", "lag_prob", "theta", "P",
+PACKED = (
+    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
+    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "lag_prob",
+    "decided",
 )  # fmt: skip
-"""Fields of the record that `bank` works on, in the order of its table: address, rows, columns of each; in a last row
-how many output lags leaves have of their own, and whether the noise is unknown and events are independent.
+"""Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
+shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
 """
+PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
+BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, ROWS = range(PLACES, PLACES + 10)
+"""Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
+and whether the noise is unknown and events are independent; and how many rows there are.
+"""
+
+
+@kernel
+def packed(t: Array, k: int) -> Array:
+    """One of the packed arrays, of floats."""
+    return floats(t[BASE if k < PLACES - 2 else REPORT, 0] + t[k, 0], t[k, 1], t[k, 2])
+
+
+@kernel
+def whole(t: Array, k: int) -> Array:
+    """One of the packed arrays, of whole numbers."""
+    return wholes(t[BASE, 0] + t[k, 0], t[k, 1], t[k, 2])
 
 
 @outside
 def bank(table: int) -> None:
     """`advance` on the arrays of a table."""
-    t = wholes(table, 35, 3)
+    t = wholes(table, ROWS, 3)
+    n = t[THETA, 1]
+    many, now = wholes(t[MANY, 0], 1, COUNT)[0], floats(t[NOW, 0], 1, SIZE)[0]
+    head = floats(t[REPORT, 0], 1, HEAD)[0]
+    if many[SETTLED] != 1:
+        wait(
+            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 26),
+            t[FLAGS, 0],
+        )  # fmt: skip
+        root = packed(t, 23)
+        for row in range(len(root)):
+            root[row, 0] = packed(t, 1)[row, 0]
+        head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
+        return
     advance(
-        floats(t[0, 0], t[0, 1], t[0, 2]), floats(t[1, 0], t[1, 1], t[1, 2]), floats(t[2, 0], t[2, 1], t[2, 2]),
-        floats(t[3, 0], t[3, 1], t[3, 2]), floats(t[4, 0], t[4, 1], t[4, 2]), wholes(t[5, 0], t[5, 1], t[5, 2]),
-        wholes(t[6, 0], 1, t[6, 2])[0], wholes(t[7, 0], 1, t[7, 2])[0], wholes(t[8, 0], 1, t[8, 2])[0],
-        floats(t[9, 0], 1, t[9, 2])[0], floats(t[10, 0], t[10, 1], t[10, 2]), floats(t[11, 0], 1, t[11, 2])[0],
-        floats(t[12, 0], t[12, 1], t[12, 2]), floats(t[13, 0], t[13, 1], t[13, 2]), floats(t[14, 0], 1, t[14, 2])[0],
-        floats(t[15, 0], 1, t[15, 2])[0], floats(t[16, 0], t[16, 1], t[16, 2]), floats(t[17, 0], 1, t[17, 2])[0],
-        floats(t[18, 0], t[18, 1], t[18, 2]), floats(t[19, 0], t[19, 1], t[19, 2]), floats(t[20, 0], 1, t[20, 2])[0],
-        floats(t[21, 0], 1, t[21, 2])[0], floats(t[22, 0], t[22, 1], t[22, 2]), floats(t[23, 0], 1, t[23, 2])[0],
-        floats(t[24, 0], 1, t[24, 2])[0], floats(t[25, 0], 1, t[25, 2])[0], floats(t[26, 0], t[26, 1], t[26, 2]),
-        floats(t[27, 0], t[27, 1], t[27, 2]), floats(t[28, 0], t[28, 1], t[28, 2]), floats(t[29, 0], t[29, 1], t[29, 2]),
-        floats(t[30, 0], t[30, 1], t[30, 2]), floats(t[31, 0], t[31, 1], t[31, 2]), floats(t[32, 0], 1, t[32, 2])[0],
-        floats(t[33, 0], t[33, 1], t[33, 2]), t[34, 0], t[34, 1] > 0, t[34, 2] > 0,
+        packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
+        whole(t, 7)[0], many, now, packed(t, 8),
+        floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
+        packed(t, 12), packed(t, 13)[0], packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
+        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 27), packed(t, 22),
+        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 26), floats(t[THETA, 0], 1, n)[0],
+        floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,
     )  # fmt: skip
+    head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]

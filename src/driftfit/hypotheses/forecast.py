@@ -56,4 +56,3 @@ def expect(
     if mass != 1.0:
         variance /= mass
     return mean, variance if noise < np.inf else np.inf
-

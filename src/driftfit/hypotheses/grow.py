@@ -21,7 +21,7 @@ import numpy as np
 
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE, WIDTH
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.kernel import Array, log, core
+from driftfit.kernel import Array, core, log
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
@@ -29,7 +29,9 @@ FLOOR = 1e-12
 
 
 @core
-def develop(A: Array, K: int, n: int, Q: Array, maps: Array, theta0: Array, own: bool, Hm: int, C: Array, m: Array) -> int:
+def develop(
+    A: Array, K: int, n: int, Q: Array, maps: Array, theta0: Array, own: bool, Hm: int, C: Array, m: Array
+) -> int:
     """Every leaf under every change: C and m of the columns c K + l. With ``own`` leaf l stands for the joint event l
     alone. Returns the number of columns.
     """
@@ -119,9 +121,7 @@ def student(nus: Array, scales: Array, eps: Array, s: Array, fade: float, least:
 
 
 @core
-def frozen(
-    nus: Array, scales: Array, y: float, last: float, width: float, r: float, unknown: bool, out: Array
-) -> None:
+def frozen(nus: Array, scales: Array, y: float, last: float, width: float, r: float, unknown: bool, out: Array) -> None:
     """Log density of the last output again."""
     for l in range(len(nus)):
         wide = width

@@ -5,7 +5,7 @@ which is what the compiler vectorises over; the rows of a column are
 
     log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
 
-nu and S are those of the inverse gamma distribution of the noise variance where that is unknown; C is then in its units.
+nu and S are those of the inverse gamma distribution of the noise variance where that is unknown, C then in its units.
 Codes are the newest events as the digits of a number; what they are for is the reduction's business. What a leaf
 remembers of its past floors, for the user and not for the recursion, are marginals of events in a table of their own,
 which the children of a leaf share: block k of it has the joint events k floors back, and the probability of no change
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.kernel import Array, exp, kernel, log, core
+from driftfit.kernel import Array, core, exp, kernel, log
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""

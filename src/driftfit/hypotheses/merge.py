@@ -8,7 +8,7 @@ g_l = nu_l / S_l and g = sum w g_l,
     m = sum w g_l m_l / g,   C = sum w (C_l + g_l d_l d_l'),
     psi(nu/2) - log(nu/2) = sum w (psi(nu_l/2) - log(S_l/2)) - log g,   S = nu / g
 
-which keeps the expectations of 1/s2, log s2, theta/s2 and theta theta'/s2. A group of one leaf is that leaf, bit for bit.
+which keeps the expectations of 1/s2, log s2, theta/s2 and theta theta'/s2. A group of one leaf is that leaf.
 """
 
 from __future__ import annotations

@@ -7,8 +7,6 @@ every leaf.
 
 from __future__ import annotations
 
-import numpy as np
-
 from driftfit.hypotheses.leaves import WEIGHT
 from driftfit.kernel import Array, core
 

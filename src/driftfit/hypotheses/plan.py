@@ -6,10 +6,8 @@ not used leaves the mixture as it is.
 
 from __future__ import annotations
 
-import numpy as np
-
-from driftfit.hypotheses.lookahead import expected_risk
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
+from driftfit.hypotheses.lookahead import expected_risk
 from driftfit.kernel import Array, core
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
@@ -186,8 +184,8 @@ def decide(
                 stop = risk[best] <= knobs[WAIT]
                 if not stop:
                     later = expected_risk(
-                        B, L, top, loss, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event, group,
-                        mass, parts, X[2:],
+                        B, L, top, loss, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event,
+                        group, mass, parts, X[2:],
                     )  # fmt: skip
                     stop = risk[best] <= knobs[WAIT] + later
         if not stop:

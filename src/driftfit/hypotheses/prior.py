@@ -102,8 +102,8 @@ def _chains(owner: str, transition: Any, Hd: int, Hm: int) -> Any:
     if shape in sizes:
         return sizes[shape]
     raise ValueError(
-        f"{owner}: transition has shape {shape}; give ({Hd}, {Hd}) for the changes, ({Hd * Hm}, {Hd * Hm}) for the joint "
-        f"events, or a pair of ({Hd}, {Hd}) and ({Hm}, {Hm})."
+        f"{owner}: transition has shape {shape}; give ({Hd}, {Hd}) for the changes, ({Hd * Hm}, {Hd * Hm}) for the "
+        f"joint events, or a pair of ({Hd}, {Hd}) and ({Hm}, {Hm})."
     )
 
 

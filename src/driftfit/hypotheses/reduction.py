@@ -199,8 +199,12 @@ class Hybrid(Reduction):
         children = tree("Hybrid", Hd * Hm * self.leaves, 1, "use fewer leaves")
         bases = np.array([1.0, float(Hm) ** self.sensor_events, float(Hd) ** self.window])
         if bases.prod() * (self.age_cap + 1) > 2.0**53:
-            raise ValueError(f"Hybrid: a window of {self.window} with {Hd} changes cannot be told apart; use a smaller one.")
-        return Shape(self.leaves, children, self.window, 1, knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap), bases)
+            raise ValueError(
+                f"Hybrid: a window of {self.window} with {Hd} changes cannot be told apart; use a smaller one."
+            )
+        return Shape(
+            self.leaves, children, self.window, 1, knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap), bases
+        )
 
 
 @dataclass(frozen=True)

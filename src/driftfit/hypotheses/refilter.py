@@ -55,7 +55,9 @@ def refilter(
             for l in range(L):
                 prior[e, l] = row[e]
         increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
-        L = floor(A, L, B, samples[at], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X)
+        L = floor(
+            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X
+        )
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):

@@ -108,7 +108,7 @@ class Sensor(Settings):
         if resolution is not None and not resolution > 0.0:
             raise ValueError(
                 f"Sensor.frozen: resolution must be positive, as a density without width is infinite; got "
-                f"{resolution!r}. Without resolution= the width is {math.sqrt(STUCK):g} standard deviations of the noise."
+                f"{resolution!r}. Without resolution= the width is {math.sqrt(STUCK):g} of the noise's."
             )
         return cls("frozen", prob=prob, resolution=resolution)
 
