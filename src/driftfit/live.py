@@ -79,14 +79,25 @@ class Live:
         self._update = compiled.update.entry(kind, f8, INPUTS)
         self._update_one = compiled.update_one.entry(kind, f8, f8) if self._m == 1 else None
 
-    def update(self, y: float | None, u: Any = None, time: Any = None, weight: float = 1.0, drift: float = 1.0) -> Step:
+    def update(
+        self,
+        y: float | None,
+        u: Any = None,
+        time: Any = None,
+        weight: float = 1.0,
+        drift: Any = 1.0,
+        prob: Any = None,
+    ) -> Step:
         """Take one sample in and return (y_hat, e, s, ok).
 
         ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
         otherwise. With ``time``, the interval since the last sample scales the drift; a time that is not after the last
         is counted in ``ignored`` and leaves the state alone. ``weight`` divides the noise variance of this sample (0:
-        do not use it), ``drift`` multiplies the drift before it.
+        do not use it), ``drift`` multiplies the drift before it. A `Bank` also takes ``prob``, prior probabilities of
+        its changes or joint events at this sample, and a ``drift`` for each change.
         """
+        if prob is not None or type(drift) is not float:
+            return self._update_told(y, u, time, weight, drift, prob)
         if time is not None or weight != 1.0 or drift != 1.0 or self._window is not None:
             return self._update_known(y, u, time, weight, drift)
         if not isinstance(y, float):
@@ -97,6 +108,16 @@ class Live:
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
         return self._update(self._tile, y, u)  # type: ignore[no-any-return]
+
+    def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+        """One sample of which more is known than interval, noise and drift."""
+        each = np.ndim(drift) == 1
+        if each or prob is not None:
+            self.tracker.tell(self._lane(), prob, drift if each else None)
+        step = self._update_known(y, u, time, weight, 1.0 if each else float(drift))
+        if each or prob is not None:
+            self.tracker.tell(self._lane(), None, None)
+        return step
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
         interval = 1.0 if time is None else interval_of(self._last, time, self.dt)

@@ -6,6 +6,8 @@ no leaf is dropped. The reduction that was planned waits for the next sample tha
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from driftfit.hypotheses.forecast import expect
@@ -297,6 +299,7 @@ PACKED = (
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
 """
+GIVEN, FACTORS = PACKED.index("given"), PACKED.index("factors")
 PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
 BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, ROWS = range(PLACES, PLACES + 10)
 """Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
@@ -305,13 +308,13 @@ and whether the noise is unknown and events are independent; and how many rows t
 
 
 @kernel
-def packed(t: Array, k: int) -> Array:
+def packed(t: Array, k: int) -> Any:
     """One of the packed arrays, of floats."""
     return floats(t[BASE if k < PLACES - 2 else REPORT, 0] + t[k, 0], t[k, 1], t[k, 2])
 
 
 @kernel
-def whole(t: Array, k: int) -> Array:
+def whole(t: Array, k: int) -> Any:
     """One of the packed arrays, of whole numbers."""
     return wholes(t[BASE, 0] + t[k, 0], t[k, 1], t[k, 2])
 

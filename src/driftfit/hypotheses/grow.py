@@ -166,7 +166,7 @@ def grow(
         if na > 0:
             remember(A, K, B, block, n, na, y - sensors[j, VALUE], y_hat, sensors[j, CLEANS] > 0.0)
         name(B, block, K, j, Hd, Hm, own, prior, likely, bases, parent, event)
-    return columns * Hm
+    return int(columns * Hm)
 
 
 @core

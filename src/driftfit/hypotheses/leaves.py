@@ -56,7 +56,7 @@ def normalise(B: Array, L: int) -> float:
     for l in range(L):
         B[WEIGHT, l] *= each
         B[LOG, l] -= gone
-    return gone
+    return float(gone)
 
 
 @core

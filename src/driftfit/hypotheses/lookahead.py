@@ -28,7 +28,8 @@ SMALL = 1e-9
 @core
 def density_parts(
     B: Array, L: int, top: float, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
-    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array, mass: float, out: Array,
+    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array,
+    mass: float, out: Array,
 ) -> int:  # fmt: skip
     """Components of the predictive density as columns of out: oldest event, weight, mean, standard deviation."""
     n, Hm, count = len(phi), len(sensors), 0

@@ -17,7 +17,7 @@ from driftfit.kernel import Array
 TOLERANCE = 1e-10
 
 
-def shares(owner: str, what: str, given: Sequence[Change] | Sequence[Sensor]) -> Array:
+def shares(owner: str, what: str, given: Sequence[Any]) -> Array:
     """Prior probabilities (k,): those given, one None standing for what the others leave."""
     open_ones = [i for i, one in enumerate(given) if one.prob is None]
     p = np.array([0.0 if one.prob is None else one.prob for one in given])
@@ -71,6 +71,7 @@ def events(
         if isinstance(chains, np.ndarray):
             return chains, _initial(owner, initial, chains)
     parts, starts = [], []
+    given: Sequence[Any]
     for which, (what, given) in enumerate((("changes", changes), ("sensors", sensors))):
         size = len(given)
         if chains is not None and chains[which] is not None:

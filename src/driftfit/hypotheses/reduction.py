@@ -60,7 +60,7 @@ def tree(owner: str, H: int, depth: int, instead: str) -> int:
         raise ValueError(
             f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates a sample, more than {MOST}; {instead}."
         )
-    return H**depth
+    return int(H**depth)
 
 
 @dataclass(frozen=True)

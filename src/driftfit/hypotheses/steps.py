@@ -8,6 +8,8 @@ from driftfit.drivers import TrackerSteps
 from driftfit.hypotheses.advance import (
     ADDRESSES,
     BASE,
+    FACTORS,
+    GIVEN,
     IN_DT,
     IN_NOISE,
     IN_OK,
@@ -35,7 +37,7 @@ from driftfit.hypotheses.advance import C as AT_C
 from driftfit.hypotheses.advance import P as AT_P
 from driftfit.hypotheses.advance import R as NOISE
 from driftfit.hypotheses.grow import FLOOR
-from driftfit.kernel import State, kernel, nothing
+from driftfit.kernel import Array, State, kernel, nothing
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.diffuse import enter, measurement, spanned_variance
 from driftfit.trackers.excitation import learn_scales
@@ -136,4 +138,16 @@ def keep(o: State, s: State, l: int) -> None:
         o.report[k, l] = s.report[k, l]
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep)
+@kernel
+def told(s: State, known: Array, t: int, l: int) -> None:
+    """Priors of the joint events of this sample, then factors of the drift of every change."""
+    row = t if known.shape[0] > 1 else 0
+    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
+    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for e in range(H):
+        s.memory[given + e, l] = known[row, 3 + e, l]
+    for i in range(Hd):
+        s.memory[factors + i, l] = known[row, 3 + H + i, l]
+
+
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told)

@@ -1,6 +1,6 @@
 """A bank of hypotheses: Kalman filters along the histories of what may have happened, weighed by what they predict.
 
-    theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j) under sensor j
+    theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j), sensor j
     p(history, event | data) proportional to N(y_t; phi' m, phi' C- phi + r_j) p(event | history) p(history | data)
 
 (a jump Markov linear system). Every history of events is a leaf with its own Gaussian; a reduction keeps their number
@@ -8,8 +8,8 @@ bounded (`driftfit.hypotheses.reduction`). What is reported at t, the mixture ov
 tree has grown by sample t and before it is reduced.
 
 Use it where parameters stand still and sometimes jump, or where the sensor may fail: jumps are seen by their fit, not
-by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper. Jumps
-show only through the regressors: no excitation, no detection.
+by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper.
+Jumps show only through the regressors: no excitation, no detection.
 
 `Bank()` alone has no scale: see `driftfit.hypotheses.change`. With unknown noise variance (r of the nominal sensor left
 None) q and p0 are in units of it, unless a ``guess`` of it is given.
@@ -46,6 +46,7 @@ from driftfit.hypotheses.steps import STEPS
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, vector
+from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
 
@@ -110,7 +111,7 @@ class Bank(Tracker):
         self._check()
 
     def _check(self) -> None:
-        nominal, others = self._sensors[0], self._sensors[1:]
+        nominal, others = self.all_sensors[0], self.all_sensors[1:]
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
         self._shape, self._events  # noqa: B018  (both refuse what does not fit)
@@ -131,28 +132,30 @@ class Bank(Tracker):
             )
 
     @property
-    def _changes(self) -> tuple[Change, ...]:
+    def all_changes(self) -> tuple[Change, ...]:
+        """The changes, also those that `Bank()` supplies."""
         return self.changes or changes_.usual()
 
     @property
-    def _sensors(self) -> tuple[Sensor, ...]:
+    def all_sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, likewise."""
         return self.sensors or (Sensor.nominal(),)
 
     @property
     def _reduction(self) -> Reduction:
-        return self.reduce or (Beam() if len(self._sensors) == 1 else Hybrid())
+        return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
 
     @property
     def _count(self) -> int:
-        return len(self._changes) * len(self._sensors)
+        return len(self.all_changes) * len(self.all_sensors)
 
     @property
     def _shape(self) -> Shape:
-        return self._reduction.shape(len(self._changes), len(self._sensors))
+        return self._reduction.shape(len(self.all_changes), len(self.all_sensors))
 
     @property
     def _events(self) -> tuple[Array, Array]:
-        return events("Bank", self._changes, self._sensors, self.transition, self.initial)
+        return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
 
     @property
     def _alike(self) -> bool:
@@ -160,12 +163,17 @@ class Bank(Tracker):
         return bool((P[0] == P).all())
 
     @property
+    def change_names(self) -> tuple[str, ...]:
+        """Names of the changes."""
+        named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
+        return tuple(named)
+
+    @property
     def event_names(self) -> tuple[str, ...]:
         """Names of the joint events, in their order."""
-        changes = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self._changes)]
-        if len(self._sensors) == 1:
-            return tuple(changes)
-        return tuple(f"{change}, {sensor.name}" for change in changes for sensor in self._sensors)
+        if len(self.all_sensors) == 1:
+            return self.change_names
+        return tuple(f"{change}, {sensor.name}" for change in self.change_names for sensor in self.all_sensors)
 
     def settings(self) -> dict[str, Any]:
         plain = super().settings()
@@ -180,7 +188,7 @@ class Bank(Tracker):
         given = dict(settings)
         for name, kind in (("changes", Change), ("sensors", Sensor)):
             if given.get(name) is not None:
-                given[name] = tuple(kind.from_settings(one) for one in given[name])  # type: ignore[attr-defined]
+                given[name] = tuple(kind.from_settings(one) for one in given[name])
         if given.get("reduce") is not None:
             reduce = dict(given["reduce"])
             given["reduce"] = getattr(reductions, reduce.pop("kind")).from_settings(reduce)
@@ -188,7 +196,7 @@ class Bank(Tracker):
 
     def _sensor_table(self) -> Array:
         rows = []
-        for one in self._sensors:
+        for one in self.all_sensors:
             width = -STUCK if one.resolution is None else one.resolution**2 / (2.0 * np.pi)
             rows.append(
                 [one.factor, one.value, float(one.kind == "frozen"), width, float(one.kind in ("additive", "frozen"))]
@@ -199,11 +207,11 @@ class Bank(Tracker):
         return self._state(n, 0)
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
-        cleans = any(one.cleans for one in self._sensors)
+        cleans = any(one.cleans for one in self.all_sensors)
         return self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
-        nominal = self._sensors[0]
+        nominal = self.all_sensors[0]
         guessed = nominal.r is None and nominal.guess is not None
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
@@ -211,7 +219,8 @@ class Bank(Tracker):
         now, many = np.zeros(core.SIZE), np.zeros(core.COUNT, int)
         now[core.LAST], now[core.R] = np.nan, 1.0
         now[core.FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
-        count, squares = (nominal.nu, nominal.nu * nominal.guess) if guessed else (0.0, 0.0)
+        count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
+        squares *= nominal.guess or 0.0
         arrays = self._arrays(n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
@@ -228,11 +237,11 @@ class Bank(Tracker):
 
     def _arrays(self, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
         """What `driftfit.hypotheses.advance` works on, before the first sample."""
-        shape, Hd, Hm, H = self._shape, len(self._changes), len(self._sensors), self._count
+        shape, Hd, Hm, H = self._shape, len(self.all_changes), len(self.all_sensors), self._count
         tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
         chain, initial = self._events
         rows, lower = FIRST + n + tri + na, np.tril_indices(n)
-        steps = [one.increments(n) for one in self._changes]
+        steps = [one.increments(n) for one in self.all_changes]
         refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
         return {
             "A": np.zeros((rows, shape.parents)), "B": np.zeros((rows, K)), "T": np.zeros((W * (H + 1), K)),
@@ -241,7 +250,7 @@ class Bank(Tracker):
             "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
             "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
             "factors": np.ones(Hd), "theta0": theta0,
-            "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self._changes]),
+            "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self.all_changes]),
             "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
             "loss": self._reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
             "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
@@ -249,6 +258,42 @@ class Bank(Tracker):
             "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters else 1, 3 + n)),
             "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
         }  # fmt: skip
+
+    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+        """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
+        if prob is not None:
+            columns[:, : Hd * Hm] = self._given(np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1])))
+        if drift is not None:
+            factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
+            if factors.size not in (Hd, T * Hd):
+                raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
+            columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
+        return columns
+
+    def _given(self, p: Array) -> Array:
+        """Priors of joint events from priors of joint events or of changes; rows of NaN stay."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        if p.shape[1] == Hd and Hm > 1:
+            sensors = self._events[1].reshape(Hd, Hm).sum(axis=0)
+            p = np.einsum("ti,j->tij", p, sensors).reshape(len(p), -1)
+        if p.shape[1] != Hd * Hm:
+            raise ValueError(
+                f"Bank: prob must have {Hd} columns (changes) or {Hd * Hm} (joint events); got {p.shape[1]}."
+            )
+        given = ~np.isnan(p).all(axis=1)
+        wrong = given & ~((p >= 0.0).all(axis=1) & (np.abs(p.sum(axis=1) - 1.0) < 1e-8))
+        if wrong.any():
+            t = int(np.argmax(wrong))
+            raise ValueError(f"Bank: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
+        return p
+
+    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
+        columns, Hd = self.beside(1, prob, drift)[0], len(self.all_changes)
+        for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
+            start = lane["table"][PACKED.index(name), 0] // 8
+            lane["memory"][start : start + len(values)] = values
 
     def told(self, report: Array, name: str) -> Array:
         """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
