@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numba import types
@@ -18,6 +18,9 @@ from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.storage import fields, load_state, save_state
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, Run, carried, fresh_tile
+
+if TYPE_CHECKING:
+    from driftfit.hypotheses.results import LiveHypotheses
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
@@ -113,10 +116,10 @@ class Live:
         """One sample of which more is known than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
-            self.tracker.tell(self._lane(), prob, drift if each else None)
+            self.tracker.tell(self.lane(), prob, drift if each else None)
         step = self._update_known(y, u, time, weight, 1.0 if each else float(drift))
         if each or prob is not None:
-            self.tracker.tell(self._lane(), None, None)
+            self.tracker.tell(self.lane(), None, None)
         return step
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
@@ -199,7 +202,7 @@ class Live:
         if p is not None:
             moved = np.zeros(len(self.names))
             moved[chosen] = vector("Live.reset", "p", numbers("Live.reset", "p", p, low=0.0), count)
-            self.tracker.widen(self._lane(), moved)
+            self.tracker.widen(self.lane(), moved)
         if theta is not None:
             values = vector("Live.reset", "theta", numbers("Live.reset", "theta", theta), count)
             self._tile["theta"][0, chosen, 0] = values
@@ -215,13 +218,13 @@ class Live:
             chosen.append(one if isinstance(one, int) else self.names.index(one))
         return chosen
 
-    def _lane(self) -> dict[str, Array]:
+    def lane(self) -> dict[str, Array]:
         """The fields of the record, as views."""
         return {name: self._tile[name][0, ..., :1][..., 0] for name in fields(self._tile)}
 
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
-        state = {name: np.array(value) for name, value in self._lane().items()}
+        state = {name: np.array(value) for name, value in self.lane().items()}
         return End(self.model, self.tracker, state, self._last)
 
     def _inputs(self, u: Any) -> Array:
@@ -250,12 +253,21 @@ class Live:
     @property
     def cov(self) -> Array:
         """Covariance of theta, (n, n)."""
-        return self.tracker.cov(self._lane())
+        return self.tracker.cov(self.lane())
+
+    @property
+    def hypotheses(self) -> LiveHypotheses:
+        """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
+        if "report" not in self.tracker.outputs:
+            raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
+        from driftfit.hypotheses.results import LiveHypotheses
+
+        return LiveHypotheses(self)
 
     @property
     def learning(self) -> Array:
         """Which parameters are being learned now, (n,) bool: False where the recent inputs were too dull to tell."""
-        return self.tracker.learning(self._lane())
+        return self.tracker.learning(self.lane())
 
     @property
     def names(self) -> tuple[str, ...]:

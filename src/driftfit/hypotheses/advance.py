@@ -50,7 +50,7 @@ from driftfit.hypotheses.plan import (
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
 from driftfit.kernel import Array, core, floats, kernel, outside, wholes
 
-LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, COUNT = range(11)
+LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, COUNT = range(12)
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample.
 """
@@ -291,10 +291,19 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
     many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
+@core
+def note(ring: Array, clock: int, window: float, lags: Array) -> None:
+    """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
+    row = (clock - 1) % len(ring)
+    ring[row, 0] = window
+    for e in range(lags.shape[1]):
+        ring[row, 1 + e] = lags[len(lags) - 1, e]
+
+
 PACKED = (
     "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
-    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "lag_prob",
-    "decided",
+    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
+    "lag_prob", "decided",
 )  # fmt: skip
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
@@ -328,21 +337,23 @@ def bank(table: int) -> None:
     head = floats(t[REPORT, 0], 1, HEAD)[0]
     if many[SETTLED] != 1:
         wait(
-            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 26),
+            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 27),
             t[FLAGS, 0],
         )  # fmt: skip
         root = packed(t, 23)
         for row in range(len(root)):
             root[row, 0] = packed(t, 1)[row, 0]
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
+        note(packed(t, 26), many[CLOCK], 0.0, packed(t, 27))
         return
     advance(
         packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
         whole(t, 7)[0], many, now, packed(t, 8),
         floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
         packed(t, 12), packed(t, 13)[0], packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
-        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 27), packed(t, 22),
-        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 26), floats(t[THETA, 0], 1, n)[0],
+        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
+        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
         floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,
     )  # fmt: skip
     head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
+    note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 27))

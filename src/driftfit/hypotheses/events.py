@@ -7,15 +7,12 @@ them, its interval the fewest that hold nine tenths of the mass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.kernel import Array
-
-if TYPE_CHECKING:
-    from driftfit.hypotheses.results import Hypotheses
 
 FAINT = 0.02
 """Probability below which a sample does not count to a cluster."""
@@ -53,6 +50,11 @@ class Event:
     shift: dict[str, float] = field(default_factory=dict)
     std: dict[str, float] = field(default_factory=dict)
 
+    def moved(self, by: int) -> Event:
+        """The same, counted from another sample."""
+        times = {name: getattr(self, name) + by for name in ("date", "first", "last", "known")}
+        return replace(self, **times)
+
     def row(self) -> dict[str, Any]:
         """For a table."""
         moved = ", ".join(
@@ -66,28 +68,33 @@ class Event:
         }  # fmt: skip
 
 
-def changes_of(told: Hypotheses, threshold: float) -> list[Event]:
+class Told(NamedTuple):
+    """What events are made of."""
+
+    latest: Array
+    """(T, H): probabilities of the joint events of each sample, from as late as the bank remembers."""
+    window: Array
+    """(T,): probability, at each sample, of a change in the newest W floors."""
+    W: int
+    change_names: tuple[str, ...]
+    sensor_names: tuple[str, ...]
+
+
+def changes_of(told: Told, threshold: float) -> list[Event]:
     """Clusters of samples at which theta may have jumped."""
-    Hm, latest = told.sensors, np.nan_to_num(told.latest)
+    Hm, latest = len(told.sensor_names), np.nan_to_num(told.latest)
     by_change = latest.reshape(len(latest), -1, Hm).sum(axis=2)
-    changes = told.tracker.all_changes
-    p = by_change[:, 1:].sum(axis=1)
-    W = told.lag_prob.shape[1]
+    p, names = by_change[:, 1:].sum(axis=1), told.change_names[1:]
     events: list[Event] = []
     for a, b in runs(told.window > threshold):
-        reach = slice(max(0, a - W + 1, events[-1].last + 1 if events else 0), b)
-        for first, last in clusters(p, reach, threshold):
-            mass = p[first:last]
-            share = by_change[first:last, 1:].sum(axis=0)
+        reach = slice(max(0, a - told.W + 1, events[-1].last + 1 if events else 0), b)
+        for first, end in clusters(p, reach, threshold):
+            mass, share = p[first:end], by_change[first:end, 1:].sum(axis=0)
             low, high = densest(mass)
-            names = [told.tracker.change_names[i] for i in range(1, len(changes))]
-            known = max(a, first)
-            events.append(
-                Event(
-                    "change", first + int(mass.argmax()), first + low, first + high, known, float(min(mass.sum(), 1.0)),
-                    names[int(share.argmax())], dict(zip(names, (share / share.sum()).tolist(), strict=True)),
-                )
-            )  # fmt: skip
+            shares = dict(zip(names, (share / share.sum()).tolist(), strict=True))
+            likely, date = names[int(share.argmax())], first + int(mass.argmax())
+            prob = float(min(mass.sum(), 1.0))
+            events.append(Event("change", date, first + low, first + high, max(a, date), prob, likely, shares))
     return events
 
 
@@ -109,17 +116,20 @@ def densest(mass: Array) -> tuple[int, int]:
     return int(kept.min()), int(kept.max())
 
 
-def faults_of(told: Hypotheses, threshold: float) -> list[Event]:
+def faults_of(told: Told, threshold: float) -> list[Event]:
     """Stretches at which the sensor was likely not nominal."""
-    Hm, events = told.sensors, []
-    by_sensor = np.nan_to_num(told.latest).reshape(len(told.latest), -1, Hm).sum(axis=1)
-    W = told.lag_prob.shape[1]
+    Hm, T, events = len(told.sensor_names), len(told.latest), []
+    by_sensor = np.nan_to_num(told.latest).reshape(T, -1, Hm).sum(axis=1)
     for j in range(1, Hm):
         for a, b in runs(by_sensor[:, j] > threshold):
-            name = told.tracker.all_sensors[j].name
-            p = float(by_sensor[a:b, j].max())
-            events.append(Event("sensor", a, a, b - 1, min(a + W - 1, len(by_sensor) - 1), p, name))
+            p, known = float(by_sensor[a:b, j].max()), min(a + told.W - 1, T - 1)
+            events.append(Event("sensor", a, a, b - 1, known, p, told.sensor_names[j]))
     return events
+
+
+def all_of(told: Told, threshold: float) -> list[Event]:
+    """Changes and faults in order of time."""
+    return sorted(changes_of(told, threshold) + faults_of(told, threshold), key=lambda event: event.date)
 
 
 def runs(on: Array) -> list[tuple[int, int]]:

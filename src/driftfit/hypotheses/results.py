@@ -11,15 +11,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from driftfit.hypotheses.events import Event, changes_of, faults_of
+from driftfit.hypotheses.events import Event, Told, all_of
 from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.live import Live
     from driftfit.result import Track
     from driftfit.trackers.bank import Bank
+
+
+SINGLE = ("evidence", "window", "kept", "leaves")
 
 
 class Mixture(NamedTuple):
@@ -100,7 +104,7 @@ class Hypotheses:
     def lag_prob(self) -> Array:
         p = self._told("lag_prob").copy()
         p[p.sum(axis=2) < 0.5] = np.nan
-        return p
+        return np.asarray(p)
 
     def prob(self, lag: int = 0) -> Array:
         """(T, H): probabilities of the events at the samples themselves, seen from ``lag`` floors later.
@@ -122,7 +126,7 @@ class Hypotheses:
     @property
     def change_prob(self) -> Array:
         """(T,): probability of a change at each sample, from as many later samples as the bank remembers."""
-        return 1.0 - self.latest[:, : self.sensors].sum(axis=1)
+        return np.asarray(1.0 - self.latest[:, : self.sensors].sum(axis=1))
 
     @cached_property
     def latest(self) -> Array:
@@ -179,8 +183,9 @@ class Hypotheses:
 
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, in order of time."""
-        found = changes_of(self, threshold) + faults_of(self, threshold)
-        return sorted(found, key=lambda event: event.date)
+        bank = self.tracker
+        told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
+        return all_of(told, threshold)
 
     def table(self, threshold: float = 0.5) -> Any:
         """`events` as a polars table."""
@@ -191,9 +196,9 @@ class Hypotheses:
     def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:
         """Alarm while the window probability exceeds a threshold.
 
-        Give the threshold, or the rate of false alarms per sample that is allowed. With ``reference``, a run of the same
-        bank over a record without changes, the threshold is the least that alarms there no more often; without one it
-        is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
+        Give the threshold, or the rate of false alarms per sample that is allowed. With ``reference``, a run of the
+        same bank over a record without changes, the threshold is the least that alarms there no more often; without
+        one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
         """
         if (threshold is None) == (rate is None):
             raise ValueError("alarm: give threshold= or rate= (false alarms per sample), one of them.")
@@ -222,6 +227,50 @@ class Hypotheses:
         from driftfit.hypotheses.pictures import plot_hypotheses
 
         return plot_hypotheses(self, threshold, level)
+
+
+class LiveHypotheses:
+    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
+
+    ``lag_prob`` (W, H), ``window``, ``evidence``, ``leaves`` and ``kept`` are those of `Hypotheses` after the last
+    sample.
+    """
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self.tracker: Bank = live.tracker  # type: ignore[assignment]
+        self._lane = live.lane()
+        self.names = self.tracker.event_names
+        told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
+        self.lag_prob: Array = told["lag_prob"].copy()
+        self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
+
+    def mixture(self) -> Mixture:
+        """The leaves now: what control works with."""
+        return mixture_of(self.tracker, self._live, self._lane)
+
+    def events(self, threshold: float = 0.5) -> list[Event]:
+        """Events that were decided since this was asked last: all that can be known of them is known.
+
+        A stream remembers the last 256 samples, so ask more often than that.
+        """
+        from driftfit.hypotheses.advance import CLOCK, REPORTED_TO
+
+        many, bank = self._lane["many"], self.tracker
+        ring = bank.array(self._live.model, self._lane, "ring")
+        now, W = int(many[CLOCK]), len(self.lag_prob)
+        at = np.arange(max(0, now - len(ring)), now)
+        rows = ring[at % len(ring)]
+        first = int(at[0]) - W + 1 if len(at) else 0
+        window = np.r_[np.zeros(W - 1), rows[:, 0]]
+        latest = np.vstack([rows[:, 1:], np.zeros((W - 1, rows.shape[1] - 1))])
+        told = Told(latest, window, W, bank.change_names, bank.sensor_names)
+        found = [event.moved(first) for event in all_of(told, threshold)]
+        busy = window[-1] > threshold
+        done = [event for event in found if many[REPORTED_TO] <= event.date and event.last < now - W + 1 and not busy]
+        if not busy:
+            many[REPORTED_TO] = max(now - W + 1, many[REPORTED_TO])
+        return done
 
 
 def onsets(on: Array) -> Array:

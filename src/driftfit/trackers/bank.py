@@ -50,6 +50,8 @@ from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
 
+RING = 256
+"""Samples of which a stream remembers probabilities, for events."""
 TOLD = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report."""
 
@@ -115,9 +117,9 @@ class Bank(Tracker):
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
         self._shape, self._events  # noqa: B018  (both refuse what does not fit)
-        self._reduction.losses(self._count)
+        self.reduction.losses(self._count)
         kinds = {other.kind for other in others}
-        reduce = self._reduction
+        reduce = self.reduction
         if isinstance(reduce, Decide) and reduce.deepest == 1 and kinds & {"outlier", "additive"} and not reduce.force:
             raise ValueError(
                 "Bank: Decide(1) with outliers always prefers the outlier and never adapts; use Decide(2) or deeper, "
@@ -142,7 +144,8 @@ class Bank(Tracker):
         return self.sensors or (Sensor.nominal(),)
 
     @property
-    def _reduction(self) -> Reduction:
+    def reduction(self) -> Reduction:
+        """How histories are kept few, also where none was given."""
         return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
 
     @property
@@ -151,7 +154,7 @@ class Bank(Tracker):
 
     @property
     def _shape(self) -> Shape:
-        return self._reduction.shape(len(self.all_changes), len(self.all_sensors))
+        return self.reduction.shape(len(self.all_changes), len(self.all_sensors))
 
     @property
     def _events(self) -> tuple[Array, Array]:
@@ -167,6 +170,11 @@ class Bank(Tracker):
         """Names of the changes."""
         named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
         return tuple(named)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensor hypotheses."""
+        return tuple(sensor.name for sensor in self.all_sensors)
 
     @property
     def event_names(self) -> tuple[str, ...]:
@@ -252,9 +260,9 @@ class Bank(Tracker):
             "factors": np.ones(Hd), "theta0": theta0,
             "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self.all_changes]),
             "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
-            "loss": self._reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
+            "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
             "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-            "root": np.zeros((rows, 1)), "Qt": np.zeros((Hd, tri)),
+            "root": np.zeros((rows, 1)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
             "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters else 1, 3 + n)),
             "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
         }  # fmt: skip
