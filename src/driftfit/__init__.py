@@ -11,6 +11,7 @@ from driftfit.result import Track
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
+from driftfit.trackers.bank import Bank
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
@@ -23,6 +24,7 @@ __all__ = [
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
+    "Bank",
     "Fleet",
     "Kalman",
     "Live",

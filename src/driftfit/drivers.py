@@ -83,6 +83,11 @@ def nothing_more(o: State, s: State, l: int) -> None:
     """Store nothing beside the common fields."""
 
 
+@kernel
+def nothing_told(s: State, known: Array, t: int, l: int) -> None:
+    """Take nothing from further columns of what is known."""
+
+
 class TrackerSteps(NamedTuple):
     """What a tracker compiles.
 
@@ -90,7 +95,8 @@ class TrackerSteps(NamedTuple):
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
     ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.rank < n``, for trackers that
     start from no knowledge at all. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
-    name from the record ``s`` to the stored record ``o``.
+    name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a
+    sample beside interval, noise and drift from the columns of ``known`` after the third, where there are some.
     """
 
     predict: Step
@@ -98,6 +104,7 @@ class TrackerSteps(NamedTuple):
     report: Step = diagonal
     begin: Step | None = None
     store: Any = nothing_more
+    told: Any = nothing_told
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -185,7 +192,7 @@ class Drivers(NamedTuple):
 
 def _advance(tracker: TrackerSteps) -> Any:
     """predict, correct, report for all lanes of a tile; lanes that still know nothing take ``begin`` instead."""
-    predict, correct, report, begin, _ = tracker
+    predict, correct, report, begin, *_ = tracker
 
     @kernel
     def advance(s: State) -> None:
@@ -228,11 +235,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample, and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one sample of a tile of one lane with
-    u (m,), ``update_one`` the same for a single float u; both take what is known from the fields ``interval``,
-    ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
+    every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
+    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u; both take what is known from
+    the fields ``interval``, ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
     """
     regress, push = model
+    told = tracker.told
     store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
     advance = _advance(tracker)
 
@@ -263,6 +271,9 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 s.dt[l] = known[t * changing, 0, l]
                 s.noise[l] = known[t * changing, 1, l]
                 s.drift[l] = known[t * changing, 2, l]
+            if known.shape[1] > 3:
+                for l in range(L):
+                    told(s, known, t, l)
             if given:
                 for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
                     for l in range(L):
@@ -315,7 +326,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
 def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:
     m, L = tile["u"].shape[1:]
-    wanted = (T, L), (T, m if u.shape[1:2] != (0,) else 0, L), (1 if len(known) == 1 else T, 3, L)
+    wanted = (T, L), (T, m if u.shape[1:2] != (0,) else 0, L), (1 if len(known) == 1 else T, max(3, known.shape[1]), L)
     given = y.shape, u.shape, known.shape
     if given != wanted:
         raise ValueError(f"run: y, u and known have shapes {given}, but this tile and {T} samples need {wanted}.")

@@ -21,8 +21,11 @@ from typing import Any
 import numba
 import numpy as np
 import numpy.typing as npt
-from numba import njit, types
-from numba.core.dispatcher import Dispatcher
+from llvmlite.binding import add_symbol
+from numba import carray, njit, types
+from numba.core import cgutils
+from numba.core.datamodel import models, register_default
+from numba.extending import intrinsic
 
 Array = npt.NDArray[Any]
 State = Any
@@ -64,11 +67,13 @@ def _code(code: CodeType) -> str:
 def _identity_of(value: Any, function: FunctionType, name: str) -> str:
     if isinstance(value, tuple):
         return f"({', '.join(_identity_of(v, function, name) for v in value)})"
+    if value is carray:
+        return "carray"
     if value is np or value is math:  # what hangs on any other module may be edited unseen
         return str(value.__name__)
     if isinstance(value, bool | int | float | str | type(None) | np.generic):
         return repr(value)
-    if isinstance(value, Dispatcher) and hasattr(value, "identity"):
+    if hasattr(value, "identity"):
         return str(value.identity)
     raise TypeError(
         f"the kernel {function.__qualname__} uses {name!r}, a {type(value).__name__}; a kernel may use numpy, math, "
@@ -102,6 +107,66 @@ def shared(function: Callable[..., Any]) -> Any:
     """
     assert isinstance(function, FunctionType)
     return _identified(njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True, cache=True)(function))
+
+
+def core(function: Callable[..., Any]) -> Any:
+    """Compile a part of a machine that works on plain arrays with run-time bounds, once for all sizes.
+
+    As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
+    and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
+    """
+    assert isinstance(function, FunctionType)
+    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    return _identified(njit(cache=True, _nrt=False, **options)(function))
+
+
+class Outside(types.ExternalFunction):
+    """A machine that steps call by its symbol, with the address of a table: compiled once for all drivers.
+
+    What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
+    compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
+    """
+
+    identity: str
+
+    def load(self) -> None:
+        """Compile the machine, or find it on disk, and let drivers find it."""
+        if self.symbol not in _LOADED:
+            dispatcher = _OUTSIDE[self.symbol]
+            dispatcher.compile((types.intp,))
+            done = next(iter(dispatcher.overloads.values()))
+            _LOADED[self.symbol] = done.library  # which owns the code
+            address = done.library.get_pointer_to_function(done.fndesc.llvm_cfunc_wrapper_name)
+            add_symbol(self.symbol, address)
+
+
+register_default(Outside)(models.OpaqueModel)
+_OUTSIDE: dict[str, Any] = {}
+_LOADED: dict[str, Any] = {}
+
+
+def outside(function: Callable[..., Any]) -> Outside:
+    """Make a machine of a function of one address."""
+    assert isinstance(function, FunctionType)
+    dispatcher = _identified(njit(error_model="numpy", nogil=True, cache=True)(function))
+    symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
+    machine = Outside(symbol, types.void(types.intp))
+    machine.identity = dispatcher.identity
+    _OUTSIDE[symbol] = dispatcher
+    return machine
+
+
+@intrinsic
+def _pointer(context: Any, address: Any) -> Any:
+    """An address as a pointer."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.intp), build
+
+
+_pointer.identity = "pointer"
 
 
 def routine(function: Callable[..., Any]) -> Any:
@@ -149,6 +214,18 @@ class Driver:
         name = hashlib.sha256(f"{self._identity}{arguments}".encode()).hexdigest()[:16]
         twin.__qualname__ = f"{source.__name__}_{name}"
         return njit(arguments, error_model="numpy", nogil=True, cache=True)(twin)
+
+
+@kernel
+def floats(address: int, rows: int, columns: int) -> Any:
+    """The array (rows, columns) of floats that begins at an address."""
+    return carray(_pointer(address), (rows, columns), np.float64)
+
+
+@kernel
+def wholes(address: int, rows: int, columns: int) -> Any:
+    """The array (rows, columns) of whole numbers that begins at an address."""
+    return carray(_pointer(address), (rows, columns), np.int64)
 
 
 @kernel

@@ -21,6 +21,7 @@ from driftfit.warm import End, Run, carried, fresh_tile
 
 if TYPE_CHECKING:
     from driftfit.blocks.paths import Groups
+    from driftfit.hypotheses.results import LiveHypotheses
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
@@ -83,14 +84,25 @@ class Live:
         self._update = compiled.update.entry(kind, f8, INPUTS)
         self._update_one = compiled.update_one.entry(kind, f8, f8) if self._m == 1 else None
 
-    def update(self, y: float | None, u: Any = None, time: Any = None, weight: float = 1.0, drift: float = 1.0) -> Step:
+    def update(
+        self,
+        y: float | None,
+        u: Any = None,
+        time: Any = None,
+        weight: float = 1.0,
+        drift: Any = 1.0,
+        prob: Any = None,
+    ) -> Step:
         """Take one sample in and return (y_hat, e, s, ok).
 
         ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
         otherwise. With ``time``, the interval since the last sample scales the drift; a time that is not after the last
         is counted in ``ignored`` and leaves the state alone. ``weight`` divides the noise variance of this sample (0:
-        do not use it), ``drift`` multiplies the drift before it.
+        do not use it), ``drift`` multiplies the drift before it. A `Bank` also takes ``prob``, prior probabilities of
+        its changes or joint events at this sample, and a ``drift`` for each change.
         """
+        if prob is not None or type(drift) is not float:
+            return self._update_told(y, u, time, weight, drift, prob)
         if time is not None or weight != 1.0 or drift != 1.0 or self._window is not None:
             return self._update_known(y, u, time, weight, drift)
         if not isinstance(y, float):
@@ -101,6 +113,16 @@ class Live:
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
         return self._update(self._tile, y, u)  # type: ignore[no-any-return]
+
+    def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+        """One sample of which more is known than interval, noise and drift."""
+        each = np.ndim(drift) == 1
+        if each or prob is not None:
+            self.tracker.tell(self.lane(), prob, drift if each else None)
+        step = self._update_known(y, u, time, weight, 1.0 if each else float(drift))
+        if each or prob is not None:
+            self.tracker.tell(self.lane(), None, None)
+        return step
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
         interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
@@ -182,7 +204,7 @@ class Live:
         if p is not None:
             moved = np.zeros(len(self.names))
             moved[chosen] = vector("Live.reset", "p", numbers("Live.reset", "p", p, low=0.0), count)
-            self.tracker.widen(self._lane(), moved)
+            self.tracker.widen(self.lane(), moved)
         if theta is not None:
             values = vector("Live.reset", "theta", numbers("Live.reset", "theta", theta), count)
             self._tile["theta"][0, chosen, 0] = values
@@ -198,13 +220,13 @@ class Live:
             chosen.append(one if isinstance(one, int) else self.names.index(one))
         return chosen
 
-    def _lane(self) -> dict[str, Array]:
+    def lane(self) -> dict[str, Array]:
         """The fields of the record, as views."""
         return {name: self._tile[name][0, ..., :1][..., 0] for name in fields(self._tile)}
 
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
-        state = {name: np.array(value) for name, value in self._lane().items()}
+        state = {name: np.array(value) for name, value in self.lane().items()}
         return End(self.model, self.tracker, state, self._last)
 
     def _inputs(self, u: Any) -> Array:
@@ -233,7 +255,16 @@ class Live:
     @property
     def cov(self) -> Array:
         """Covariance of theta, (n, n)."""
-        return self.tracker.cov(self._lane())
+        return self.tracker.cov(self.lane())
+
+    @property
+    def hypotheses(self) -> LiveHypotheses:
+        """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
+        if "report" not in self.tracker.outputs:
+            raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
+        from driftfit.hypotheses.results import LiveHypotheses
+
+        return LiveHypotheses(self)
 
     def blocks(self, method: str = "svd-joint") -> Groups:
         """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, but for "gls"."""
@@ -247,7 +278,7 @@ class Live:
     @property
     def learning(self) -> Array:
         """Which parameters are being learned now, (n,) bool: False where the recent inputs were too dull to tell."""
-        return self.tracker.learning(self._lane())
+        return self.tracker.learning(self.lane())
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from driftfit.blocks.paths import Blocks
     from driftfit.forecast import Forecast
+    from driftfit.hypotheses.results import Hypotheses
     from driftfit.smoothers.smoothed import Smoothed
     from driftfit.summary import Summary
 
@@ -175,12 +176,26 @@ class Track(Judged):
         t %= T
         if "P" in _names(self._out):
             return np.array(self._written("P")[t])
+        return self.tracker.cov(self.lane(t))
+
+    def lane(self, t: int) -> dict[str, Array]:
+        """The state after sample t, field by field; replays the record up to t, O(t)."""
+        t %= len(self)
         tile = self._fresh_tile()
         out = np.empty(t + 1, output_type(tile, self.tracker.outputs))
         known = self._known if len(self._known) == 1 else self._known[: t + 1]
         run = drivers(self.model.steps, self.tracker.steps_for(self.model)).run
         run(tile, self.y[: t + 1, None], self.u[: t + 1, :, None], known[:, :, None], out)
-        return self.tracker.cov({name: tile[name][0, ..., 0] for name in storage.fields(tile)})
+        return {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
+        if "report" not in self.tracker.outputs:
+            raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
+        from driftfit.hypotheses.results import Hypotheses
+
+        return Hypotheses(self)
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.

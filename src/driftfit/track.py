@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast, overload
 
 import numpy as np
@@ -43,6 +44,7 @@ def track(
     units: Mapping[str, str] | None = None,
     keep: str = "std",
     warm_start: Run | None = None,
+    prob: Any = None,
 ) -> Track: ...
 
 
@@ -80,6 +82,7 @@ def track(
     units: Mapping[str, str] | None = None,
     keep: str = "std",
     warm_start: Any = None,
+    prob: Any = None,
 ) -> Track | Fleet:
     """Follow the parameters of a model through a record, or through many.
 
@@ -110,13 +113,16 @@ def track(
     weights : number or (T,)
         The noise variance of a sample is r / weight; 0 marks a sample that is not to be used.
     drift : number or (T,)
-        Known factors of the drift before each sample, such as 100 where a set-point was changed.
+        Known factors of the drift before each sample, such as 100 where a set-point was changed. For a `Bank` also
+        (T, changes): a factor for each change.
     units : mapping from names of columns to their units, such as {"flow": "l/min"}
         Carried to summary, plots and exports.
     keep : "std" or "cov"
         "cov" also stores the covariance of every sample, n * n numbers each.
     warm_start : Track, Live, Fleet or None
         Begin where that run ended, a fleet series by series (those that it does not have begin afresh).
+    prob : (T, changes), (T, joint events) or None
+        For a `Bank`: prior probabilities at every sample, NaN in the rows where its own hold.
 
     Returns
     -------
@@ -133,11 +139,18 @@ def track(
         other = (data, by, units, warm_start)
         return cast("Track", _several_outputs(model, tracker, y, u, time, dt, weights, drift, keep, other))
     one_of("track", "keep", keep, ("std", "cov"))
-    records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
+    each = data is None and np.ndim(drift) == 2 and by is None
+    records, failed = _records(y, u, data, time, by, dt, weights, 1.0 if each else drift, units)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
     if by is None and isinstance(tracker, Tracker):
+        if each or prob is not None:
+            T = len(records.y)
+            columns = tracker.beside(T, prob, drift if each else None)
+            records = replace(records, known=np.hstack([np.broadcast_to(records.known, (T, 3)), columns]))
         return _one(bound, _checked(tracker, keep), records, keep, warm_start, dt)
+    if each or prob is not None:
+        raise ValueError("track: prob= and a drift for each change are for one series and one tracker.")
     if by is None and not isinstance(tracker, Tracker):
         names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
         records = records.repeated(names)

@@ -166,6 +166,11 @@ class ARX(Model):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
 
+    @property
+    def output_lags(self) -> int:
+        """How many entries of phi, from its first, are past outputs: a bank of hypotheses cleans them leaf by leaf."""
+        return self.na
+
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of 1 / A(z) to an impulse, (h,)."""
         A, _ = self.polynomials(theta)

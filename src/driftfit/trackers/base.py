@@ -85,6 +85,14 @@ class Tracker(Settings, ABC):
             "track with FLS or Kalman."
         )
 
+    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+        """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
+        raise ValueError(f"{type(self).__name__} has no hypotheses: prob= and a drift for each change are for a Bank.")
+
+    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
+        """What is known of the next sample of a stream; None is what holds otherwise."""
+        self.beside(1, prob, drift)
+
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         """Add variances p (n,), in squared units of theta, to the covariance in the fields of one lane.
 

@@ -1,4 +1,4 @@
-"""Recursive least squares with exponential forgetting.
+"""Recursive least squares with exponential or directional forgetting.
 
     predict   P <- P / lambda_e,   lambda_e = min(1, max(lambda^dt, tr P / c_max))
     correct   e = y - phi' theta;  s = phi' P phi + 1;  K = P phi / s
@@ -11,8 +11,17 @@ Use it when all parameters drift alike and nothing is known of noise and drift. 
 forgetting would blow P up; it stops at ``c_max`` times the trace that P had when the regressors first had full rank
 (before that: when they last showed a new direction).
 
+Directional forgetting (kind="directional") forgets only what a sample brings news of, after it was taken in:
+
+    g = P phi;  P <- P + (1/lambda - 1) g g' / (phi' g)
+
+phi' P phi is then 1/lambda times what least squares would leave, the marginal of every other combination stays, and
+nothing winds up: without excitation nothing is forgotten, so it has no cap. It acts at usable samples only. With one
+parameter the two are the same.
+
 Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting belongs
-to time (dt, and also when y is missing); the cap; an exact diffuse start. Cost per sample: O(n^2).
+to time (dt, and also when y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
+Kulhavy and Karny (1984). Cost per sample: O(n^2).
 """
 
 from __future__ import annotations
@@ -24,8 +33,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import State, exp, kernel
-from driftfit.settings import covariance, matrix, numbers, vector
+from driftfit.kernel import State, exp, kernel, nothing
+from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
 
@@ -107,9 +116,39 @@ def begin(s: State, l: int) -> None:
         s.per_cap[l] = 1.0 / (s.c_max[l] * trace(s, l))
 
 
+@kernel
+def forget_direction(s: State, l: int) -> None:
+    """After `measurement`: s.g is still P phi before the sample, s.s its innovation variance."""
+    h = s.s[l] - s.r[l] * s.noise[l]
+    gain = s.ok[l] * (1.0 / s.forgetting[l] - 1.0) / (s.s[l] * h) if h > 0.0 and s.ok[l] > 0.0 else 0.0
+    gain *= s.r[l] * s.noise[l] if s.ok[l] > 0.0 else 0.0
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
+
+
+@kernel
+def correct_direction(s: State, l: int) -> None:
+    measurement(s, l)
+    forget_direction(s, l)
+    learn_scale(s, l)
+
+
+@kernel
+def begin_direction(s: State, l: int) -> None:
+    enter(s, l)
+    if s.s[l] < np.inf:
+        learn_scale(s, l)
+    spanned_variance(s, l)
+
+
+EXPONENTIAL = TrackerSteps(forget, correct, diagonal, begin)
+DIRECTIONAL = TrackerSteps(nothing, correct_direction, diagonal, begin_direction)
+
+
 @dataclass(frozen=True)
 class RLS(Tracker):
-    """Recursive least squares with exponential forgetting.
+    """Recursive least squares with exponential or directional forgetting.
 
     Parameters
     ----------
@@ -120,7 +159,9 @@ class RLS(Tracker):
     theta0 : number or (n,)
         Mean of theta before the first sample.
     c_max : number
-        Cap of the growth of P, as a multiple of its trace at the start.
+        Cap of the growth of P, as a multiple of its trace at the start (exponential forgetting).
+    kind : "exponential" or "directional"
+        What is forgotten: all directions alike, or only those that the regressors excite.
 
     Raises
     ------
@@ -132,6 +173,7 @@ class RLS(Tracker):
     p0: Any = None
     theta0: Any = 0.0
     c_max: float = 1e8
+    kind: str = "exponential"
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
 
@@ -143,6 +185,7 @@ class RLS(Tracker):
         if self.p0 is not None:
             self._set("p0", covariance("RLS", "p0", self.p0))
         self._set("theta0", numbers("RLS", "theta0", self.theta0))
+        one_of("RLS", "kind", self.kind, ("exponential", "directional"))
         self._set("c_max", numbers("RLS", "c_max", self.c_max, ndim=0, low=1.0))
 
     def state(self, n: int) -> Mapping[str, Any]:
@@ -166,4 +209,4 @@ class RLS(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(forget, correct, diagonal, begin)
+        return EXPONENTIAL if self.kind == "exponential" else DIRECTIONAL

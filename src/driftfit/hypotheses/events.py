@@ -1,0 +1,138 @@
+"""Events: what the probabilities of a run add up to, dated and with what is plausible beside the date.
+
+The mass of one jump splits between neighbouring samples, so an event is a cluster of them: while the probability of a
+change in the window is above the threshold, samples with a share in it belong together. Its date is the likeliest of
+them, its interval the fewest that hold nine tenths of the mass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.kernel import Array
+
+FAINT = 0.02
+"""Probability below which a sample does not count to a cluster."""
+MASS = 0.9
+"""Share of the mass that the interval of a date holds."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """One change or sensor fault.
+
+    Attributes
+    ----------
+    date, first, last : int
+        Sample that it is first visible in, and the first and last plausible one (of a fault: of its duration).
+    known : int
+        The sample after which it was known at this threshold.
+    prob : float
+        Probability that it happened.
+    name : str
+        The likeliest change, or the sensor fault.
+    names : mapping from names of changes to their share
+    shift, std : mapping from parameters to how far they moved and its standard error (changes only)
+        From the smoothed path given the events: conditional on them.
+    """
+
+    kind: str
+    date: int
+    first: int
+    last: int
+    known: int
+    prob: float
+    name: str
+    names: dict[str, float] = field(default_factory=dict)
+    shift: dict[str, float] = field(default_factory=dict)
+    std: dict[str, float] = field(default_factory=dict)
+
+    def moved(self, by: int) -> Event:
+        """The same, counted from another sample."""
+        times = {name: getattr(self, name) + by for name in ("date", "first", "last", "known")}
+        return replace(self, **times)
+
+    def row(self) -> dict[str, Any]:
+        """For a table."""
+        moved = ", ".join(
+            f"{name} {shift:+.3g} ({self.std[name]:.2g})"
+            for name, shift in self.shift.items()
+            if abs(shift) > 2.0 * self.std[name]
+        )
+        return {
+            "kind": self.kind, "date": self.date, "first": self.first, "last": self.last, "known": self.known,
+            "prob": self.prob, "name": self.name, "moved": moved,
+        }  # fmt: skip
+
+
+class Told(NamedTuple):
+    """What events are made of."""
+
+    latest: Array
+    """(T, H): probabilities of the joint events of each sample, from as late as the bank remembers."""
+    window: Array
+    """(T,): probability, at each sample, of a change in the newest W floors."""
+    W: int
+    change_names: tuple[str, ...]
+    sensor_names: tuple[str, ...]
+
+
+def changes_of(told: Told, threshold: float) -> list[Event]:
+    """Clusters of samples at which theta may have jumped."""
+    Hm, latest = len(told.sensor_names), np.nan_to_num(told.latest)
+    by_change = latest.reshape(len(latest), -1, Hm).sum(axis=2)
+    p, names = by_change[:, 1:].sum(axis=1), told.change_names[1:]
+    events: list[Event] = []
+    for a, b in runs(told.window > threshold):
+        reach = slice(max(0, a - told.W + 1, events[-1].last + 1 if events else 0), b)
+        for first, end in clusters(p, reach, threshold):
+            mass, share = p[first:end], by_change[first:end, 1:].sum(axis=0)
+            low, high = densest(mass)
+            shares = dict(zip(names, (share / share.sum()).tolist(), strict=True))
+            likely, date = names[int(share.argmax())], first + int(mass.argmax())
+            prob = float(min(mass.sum(), 1.0))
+            events.append(Event("change", date, first + low, first + high, max(a, date), prob, likely, shares))
+    return events
+
+
+def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
+    """Groups of neighbouring samples with a share each; the whole where no group alone passes the threshold."""
+    part = p[reach]
+    found = [(reach.start + a, reach.start + b) for a, b in runs(part > FAINT) if part[a:b].sum() > threshold]
+    if found or not len(part) or part.sum() <= threshold:
+        return found
+    seen = np.flatnonzero(part > FAINT)
+    return [(reach.start + int(seen[0]), reach.start + int(seen[-1]) + 1)] if len(seen) else []
+
+
+def densest(mass: Array) -> tuple[int, int]:
+    """First and last of the fewest entries that hold `MASS` of all."""
+    order = np.argsort(-mass, kind="stable")
+    count = int(np.searchsorted(np.cumsum(mass[order]), MASS * mass.sum())) + 1
+    kept = order[:count]
+    return int(kept.min()), int(kept.max())
+
+
+def faults_of(told: Told, threshold: float) -> list[Event]:
+    """Stretches at which the sensor was likely not nominal."""
+    Hm, T, events = len(told.sensor_names), len(told.latest), []
+    by_sensor = np.nan_to_num(told.latest).reshape(T, -1, Hm).sum(axis=1)
+    for j in range(1, Hm):
+        for a, b in runs(by_sensor[:, j] > threshold):
+            p, known = float(by_sensor[a:b, j].max()), min(a + told.W - 1, T - 1)
+            events.append(Event("sensor", a, a, b - 1, known, p, told.sensor_names[j]))
+    return events
+
+
+def all_of(told: Told, threshold: float) -> list[Event]:
+    """Changes and faults in order of time."""
+    return sorted(changes_of(told, threshold) + faults_of(told, threshold), key=lambda event: event.date)
+
+
+def runs(on: Array) -> list[tuple[int, int]]:
+    """Stretches [a, b) over which a condition holds."""
+    edges = np.flatnonzero(np.diff(np.r_[False, on, False].astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,58 @@
+"""What the leaves expect of the next output, whether it comes or not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.hypotheses.leaves import total
+from driftfit.kernel import Array, core
+
+FACTOR, VALUE, FROZEN, WIDTH, CLEANS = range(5)
+"""Columns of the table of sensors."""
+
+
+@core
+def expect(
+    w: Array, L: int, y: Array, h: Array, factor: Array, prior: Array, sensors: Array, r: float, noise: float,
+    last: float, X: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """Mean and variance of the output under the mixture of leaves and sensors.
+
+    ``y`` and ``h`` are z'm and z'Cz of every leaf, ``factor`` what h is in units of. A sensor that may be frozen says
+    the last output, if there was one.
+    """
+    Hm = len(sensors)
+    Hd = len(prior) // Hm
+    mean, share = 0.0, X[0]
+    for j in range(Hm):
+        frozen = sensors[j, FROZEN] > 0.0
+        possible = not frozen or abs(last) < np.inf
+        for l in range(L):
+            share[l] = 0.0
+        if possible:
+            for c in range(Hd):
+                for l in range(L):
+                    share[l] += prior[c * Hm + j, l]
+        for l in range(L):
+            X[1 + j, l] = w[l] * share[l]
+        for l in range(L):
+            share[l] = X[1 + j, l] * (last if frozen and possible else y[l] + sensors[j, VALUE])
+        mean += total(share, L)
+    variance, mass = 0.0, 0.0
+    for j in range(Hm):
+        mass += total(X[1 + j], L)
+    mean = mean / mass if mass != 1.0 else mean
+    for j in range(Hm):
+        frozen = sensors[j, FROZEN] > 0.0 and abs(last) < np.inf
+        if frozen:
+            for l in range(L):
+                wide = sensors[j, WIDTH] if sensors[j, WIDTH] > 0.0 else -sensors[j, WIDTH] * r * factor[l]
+                share[l] = X[1 + j, l] * (wide + (last - mean) ** 2)
+        else:
+            for l in range(L):
+                scatter = y[l] + sensors[j, VALUE] - mean
+                share[l] = X[1 + j, l] * ((h[l] + sensors[j, FACTOR] * r * noise) * factor[l] + scatter * scatter)
+        variance += total(share, L)
+    if mass != 1.0:
+        variance /= mass
+    return mean, variance if noise < np.inf else np.inf

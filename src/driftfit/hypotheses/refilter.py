@@ -1,0 +1,81 @@
+"""First-floor approximation: the mixture over the oldest event becomes one density, and the tree is grown again.
+
+    C' = C + sum_i w_i Q_i,   w_i the prior p_i, or the posterior p(c_i | data)
+
+The components of the first floor share their mean, so with prior weights this is one Kalman filter with
+Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered again and so count twice; merging leaves
+(GPB) uses each once and is better. It is here to show that. One sensor, independent events.
+"""
+
+from __future__ import annotations
+
+from driftfit.hypotheses.grow import grow
+from driftfit.hypotheses.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise
+from driftfit.kernel import Array, core
+
+Y, NOISE, TIME = 0, 1, 2
+"""Columns of a stored sample before its regressor."""
+
+
+@core
+def refilter(
+    root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
+    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, theta0: Array, sensors: Array,
+    row: Array, bases: Array, parent: Array, event: Array, prior: Array, Qt: Array, X: Array,
+) -> int:  # fmt: skip
+    """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
+    H, n = len(row), len(theta0)
+    tri = n * (n + 1) // 2
+    weight = X[0]
+    top = float(H) ** (D - 1)
+    for e in range(H):
+        weight[e] = row[e] if by_prior else 0.0
+    if not by_prior:
+        for l in range(L):
+            weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
+    increments(Q, sizes, c, r, unknown, samples[0, TIME], factors, Qt)
+    for k in range(tri):
+        for e in range(H):
+            root[FIRST + n + k, 0] += weight[e] * Qt[e, k]
+    for e in range(H):
+        prior[e, 0] = 0.0
+    prior[0, 0] = 1.0
+    for e in range(H):
+        for k in range(tri):
+            Qt[e, k] = 0.0
+    root[LOG, 0] = 0.0
+    floor(root, 1, B, samples[0], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X)
+    for k in range(len(root)):
+        root[k, 0] = B[k, 0]
+        A[k, 0] = B[k, 0]
+    root[LOG, 0], A[LOG, 0], A[CODE, 0] = 0.0, 0.0, 0.0
+    L = 1
+    for at in range(1, D):
+        for e in range(H):
+            for l in range(L):
+                prior[e, l] = row[e]
+        increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
+        L = floor(
+            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X
+        )
+        normalise(B, L)
+        for k in range(len(root)):
+            for l in range(L):
+                A[k, l] = B[k, l]
+    for at in range(1, D):
+        for k in range(samples.shape[1]):
+            samples[at - 1, k] = samples[at, k]
+    return L
+
+
+@core
+def floor(
+    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, Q: Array,
+    maps: Array, theta0: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
+) -> int:  # fmt: skip
+    return int(
+        grow(
+            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, 0, Q, maps,
+            theta0, sensors, prior, False, bases, parent, event, X,
+        )
+    )  # fmt: skip

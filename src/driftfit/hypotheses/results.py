@@ -1,0 +1,294 @@
+"""What a bank of hypotheses tells beside parameters: probabilities, evidence, alarms, events, the mixture.
+
+Everything is causal unless it says otherwise: what stands in row t is what was known after sample t. Where events were
+decided, probabilities are conditional on the decisions.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.hypotheses.events import Event, Told, all_of
+from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S
+from driftfit.kernel import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.live import Live
+    from driftfit.result import Track
+    from driftfit.trackers.bank import Bank
+
+
+SINGLE = ("evidence", "window", "kept", "leaves")
+
+
+class Mixture(NamedTuple):
+    """The leaves after a sample: what control works with."""
+
+    weights: Array
+    """(L,), summing to 1."""
+    means: Array
+    """(L, n)"""
+    covs: Array
+    """(L, n, n)"""
+
+    @property
+    def mean(self) -> Array:
+        """sum w m, (n,)."""
+        return np.asarray(self.weights @ self.means)
+
+    @property
+    def cov(self) -> Array:
+        """sum w (C + d d'), (n, n)."""
+        away = self.means - self.mean
+        return np.asarray(np.einsum("l,lij->ij", self.weights, self.covs + away[:, :, None] * away[:, None, :]))
+
+
+class Alarm(NamedTuple):
+    """A window alarm: the threshold of the probability, and the samples at which it went on."""
+
+    threshold: float
+    at: Array
+    on: Array
+    """(T,) bool: whether the alarm is on."""
+
+
+class Decision(NamedTuple):
+    """An event that was decided."""
+
+    sample: int
+    """The first sample that it affects."""
+    decided: int
+    """The sample after which it was decided."""
+    event: int
+    """Joint event."""
+    prob: float
+    """Its probability then."""
+
+
+class Hypotheses:
+    """What a run of a `Bank` says of events; `Track.hypotheses` makes it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the joint events (change, sensor), H of them.
+    lag_prob : (T, W, H)
+        lag_prob[t, k] are the probabilities of the events k floors before t, given the data up to t; NaN before the
+        first event.
+    window : (T,)
+        Probability of at least one change in the newest W floors.
+    evidence : (T,)
+        Log density of each sample given those before it.
+    leaves : (T,)
+        Leaves after growth.
+    kept : (T,)
+        Weight of the leaves that went on from the sample before; what is missing to 1 was dropped.
+    """
+
+    def __init__(self, run: Track) -> None:
+        self.run = run
+        self.tracker: Bank = run.tracker  # type: ignore[assignment]
+        self._report = run._written("report")
+        self.names = self.tracker.event_names
+        self.sensors = len(self.tracker.all_sensors)
+
+    def _told(self, name: str) -> Array:
+        return self.tracker.told(self._report, name)
+
+    @cached_property
+    def lag_prob(self) -> Array:
+        p = self._told("lag_prob").copy()
+        p[p.sum(axis=2) < 0.5] = np.nan
+        return np.asarray(p)
+
+    def prob(self, lag: int = 0) -> Array:
+        """(T, H): probabilities of the events at the samples themselves, seen from ``lag`` floors later.
+
+        Row t is of the event first visible in sample t; NaN at the end, where the later samples are not there yet.
+        """
+        W = self.lag_prob.shape[1]
+        if not 0 <= lag < W:
+            raise ValueError(f"prob: lag must be 0 .. {W - 1} for this reduction; got {lag}.")
+        p = np.full((len(self.run), len(self.names)), np.nan)
+        p[: len(p) - lag] = self.lag_prob[lag:, lag]
+        return p
+
+    @property
+    def mode_prob(self) -> Array:
+        """(T, H): probabilities of the present event, `prob` at lag 0."""
+        return self.prob(0)
+
+    @property
+    def change_prob(self) -> Array:
+        """(T,): probability of a change at each sample, from as many later samples as the bank remembers."""
+        return np.asarray(1.0 - self.latest[:, : self.sensors].sum(axis=1))
+
+    @cached_property
+    def latest(self) -> Array:
+        """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
+        T, W, _ = self.lag_prob.shape
+        lag = np.minimum(W - 1, T - 1 - np.arange(T))
+        return np.asarray(self.lag_prob[np.arange(T) + lag, lag])
+
+    @property
+    def window(self) -> Array:
+        return self._told("window")
+
+    @property
+    def evidence(self) -> Array:
+        return self._told("evidence")
+
+    @property
+    def log_evidence(self) -> float:
+        """Their sum: the log density of the record, under the approximations made."""
+        return float(self.evidence.sum())
+
+    @property
+    def leaves(self) -> Array:
+        return self._told("leaves")
+
+    @property
+    def kept(self) -> Array:
+        return self._told("kept")
+
+    @property
+    def impossible(self) -> int:
+        """Samples that no leaf allowed; they were not used."""
+        from driftfit.hypotheses.advance import IMPOSSIBLE
+
+        return int(self.run._tile["many"][0, IMPOSSIBLE, self.run._lane])
+
+    @cached_property
+    def decisions(self) -> list[Decision]:
+        """Decided events, in order; empty for reductions that decide nothing."""
+        found = self._told("decided")
+        return [
+            Decision(int(t - found[t, k, 1]), int(t), int(found[t, k, 0]), float(found[t, k, 2]))
+            for t, k in zip(*np.nonzero(found[:, :, 0] >= 0.0), strict=True)
+        ]
+
+    def finish(self) -> list[Decision]:
+        """What would be decided of the events still held, in order, each on its own marginal."""
+        if not self.decisions:
+            return []
+        after = self.decisions[-1].sample + 1
+        T = len(self.run)
+        rows = self.latest[after:T]
+        return [Decision(after + k, T - 1, int(p.argmax()), float(p.max())) for k, p in enumerate(rows) if p[0] == p[0]]
+
+    def events(self, threshold: float = 0.5) -> list[Event]:
+        """Changes and sensor faults whose probability exceeds the threshold, in order of time."""
+        bank = self.tracker
+        told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
+        return all_of(told, threshold)
+
+    def table(self, threshold: float = 0.5) -> Any:
+        """`events` as a polars table."""
+        import polars as pl
+
+        return pl.DataFrame([event.row() for event in self.events(threshold)])
+
+    def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:
+        """Alarm while the window probability exceeds a threshold.
+
+        Give the threshold, or the rate of false alarms per sample that is allowed. With ``reference``, a run of the
+        same bank over a record without changes, the threshold is the least that alarms there no more often; without
+        one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
+        """
+        if (threshold is None) == (rate is None):
+            raise ValueError("alarm: give threshold= or rate= (false alarms per sample), one of them.")
+        if threshold is None:
+            assert rate is not None
+            threshold = self._threshold(rate, reference)
+        on = self.window > threshold
+        return Alarm(float(threshold), onsets(on), on)
+
+    def _threshold(self, rate: float, reference: Track | None) -> float:
+        window = self.window if reference is None else reference.hypotheses.window
+        for level in np.unique(np.r_[0.0, np.round(window, 4), 1.0]):
+            at = onsets(window > level)
+            false = len(at) if reference is not None else float(np.sum(1.0 - window[at]))
+            if false <= rate * len(window) and (reference is not None or level >= rate):
+                return float(level)
+        return 1.0
+
+    def mixture(self, t: int = -1) -> Mixture:
+        """The leaves after sample t; replays the record up to t."""
+        lane = self.run.lane(t)
+        return mixture_of(self.tracker, self.run, lane)
+
+    def plot(self, threshold: float = 0.5, level: float = 0.95) -> Figure:
+        """Parameters with bands, probabilities of events stacked under them, events marked."""
+        from driftfit.hypotheses.pictures import plot_hypotheses
+
+        return plot_hypotheses(self, threshold, level)
+
+
+class LiveHypotheses:
+    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
+
+    ``lag_prob`` (W, H), ``window``, ``evidence``, ``leaves`` and ``kept`` are those of `Hypotheses` after the last
+    sample.
+    """
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self.tracker: Bank = live.tracker  # type: ignore[assignment]
+        self._lane = live.lane()
+        self.names = self.tracker.event_names
+        told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
+        self.lag_prob: Array = told["lag_prob"].copy()
+        self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
+
+    def mixture(self) -> Mixture:
+        """The leaves now: what control works with."""
+        return mixture_of(self.tracker, self._live, self._lane)
+
+    def events(self, threshold: float = 0.5) -> list[Event]:
+        """Events that were decided since this was asked last: all that can be known of them is known.
+
+        A stream remembers the last 256 samples, so ask more often than that.
+        """
+        from driftfit.hypotheses.advance import CLOCK, REPORTED_TO
+
+        many, bank = self._lane["many"], self.tracker
+        ring = bank.array(self._live.model, self._lane, "ring")
+        now, W = int(many[CLOCK]), len(self.lag_prob)
+        at = np.arange(max(0, now - len(ring)), now)
+        rows = ring[at % len(ring)]
+        first = int(at[0]) - W + 1 if len(at) else 0
+        window = np.r_[np.zeros(W - 1), rows[:, 0]]
+        latest = np.vstack([rows[:, 1:], np.zeros((W - 1, rows.shape[1] - 1))])
+        told = Told(latest, window, W, bank.change_names, bank.sensor_names)
+        found = [event.moved(first) for event in all_of(told, threshold)]
+        busy = window[-1] > threshold
+        done = [event for event in found if many[REPORTED_TO] <= event.date and event.last < now - W + 1 and not busy]
+        if not busy:
+            many[REPORTED_TO] = max(now - W + 1, many[REPORTED_TO])
+        return done
+
+
+def onsets(on: Array) -> Array:
+    """Where a condition begins to hold."""
+    return np.flatnonzero(on & ~np.r_[False, on[:-1]])
+
+
+def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
+    """The leaves in the fields of one lane; before the bank has begun, its one filter."""
+    from driftfit.hypotheses.advance import LEAVES, SETTLED
+
+    n = len(lane["theta"])
+    if lane["many"][SETTLED] != 1:
+        return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None])
+    B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
+    covs = np.zeros((B.shape[1], n, n))
+    i, j = np.tril_indices(n)
+    covs[:, i, j] = covs[:, j, i] = B[FIRST + n : FIRST + n + len(i)].T
+    if lane["unknown"]:
+        covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
+    return Mixture(B[WEIGHT].copy(), B[FIRST : FIRST + n].T.copy(), covs)

@@ -1,0 +1,153 @@
+"""The steps of a bank in the lane form: one filter until it can begin, then the machine of `advance`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.drivers import TrackerSteps
+from driftfit.hypotheses.advance import (
+    ADDRESSES,
+    BASE,
+    FACTORS,
+    GIVEN,
+    IN_DT,
+    IN_NOISE,
+    IN_OK,
+    IN_SEEN,
+    IN_TIME,
+    IN_VALID,
+    IN_Y,
+    LEAST,
+    MANY,
+    NOW,
+    PHI,
+    PLACES,
+    READY,
+    REPORT,
+    S2,
+    SETTLED,
+    SQUARES,
+    THETA,
+    TIMES,
+    WAITING,
+    Y_HAT,
+    bank,
+)
+from driftfit.hypotheses.advance import C as AT_C
+from driftfit.hypotheses.advance import P as AT_P
+from driftfit.hypotheses.advance import R as NOISE
+from driftfit.hypotheses.grow import FLOOR
+from driftfit.kernel import Array, State, kernel, nothing
+from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.diffuse import enter, measurement, spanned_variance
+from driftfit.trackers.excitation import learn_scales
+
+
+@kernel
+def only_drift(s: State, l: int) -> None:
+    """The first change, for the one filter before the bank starts."""
+    time = s.dt[l] * s.drift[l]
+    keep = s.keep0[l] if time > 0.0 else 1.0
+    at = 0
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] = s.P[i, j, l] * keep + s.q0[at, l] * time
+            at += 1
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        s.P[i, i, l] += s.size0[i, l] * unit * time
+
+
+@kernel
+def point(s: State) -> None:
+    """Write where the arrays are into the table."""
+    s.table[BASE, 0, 0] = s.memory.ctypes.data
+    s.table[REPORT, 0, 0] = s.report.ctypes.data
+    s.table[PHI, 0, 0] = s.phi.ctypes.data
+    s.table[AT_C, 0, 0] = s.c.ctypes.data
+    s.table[THETA, 0, 0] = s.theta.ctypes.data
+    s.table[AT_P, 0, 0] = s.P.ctypes.data
+    s.table[MANY, 0, 0] = s.many.ctypes.data
+    s.table[NOW, 0, 0] = s.now.ctypes.data
+
+
+@kernel
+def run(s: State) -> None:
+    """The machine; addresses are no part of the state."""
+    point(s)
+    bank(s.table.ctypes.data)
+    for k in range(ADDRESSES):
+        s.table[PLACES + k, 0, 0] = 0
+
+
+@kernel
+def tell(s: State, l: int) -> None:
+    """What the machine is told of this sample."""
+    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
+    s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
+    s.now[IN_OK, l], s.now[IN_SEEN, l], s.now[IN_VALID, l] = s.ok[l], s.seen[l], s.valid[l]
+    s.now[NOISE, l], s.now[LEAST, l] = s.r[l], FLOOR * s.power[l] + 1e-300
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    if s.many[SETTLED, l] > 0:
+        tell(s, l)
+        run(s)
+        s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
+        learn_scales(s, l)
+    else:
+        only_drift(s, l)
+        measurement(s, l)
+        alone(s, l, s.unknown[l] > 0)
+
+
+@kernel
+def begin(s: State, l: int) -> None:
+    only_drift(s, l)
+    enter(s, l)
+    alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
+    spanned_variance(s, l)
+
+
+@kernel
+def alone(s: State, l: int, counts: bool) -> None:
+    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    learn_scales(s, l)
+    if counts:
+        learn_start(s, l)
+    tell(s, l)
+    s.now[Y_HAT, l] = s.y_hat[l]
+    s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
+    ready = s.rank[l] == s.theta.shape[0] and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
+    s.many[SETTLED, l] = READY if ready else WAITING
+    run(s)
+    if ready:
+        s.scale[l] = 1.0
+
+
+@kernel
+def report(s: State, l: int) -> None:
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
+
+
+@kernel
+def keep(o: State, s: State, l: int) -> None:
+    """Store what tells of events."""
+    for k in range(s.report.shape[0]):
+        o.report[k, l] = s.report[k, l]
+
+
+@kernel
+def told(s: State, known: Array, t: int, l: int) -> None:
+    """Priors of the joint events of this sample, then factors of the drift of every change."""
+    row = t if known.shape[0] > 1 else 0
+    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
+    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for e in range(H):
+        s.memory[given + e, l] = known[row, 3 + e, l]
+    for i in range(Hd):
+        s.memory[factors + i, l] = known[row, 3 + H + i, l]
+
+
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told)

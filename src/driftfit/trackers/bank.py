@@ -1,0 +1,355 @@
+"""A bank of hypotheses: Kalman filters along the histories of what may have happened, weighed by what they predict.
+
+    theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j), sensor j
+    p(history, event | data) proportional to N(y_t; phi' m, phi' C- phi + r_j) p(event | history) p(history | data)
+
+(a jump Markov linear system). Every history of events is a leaf with its own Gaussian; a reduction keeps their number
+bounded (`driftfit.hypotheses.reduction`). What is reported at t, the mixture over all leaves, is computed after the
+tree has grown by sample t and before it is reduced.
+
+Use it where parameters stand still and sometimes jump, or where the sensor may fail: jumps are seen by their fit, not
+by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper.
+Jumps show only through the regressors: no excitation, no detection.
+
+`Bank()` alone has no scale: see `driftfit.hypotheses.change`. With unknown noise variance (r of the nominal sensor left
+None) q and p0 are in units of it, unless a ``guess`` of it is given.
+
+A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
+Until the regressors have full rank (and, with unknown noise, four residuals are there) only the first change acts.
+
+Source: fixed-lag decisions and trees of hypotheses after the paper on Bayesian tracking of parameters with alternative
+developments; Bar-Shalom, Li and Kirubarajan (2001), chapter 11; Andersson (1985) for the beam. Departures: leaves are
+merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) a leaf update.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from driftfit.drivers import TrackerSteps
+from driftfit.hypotheses import advance as core
+from driftfit.hypotheses import change as changes_
+from driftfit.hypotheses import plan
+from driftfit.hypotheses import reduction as reductions
+from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.leaves import FIRST
+from driftfit.hypotheses.lookahead import NODES
+from driftfit.hypotheses.prior import events
+from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
+from driftfit.hypotheses.sensor import STUCK, Sensor
+from driftfit.hypotheses.steps import STEPS
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.settings import covariance, matrix, numbers, vector
+from driftfit.signals import as_numbers, factor
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.diffuse import knowing, knowing_nothing
+
+RING = 256
+"""Samples of which a stream remembers probabilities, for events."""
+TOLD = ("evidence", "window", "kept", "leaves")
+"""Entries of the head of a report."""
+
+
+@dataclass(frozen=True)
+class Bank(Tracker):
+    """Bank of hypotheses: parameters that may jump, sensors that may fail.
+
+    Parameters
+    ----------
+    changes : list of Change
+        What may happen to theta between samples; the first is the ordinary course. None: a small drift, and a rare
+        jump of any parameter, free of scale.
+    sensors : list of Sensor
+        What the sensor may do; the first must be nominal. None: nominal, with unknown noise variance.
+    transition : None, (H_d, H_d), (H, H), or a pair
+        Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
+        sensors). None: events are independent, with the probabilities that changes and sensors carry.
+    reduce : Reduction
+        How histories are kept few. None: Beam(9), or Hybrid(9) with more than one sensor.
+    theta0, p0
+        Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
+    initial : (H,) or None
+        Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+
+    Raises
+    ------
+    ValueError
+        If probabilities do not sum to 1, a matrix has the wrong shape or orientation, or the tree is too large.
+    """
+
+    changes: Any = None
+    sensors: Any = None
+    transition: Any = None
+    reduce: Any = None
+    theta0: Any = 0.0
+    p0: Any = None
+    initial: Any = None
+
+    width: ClassVar[int] = 1
+    outputs: ClassVar[tuple[str, ...]] = ("report",)
+
+    def __post_init__(self) -> None:
+        for name, kind, what in (("changes", Change, "a Change"), ("sensors", Sensor, "a Sensor")):
+            given = getattr(self, name)
+            if given is not None:
+                given = (given,) if isinstance(given, kind) else tuple(given)
+                if not given or not all(isinstance(one, kind) for one in given):
+                    raise ValueError(f"Bank: {name} must list at least one hypothesis, each {what}; got {given!r}.")
+                self._set(name, given)
+        if self.reduce is not None and not isinstance(self.reduce, Reduction):
+            raise ValueError(f"Bank: reduce must be a reduction such as Beam(9) or Decide(3); got {self.reduce!r}.")
+        if self.p0 is not None:
+            self._set("p0", covariance("Bank", "p0", self.p0))
+        self._set("theta0", numbers("Bank", "theta0", self.theta0))
+        for name in ("transition", "initial"):
+            value = getattr(self, name)
+            self._set(name, None if value is None else _tuples(value))
+        self._check()
+
+    def _check(self) -> None:
+        nominal, others = self.all_sensors[0], self.all_sensors[1:]
+        if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
+            raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
+        self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        self.reduction.losses(self._count)
+        kinds = {other.kind for other in others}
+        reduce = self.reduction
+        if isinstance(reduce, Decide) and reduce.deepest == 1 and kinds & {"outlier", "additive"} and not reduce.force:
+            raise ValueError(
+                "Bank: Decide(1) with outliers always prefers the outlier and never adapts; use Decide(2) or deeper, "
+                "Hybrid(9), or Decide(1, force=True)."
+            )
+        if "frozen" in kinds and self._alike:
+            import warnings
+
+            warnings.warn(
+                "Bank: a frozen sensor stays frozen for a while, but events are independent here; give transition=.",
+                stacklevel=4,
+            )
+
+    @property
+    def all_changes(self) -> tuple[Change, ...]:
+        """The changes, also those that `Bank()` supplies."""
+        return self.changes or changes_.usual()
+
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, likewise."""
+        return self.sensors or (Sensor.nominal(),)
+
+    @property
+    def reduction(self) -> Reduction:
+        """How histories are kept few, also where none was given."""
+        return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
+
+    @property
+    def _count(self) -> int:
+        return len(self.all_changes) * len(self.all_sensors)
+
+    @property
+    def _shape(self) -> Shape:
+        return self.reduction.shape(len(self.all_changes), len(self.all_sensors))
+
+    @property
+    def _events(self) -> tuple[Array, Array]:
+        return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
+
+    @property
+    def _alike(self) -> bool:
+        P = self._events[0]
+        return bool((P[0] == P).all())
+
+    @property
+    def change_names(self) -> tuple[str, ...]:
+        """Names of the changes."""
+        named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
+        return tuple(named)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensor hypotheses."""
+        return tuple(sensor.name for sensor in self.all_sensors)
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """Names of the joint events, in their order."""
+        if len(self.all_sensors) == 1:
+            return self.change_names
+        return tuple(f"{change}, {sensor.name}" for change in self.change_names for sensor in self.all_sensors)
+
+    def settings(self) -> dict[str, Any]:
+        plain = super().settings()
+        for name in ("changes", "sensors"):
+            plain[name] = None if plain[name] is None else tuple(one.settings() for one in plain[name])
+        if self.reduce is not None:
+            plain["reduce"] = {"kind": type(self.reduce).__name__, **self.reduce.settings()}
+        return plain
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any]) -> Self:
+        given = dict(settings)
+        for name, kind in (("changes", Change), ("sensors", Sensor)):
+            if given.get(name) is not None:
+                given[name] = tuple(kind.from_settings(one) for one in given[name])
+        if given.get("reduce") is not None:
+            reduce = dict(given["reduce"])
+            given["reduce"] = getattr(reductions, reduce.pop("kind")).from_settings(reduce)
+        return cls(**given)
+
+    def _sensor_table(self) -> Array:
+        rows = []
+        for one in self.all_sensors:
+            width = -STUCK if one.resolution is None else one.resolution**2 / (2.0 * np.pi)
+            rows.append(
+                [one.factor, one.value, float(one.kind == "frozen"), width, float(one.kind in ("additive", "frozen"))]
+            )
+        return np.array(rows)
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        return self._state(n, 0)
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        cleans = any(one.cleans for one in self.all_sensors)
+        return self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+
+    def _state(self, n: int, na: int) -> Mapping[str, Any]:
+        nominal = self.all_sensors[0]
+        guessed = nominal.r is None and nominal.guess is not None
+        unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
+        P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
+        theta0 = vector("Bank", "theta0", self.theta0, n)
+        now, many = np.zeros(core.SIZE), np.zeros(core.COUNT, int)
+        now[core.LAST], now[core.R] = np.nan, 1.0
+        now[core.FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
+        squares *= nominal.guess or 0.0
+        arrays = self._arrays(n, na, unit, theta0)
+        scale = 1.0 if nominal.r is not None else np.nan
+        if self.p0 is not None and (nominal.r is not None or guessed):
+            core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["root"], scale = arrays["B"][:, :1].copy(), 1.0
+        return {
+            "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
+            "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
+            "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
+            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            "q0": arrays["Q"][0], "size0": arrays["sizes"][0], "keep0": arrays["maps"][0, 0],
+            **packed(arrays, n, na, nominal.r is None, self._alike),
+        }  # fmt: skip
+
+    def _arrays(self, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+        """What `driftfit.hypotheses.advance` works on, before the first sample."""
+        shape, Hd, Hm, H = self._shape, len(self.all_changes), len(self.all_sensors), self._count
+        tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
+        chain, initial = self._events
+        rows, lower = FIRST + n + tri + na, np.tril_indices(n)
+        steps = [one.increments(n) for one in self.all_changes]
+        refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
+        return {
+            "A": np.zeros((rows, shape.parents)), "B": np.zeros((rows, K)), "T": np.zeros((W * (H + 1), K)),
+            "T2": np.zeros((W * (H + 1), K)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm), K)),
+            "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
+            "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
+            "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
+            "factors": np.ones(Hd), "theta0": theta0,
+            "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self.all_changes]),
+            "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
+            "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
+            "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
+            "root": np.zeros((rows, 1)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
+            "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters else 1, 3 + n)),
+            "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
+        }  # fmt: skip
+
+    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+        """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
+        if prob is not None:
+            columns[:, : Hd * Hm] = self._given(np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1])))
+        if drift is not None:
+            factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
+            if factors.size not in (Hd, T * Hd):
+                raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
+            columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
+        return columns
+
+    def _given(self, p: Array) -> Array:
+        """Priors of joint events from priors of joint events or of changes; rows of NaN stay."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        if p.shape[1] == Hd and Hm > 1:
+            sensors = self._events[1].reshape(Hd, Hm).sum(axis=0)
+            p = np.einsum("ti,j->tij", p, sensors).reshape(len(p), -1)
+        if p.shape[1] != Hd * Hm:
+            raise ValueError(
+                f"Bank: prob must have {Hd} columns (changes) or {Hd * Hm} (joint events); got {p.shape[1]}."
+            )
+        given = ~np.isnan(p).all(axis=1)
+        wrong = given & ~((p >= 0.0).all(axis=1) & (np.abs(p.sum(axis=1) - 1.0) < 1e-8))
+        if wrong.any():
+            t = int(np.argmax(wrong))
+            raise ValueError(f"Bank: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
+        return p
+
+    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
+        columns, Hd = self.beside(1, prob, drift)[0], len(self.all_changes)
+        for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
+            start = lane["table"][PACKED.index(name), 0] // 8
+            lane["memory"][start : start + len(values)] = values
+
+    def told(self, report: Array, name: str) -> Array:
+        """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
+        if name in TOLD:
+            return report[..., TOLD.index(name)]
+        shape = self._shape
+        lags = shape.floors * self._count
+        start, rows, columns = {"lag_prob": (HEAD, shape.floors, self._count), "decided": (HEAD + lags, shape.held, 3)}[
+            name
+        ]
+        return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
+
+    def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
+        """One of the packed arrays of a lane, as a view."""
+        start, rows, columns = self.state_for(model)["table"][PACKED.index(name)]
+        part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
+        return part.view(np.int64) if name in ("links", "group", "slots") else part
+
+    @property
+    def steps(self) -> TrackerSteps:
+        bank.load()
+        return STEPS
+
+
+def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool) -> dict[str, Any]:
+    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver."""
+    table = np.zeros((core.ROWS, 3), int)
+    flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
+    for k, name in enumerate(PACKED):
+        array = np.ascontiguousarray(arrays[name])
+        into = flat[name in REPORTED]
+        table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
+        into.append(array.ravel().view(np.float64))
+    table[core.THETA, 1] = n
+    table[core.FLAGS] = na, unknown, alike
+    memory, report = (np.concatenate(parts) for parts in flat)
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 64), "table": table}
+
+
+def _padded(x: Array, least: int) -> Array:
+    """With zeros up to one of few sizes."""
+    size = least
+    while size < len(x):
+        size *= 4
+    return np.concatenate([x, np.zeros(size - len(x))])
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, list | tuple | np.ndarray):
+        return tuple(_tuples(one) for one in value)
+    return None if value is None else float(value)

@@ -1,0 +1,195 @@
+"""The bank of hypotheses against a naive twin, against dense Gaussians, and against itself in other clothes."""
+
+from itertools import pairwise, product
+
+import naive_bank
+import numpy as np
+import pytest
+from support import same
+
+from driftfit import ARX, Bank, Kalman, Regression, track
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.hypotheses.sensor import Sensor
+
+N, R = 2, 0.09
+Q = np.array([1e-4 * np.eye(2), 0.6 * np.eye(2), np.diag([0.0, 1.5])])
+P3 = np.array([[0.97, 0.02, 0.01], [0.3, 0.6, 0.1], [0.2, 0.3, 0.5]])
+PROBS = np.array([0.97, 0.018, 0.012])
+
+
+def changes(probs=PROBS):
+    return [Change(q, prob=p) for q, p in zip(Q, probs, strict=True)]
+
+
+def record(T, seed=0, jumps=(20, 45), outliers=()):
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((T, N))
+    theta = np.array([1.0, -0.5])
+    y = np.empty(T)
+    for t in range(T):
+        theta = theta + rng.standard_normal(N) if t in jumps else theta
+        y[t] = u[t] @ theta + np.sqrt(R) * rng.standard_normal() * (8.0 if t in outliers else 1.0)
+    return y, u
+
+
+Y, U = record(70, outliers=(30, 60))
+SENSORS = [Sensor.nominal(R), Sensor.outlier(10.0, prob=0.05)]
+TABLE = [(R, 0.0, False), (100.0 * R, 0.0, False)]
+PRIORS = {
+    "independent": (None, np.tile(np.kron(PROBS, [0.95, 0.05]), (6, 1)), np.kron(PROBS, [0.95, 0.05])),
+    "Markov": ((P3, None), np.kron(P3, np.tile([0.95, 0.05], (2, 1))), None),
+}
+
+
+def told(run, name):
+    return run.tracker.told(run._written("report"), name)
+
+
+def state(run, name):
+    return run.tracker.array(run.model, {"memory": run._tile["memory"][0, :, 0]}, name)
+
+
+def compare(run, twin, y, u, atol=1e-10, lags=1):
+    total = 0.0
+    for t in range(len(y)):
+        total += twin.see(u[t], y[t])
+        np.testing.assert_allclose(run.theta[t], twin.mean, atol=atol)
+        np.testing.assert_allclose(told(run, "evidence")[: t + 1].sum(), total, atol=1e-8)
+        for k in range(min(lags, t + 1)):
+            np.testing.assert_allclose(told(run, "lag_prob")[t, k], twin.lag(k, len(twin.initial)), atol=atol)
+    np.testing.assert_allclose(run.cov(-1), twin.cov, atol=atol)
+
+
+@pytest.mark.parametrize("prior", list(PRIORS))
+@pytest.mark.parametrize(
+    ("reduce", "naive", "lags"),
+    [
+        (Beam(7), naive_bank.beam(7), 5),
+        (Decide(3), naive_bank.decide(3, 6), 3),
+        (GPB(2), naive_bank.gpb(2), 1),
+        (GPB(3), naive_bank.gpb(3), 2),
+    ],
+    ids=str,
+)
+def test_every_reduction_is_what_its_naive_twin_says(prior, reduce, naive, lags):
+    transition, P, initial = PRIORS[prior]
+    bank = Bank(changes(), SENSORS, transition, reduce, p0=2.0, initial=initial)
+    initial = bank._events[1]
+    twin = naive_bank.Bank(Q, TABLE, P, initial, np.zeros(N), 2.0 * np.eye(N), naive)
+    compare(track(Regression(N), bank, Y, U), twin, Y, U, lags=lags)
+
+
+@pytest.mark.parametrize("prior", list(PRIORS))
+def test_without_reduction_it_is_the_joint_gaussian_of_every_sequence(prior):
+    K = 3
+    transition, P, initial = PRIORS[prior]
+    bank = Bank(changes(), SENSORS, transition, Decide(K), p0=2.0, initial=initial)
+    initial = bank._events[1]
+    run = track(Regression(N), bank, Y[:K], U[:K])
+    logs = []
+    for events in product(range(6), repeat=K):
+        prior_log = np.log(initial[events[0]]) + sum(np.log(P[a, b]) for a, b in pairwise(events))
+        noise = [TABLE[e % 2][0] for e in events]
+        dense = naive_bank.evidence_of([e // 2 for e in events], U[:K], Y[:K], Q, noise, np.zeros(N), 2.0 * np.eye(N))
+        logs.append(prior_log + dense)
+    evidence = np.logaddexp.reduce(logs)
+    assert told(run, "evidence").sum() == pytest.approx(evidence, abs=1e-10)
+    got = state(run, "B")[0, : 6**K]
+    np.testing.assert_allclose(np.sort(got), np.sort(np.array(logs) - evidence), atol=1e-10)
+
+
+def test_unlimited_beam_is_the_full_tree_is_gpb():
+    runs = [
+        track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=reduce, p0=2.0), Y[:4], U[:4])
+        for reduce in (Decide(4), GPB(4), Beam(27))
+    ]
+    for run in runs[1:]:
+        np.testing.assert_allclose(run.theta, runs[0].theta, atol=1e-12)
+        np.testing.assert_allclose(told(run, "evidence"), told(runs[0], "evidence"), atol=1e-12)
+
+
+def test_imm_is_gpb1_for_independent_events():
+    runs = [
+        track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=reduce, p0=2.0), Y, U)
+        for reduce in (IMM(), GPB(1))
+    ]
+    np.testing.assert_allclose(runs[0].theta, runs[1].theta, atol=1e-10)
+    np.testing.assert_allclose(runs[0].std, runs[1].std, atol=1e-10)
+    np.testing.assert_allclose(told(runs[0], "evidence"), told(runs[1], "evidence"), atol=1e-10)
+
+
+def test_imm_mixes_as_in_the_book():
+    bank = Bank(changes(), [Sensor.nominal(R)], P3, IMM(), p0=2.0)
+    run = track(Regression(N), bank, Y, U)
+    m, C, mu = np.zeros((3, N)), np.tile(2.0 * np.eye(N), (3, 1, 1)), None
+    for t in range(len(Y)):
+        c = bank._events[1] if mu is None else mu @ P3
+        if mu is not None:
+            W = mu[:, None] * P3 / c
+            mixed = W.T @ m
+            C = np.array([
+                sum(W[i, j] * (C[i] + np.outer(m[i] - mixed[j], m[i] - mixed[j])) for i in range(3)) for j in range(3)
+            ])  # fmt: skip
+            m = mixed
+        logs = np.empty(3)
+        for j in range(3):
+            Cj = C[j] + Q[j]
+            s, e = R + U[t] @ Cj @ U[t], Y[t] - U[t] @ m[j]
+            logs[j] = np.log(c[j]) + naive_bank.log_normal(e, s)
+            m[j] = m[j] + Cj @ U[t] / s * e
+            C[j] = Cj - np.outer(Cj @ U[t], U[t] @ Cj) / s
+        mu = np.exp(logs - np.logaddexp.reduce(logs))
+        np.testing.assert_allclose(run.theta[t], mu @ m, atol=1e-10)
+        np.testing.assert_allclose(told(run, "lag_prob")[t, 0], mu, atol=1e-10)
+
+
+@pytest.mark.parametrize("form", [{"p0": 2.0}, {}])
+@pytest.mark.parametrize("reduce", [Beam(3), Decide(2), GPB(2), IMM(), Hybrid(3)], ids=str)
+def test_one_hypothesis_is_the_kalman_filter_bit_for_bit(reduce, form):
+    y, u = Y.copy(), U.copy()
+    y[[25, 26]], u[40] = np.nan, np.nan
+    kalman = track(Regression(N), Kalman(q=1e-3, r=R, **form), y, u)
+    bank = track(Regression(N), Bank([Change(1e-3)], [Sensor.nominal(R)], reduce=reduce, **form), y, u)
+    for name in ("theta", "std", "prediction", "innovation", "innovation_std", "ok"):
+        assert same(getattr(kalman, name), getattr(bank, name)), name
+
+
+def test_first_floor_with_prior_weights_is_one_kalman_filter():
+    mean = np.einsum("i,ijk->jk", PROBS, Q)
+    kalman = track(Regression(N), Kalman(q=mean, r=R, p0=2.0), Y, U)
+    bank = Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3, "prior"), p0=2.0)
+    run = track(Regression(N), bank, Y, U)
+    D = 3
+    root = state(run, "root")[:, 0]
+    np.testing.assert_allclose(root[8 : 8 + N], kalman.theta[len(Y) - 1 - D], atol=1e-12)
+
+
+def test_offset_of_unknown_size_is_an_outlier():
+    with pytest.warns(UserWarning, match="outlier of variance"):
+        offset = Sensor.offset(std=2.0, r=R, prob=0.05)
+    outlier = Sensor.outlier(np.sqrt((R + 4.0) / R), prob=0.05)
+    one, other = (
+        track(Regression(N), Bank(changes(), [Sensor.nominal(R), s], reduce=Beam(9), p0=2.0), Y, U)
+        for s in (offset, outlier)
+    )
+    np.testing.assert_allclose(one.theta, other.theta, atol=1e-12)
+
+
+def test_leaves_clean_their_own_lags():
+    """Additive outliers: every leaf has its own regressor."""
+    rng = np.random.default_rng(3)
+    T = 60
+    u, x, y = rng.standard_normal(T), np.zeros(T), np.zeros(T)
+    for t in range(T):
+        x[t] = (0.7 * x[t - 1] if t else 0.0) + u[t] + 0.3 * rng.standard_normal()
+        y[t] = x[t] + (5.0 if t in (20, 40) else 0.0)
+    sensors = [Sensor.nominal(R), Sensor.outlier(10.0, "additive", prob=0.05)]
+    bank = Bank(changes(), sensors, reduce=Beam(7), p0=2.0)
+    run = track(ARX(1, 1, nk=0, start="zero"), bank, y, u)
+    P = np.tile(np.kron(PROBS, [0.95, 0.05]), (6, 1))
+    table = [(R, 0.0, False), (100.0 * R, 0.0, True)]
+    twin = naive_bank.Bank(Q, table, P, P[0], np.zeros(2), 2.0 * np.eye(2), naive_bank.beam(7), na=1)
+    for t in range(T):
+        twin.see(np.array([0.0, u[t]]), y[t])
+        np.testing.assert_allclose(run.theta[t], twin.mean, atol=1e-10)

@@ -1,0 +1,162 @@
+"""What a user gets of a bank: probabilities, events, alarms, the mixture; live as in a record; bad data."""
+
+import numpy as np
+import pytest
+from support import arx_record, same
+from test_bank import N, R, changes, record
+
+from driftfit import ARX, Bank, Kalman, Live, Regression, track
+from driftfit.hypotheses.reduction import IMM, Beam, Decide, Hybrid
+from driftfit.hypotheses.sensor import Sensor
+
+JUMPS = (40, 90)
+KNOWN = [Sensor.nominal(R)]
+BANK = Bank(changes(), KNOWN, reduce=Beam(9), p0=2.0)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return track(Regression(N), BANK, *record(150, 5, JUMPS))
+
+
+def test_probabilities_are_probabilities(run):
+    told = run.hypotheses
+    there = ~np.isnan(told.lag_prob[..., 0])
+    np.testing.assert_allclose(told.lag_prob[there].sum(axis=1), 1.0, atol=1e-12)
+    assert there[:8].sum() == 36  # one more floor a sample, until there are eight
+    assert same(told.prob(3)[40], told.lag_prob[43, 3])
+    assert ((told.window >= -1e-12) & (told.window <= 1.0)).all()
+    assert told.log_evidence == pytest.approx(told.evidence.sum())
+    assert told.kept.min() > 0.8
+
+
+def test_jumps_are_found_and_dated(run):
+    events = run.hypotheses.events()
+    assert [event.kind for event in events] == ["change", "change"]
+    for event, jump in zip(events, JUMPS, strict=True):
+        assert abs(event.date - jump) <= 2
+        assert event.first <= jump <= event.last
+        assert event.prob > 0.9
+        assert event.known <= jump + 5
+    assert run.hypotheses.table().height == 2
+    assert len(run.hypotheses.plot().axes) == N + 1
+
+
+def test_alarms_keep_to_their_rate(run):
+    alarm = run.hypotheses.alarm(threshold=0.5)
+    assert {event.known for event in run.hypotheses.events()} <= set(alarm.at.tolist())
+    quiet = track(Regression(N), BANK, *record(2000, 6, ()))
+    strict = quiet.hypotheses.alarm(rate=0.002, reference=quiet)
+    assert len(strict.at) <= 4
+    assert strict.threshold < 0.9
+    with pytest.raises(ValueError, match="threshold= or rate="):
+        run.hypotheses.alarm()
+
+
+@pytest.mark.parametrize("bank", [BANK, Bank()], ids=["known", "unknown noise"])
+def test_the_mixture_is_what_the_track_says(bank):
+    run = track(Regression(N), bank, *record(60, 5, (40,)))
+    for t in (0, 45, 59):
+        mixture = run.hypotheses.mixture(t)
+        assert mixture.weights.sum() == pytest.approx(1.0)
+        np.testing.assert_allclose(mixture.mean, run.theta[t], atol=1e-12)
+        np.testing.assert_allclose(mixture.cov, run.cov(t), atol=1e-12)
+
+
+def test_a_stream_says_what_the_record_says(run, tmp_path):
+    y, u = run.y, run.u
+    live, found = Live(Regression(N), BANK), []
+    for t in range(150):
+        live.update(y[t], u[t])
+        told = live.hypotheses
+        assert same(told.lag_prob[0], np.nan_to_num(run.hypotheses.lag_prob[t, 0])), t
+        found += [(t, event) for event in told.events()]
+        if t == 70:
+            live.save(tmp_path / "state")
+            live = Live.load(tmp_path / "state")
+    wanted = run.hypotheses.events()
+    assert [(e.date, e.first, e.last, e.name) for _, e in found] == [(e.date, e.first, e.last, e.name) for e in wanted]
+    assert all(event.date < t < event.date + 20 for t, event in found)
+    np.testing.assert_allclose(live.hypotheses.mixture().mean, run.theta[-1])
+
+
+def test_decisions_come_after_their_depth():
+    run = track(Regression(N), Bank(changes(), KNOWN, reduce=Decide(3), p0=2.0), *record(100, 5, (40,)))
+    decisions = run.hypotheses.decisions
+    assert [d.sample for d in decisions] == list(range(98))
+    assert {d.decided - d.sample for d in decisions} == {2}
+    assert [d.sample for d in decisions if d.event] == [40]
+    assert [d.sample for d in run.hypotheses.finish()] == [98, 99]
+    auto = track(
+        Regression(N), Bank(changes(), KNOWN, reduce=Decide("auto", wait_cost=0.005), p0=2.0), *record(100, 5, (40,))
+    )
+    delays = [d.decided - d.sample for d in auto.hypotheses.decisions]
+    assert min(delays) == 0
+    assert max(delays) <= 5
+    assert auto.hypotheses.leaves.mean() < run.hypotheses.leaves.mean()
+
+
+def test_known_changes_are_found_at_once():
+    y, u = record(100, 5, (40,))
+    prob = np.full((100, 3), np.nan)
+    prob[40] = 0.0, 1.0, 0.0
+    run = track(Regression(N), BANK, y, u, prob=prob)
+    assert run.hypotheses.prob()[40] == pytest.approx([0.0, 1.0, 0.0])
+    live = Live(Regression(N), BANK)
+    for t in range(100):
+        live.update(y[t], u[t], **({"prob": prob[t]} if t == 40 else {}))
+        assert same(live.theta, run.theta[t])
+    scaled = track(Regression(N), BANK, y, u, drift=np.tile([0.0, 1.0, 1.0], (100, 1)))
+    assert not same(scaled.theta, run.theta)
+    one = track(Regression(N), BANK, y, u, drift=np.ones((100, 3)))
+    assert same(one.theta, track(Regression(N), BANK, y, u).theta)
+
+
+@pytest.mark.parametrize("reduce", [Beam(5), Decide(2), IMM(), Hybrid(5)], ids=str)
+def test_what_is_not_used_moves_no_weight(reduce):
+    """Also where it is missing for longer than the tree is deep."""
+    y, u = record(60, 7, (30,))
+    y[31:40] = np.nan
+    P = [[0.97, 0.02, 0.01], [0.3, 0.6, 0.1], [0.2, 0.3, 0.5]]
+    run = track(Regression(N), Bank(changes(), KNOWN, P, reduce, p0=2.0), y, u)
+    assert same(run.theta[31:40], np.repeat(run.theta[30:31], 9, axis=0))
+    assert (np.diff(run.std[30:40], axis=0) > 0.0).all()
+    present = run.hypotheses.prob()
+    np.testing.assert_allclose(present[32:40], present[31:39] @ np.array(P), atol=1e-12)
+
+
+def test_an_impossible_sample_is_survived():
+    """A prior that allows only a frozen sensor, before there was anything to freeze at."""
+    y, u = record(30, 8, ())
+    P = (None, [[0.9, 0.1], [0.1, 0.9]])
+    bank = Bank(changes(), [Sensor.nominal(R), Sensor.frozen(0.01)], P, Beam(5), p0=2.0)
+    prob = np.full((30, 6), np.nan)
+    prob[0] = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
+    run = track(Regression(N), bank, y, u, prob=prob)
+    assert run.hypotheses.impossible == 1
+    assert np.isfinite(run.theta).all()
+    assert run.hypotheses.prob()[0, 0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_frozen_sensor_is_named():
+    y, u = record(120, 9, ())
+    y[60:75] = y[59]
+    P = (None, [[0.99, 0.01], [0.1, 0.9]])
+    run = track(Regression(N), Bank(changes(), [Sensor.nominal(R), Sensor.frozen(0.01)], P, p0=2.0), y, u)
+    (event,) = (event for event in run.hypotheses.events() if event.kind == "sensor")
+    assert (event.name, event.first, event.last) == ("frozen", 60, 74)
+
+
+def test_nothing_else_has_hypotheses():
+    with pytest.raises(ValueError, match="Kalman weighs none"):
+        track(Regression(N), Kalman(0.1, 0.1), *record(5)).hypotheses  # noqa: B018
+    with pytest.raises(ValueError, match="Kalman weighs none"):
+        Live(Regression(N), Kalman(0.1, 0.1)).hypotheses  # noqa: B018
+
+
+def test_the_bank_without_settings_has_no_scale():
+    y, u = arx_record(300, 3)
+    one = track(ARX(2, 2), Bank(), y, u)
+    other = track(ARX(2, 2), Bank(), 1e3 * y, 1e-2 * u)
+    np.testing.assert_allclose(other.theta[20:, :2], one.theta[20:, :2], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(other.theta[20:, 2:], 1e5 * one.theta[20:, 2:], rtol=1e-6, atol=1e-4)
