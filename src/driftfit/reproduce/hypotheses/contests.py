@@ -1,0 +1,192 @@
+"""What is run on what: the settings of every row of the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
+from driftfit.hypotheses.sensor import Sensor
+from driftfit.kernel import Array
+from driftfit.reproduce.hypotheses import references
+from driftfit.systems.jumps import Jumping
+from driftfit.trackers.bank import Bank
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.rls import RLS
+
+R = 0.09
+P0 = 2.0
+DRIFTING = Change(0.002**2, prob=0.99, name="drift")
+CHANGES = (DRIFTING, Change(0.6, prob=0.006, name="all"), Change([1e-6, 1e-6, 1.5], prob=0.004, name="gain"))
+REGIMES = ((0.99, 0.01), (0.025, 0.975))
+STATIONARY = 0.01 / 0.035
+OK = Sensor.nominal(R)
+OUTLIER = Sensor.outlier(10.0, plus=True)
+SPIKE = Sensor.outlier(10.0, "additive", plus=True)
+WIDTH = float(np.sqrt(2.0 * np.pi * 4e-6))
+FROZEN = Sensor.frozen(WIDTH, prob=0.06)
+FREEZES = (None, ((0.996, 0.004), (1.0 / 15.0, 14.0 / 15.0)))
+FREEZES_OR_OUTLIERS = (
+    None,
+    ((0.976, 0.02, 0.004), (0.976, 0.02, 0.004), (0.98 / 15.0, 0.02 / 15.0, 14.0 / 15.0)),
+)
+
+
+class Entry(NamedTuple):
+    """A row of a table: a tracker, the lag at which its alarms are read, and how it sees the record."""
+
+    tracker: Tracker
+    lag: int = 0
+    literal: bool = False
+    """Regressors of outputs as measured: no leaf cleans them."""
+    told: Callable[[Jumping], Array] | None = None
+    """Probabilities of events that it is given."""
+
+
+class Contest(NamedTuple):
+    """A table: records, and who runs on them."""
+
+    title: str
+    fault: str
+    K: float
+    runs: int
+    T: int
+    offset: int
+    entries: dict[str, Entry]
+    reference: dict[str, references.Row]
+
+
+def bank(reduce: Reduction, *others: Sensor, transition: Any = None, changes: Any = CHANGES) -> Bank:
+    """A bank with known noise."""
+    return Bank(changes, (OK, *others), transition, reduce, p0=P0)
+
+
+def kalman(q: Any = (0.004, 0.004, 0.04), r: float = R) -> Entry:
+    return Entry(Kalman(q, r, p0=P0))
+
+
+def decide(d: int, *others: Sensor, literal: bool = False, **more: Any) -> Entry:
+    loss = more.pop("loss", "map")
+    return Entry(bank(Decide(d, loss, force=True), *others, **more), d - 1, literal)
+
+
+def gpb(n: int, *others: Sensor, literal: bool = False, **more: Any) -> Entry:
+    return Entry(bank(GPB(n), *others, **more), n - 1, literal)
+
+
+def beam(M: int, *others: Sensor, **more: Any) -> Entry:
+    return Entry(bank(Beam(M), *others, **more), 3)
+
+
+def hybrid(M: int, *others: Sensor) -> Entry:
+    return Entry(bank(Hybrid(M), *others), 2)
+
+
+def oracle(*others: Sensor, changes: Any = CHANGES) -> Entry:
+    """A filter that is told every event."""
+    Hm = 1 + len(others)
+
+    def events(record: Jumping) -> Array:
+        told = np.zeros((len(record.y), len(changes) * Hm))
+        told[np.arange(len(told)), record.kinds * Hm + (record.bad if others else 0)] = 1.0
+        return told
+
+    return Entry(bank(GPB(1), *others, changes=changes), told=events)
+
+
+def loss_of(miss: float) -> tuple[tuple[float, ...], ...]:
+    """L[true, decided] of the changes: ``miss`` for a jump that is called none, 1 for other errors."""
+    return ((0.0, 1.0, 1.0), (miss, 0.0, 1.0), (miss, 1.0, 0.0))
+
+
+def joint_loss(miss: float) -> tuple[tuple[float, ...], ...]:
+    """The same for changes with two sensors, whose confusion costs 1."""
+    wide = np.kron(np.array(loss_of(miss)), np.ones((2, 2)))
+    return tuple(map(tuple, np.where((wide == 0.0) & (np.eye(6) == 0.0), 1.0, wide).tolist()))
+
+
+def auto(tau: float, cost: float | None = None, loss: Any = "map") -> Entry:
+    return Entry(bank(Decide("auto", loss, max_depth=6, tau=tau, wait_cost=cost)), -1)
+
+
+def contests() -> list[Contest]:
+    """All tables."""
+    mean = np.einsum("i,ijk->jk", [0.99, 0.006, 0.004], [change.increments(3)[0] for change in CHANGES])
+    clean = {
+        "RLS-EF 0.75": Entry(RLS(0.75, p0=P0 / R)), "RLS-DF 0.4": Entry(RLS(0.4, p0=P0 / R, kind="directional")),
+        "KF diag(.004,.004,.04)": kalman(), "KF Qbar=sum p_i Q_i (untuned)": kalman(mean),
+        **{f"Decide d={d}": decide(d) for d in range(1, 7)},
+        "FirstFloor posterior d=2": Entry(bank(FirstFloor(2)), 1),
+        **{f"GPB({n})": gpb(n) for n in range(1, 5)}, "IMM": Entry(bank(IMM())),
+        **{f"Beam M={M}": beam(M) for M in (3, 5, 9)}, "oracle (events known)": oracle(),
+        "Bank(), nothing given": Entry(Bank(), 3),
+    }  # fmt: skip
+    outliers = {
+        "KF tuned Q, r": kalman((0.002, 0.002, 0.02), 4.0 * R), "Decide d=2, no sensor alternative": decide(2),
+        "GPB(2), no sensor alternative": gpb(2), "IMM joint": Entry(bank(IMM(), OUTLIER)),
+        **{f"joint Decide d={d}": decide(d, OUTLIER) for d in range(1, 5)},
+        "joint Decide d=2 asym jump-miss=5": decide(2, OUTLIER, loss=joint_loss(5.0)),
+        "GPB(2) joint": gpb(2, OUTLIER), "GPB(3) joint": gpb(3, OUTLIER),
+        "joint Beam M=5": beam(5, OUTLIER), "joint Beam M=32": beam(32, OUTLIER), "oracle": oracle(OUTLIER),
+    }  # fmt: skip
+    mixed = {
+        "GPB(2) joint": gpb(2, OUTLIER), "Beam 16": beam(16, OUTLIER),
+        "Hybrid M=9 sensor_events=1": hybrid(9, OUTLIER), "Hybrid M=16 sensor_events=1": hybrid(16, OUTLIER),
+        "joint Decide d=3": decide(3, OUTLIER), "GPB(3)": gpb(3, OUTLIER), "IMM": Entry(bank(IMM(), OUTLIER)),
+        "oracle": oracle(OUTLIER),
+    }  # fmt: skip
+    additive = {
+        "KF diag(.004,.004,.04)": kalman(), "KF Q/4, 12r": kalman((0.001, 0.001, 0.01), 12.0 * R),
+        "GPB(2), no sensor alternative": gpb(2),
+        "joint Decide d=2, literal (dirty regressor)": decide(2, SPIKE, literal=True),
+        **{f"joint Decide d={d}, leaf-cleaned regressor": decide(d, SPIKE) for d in (2, 3, 4)},
+        "GPB(2) joint, literal": gpb(2, SPIKE, literal=True), "GPB(2) joint, leaf-cleaned": gpb(2, SPIKE),
+        "Beam M=16 leaf-cleaned": beam(16, SPIKE),
+    }  # fmt: skip
+    frozen = {
+        "KF diag(.004,.004,.04)": kalman(), "GPB(2), no sensor alternative": gpb(2),
+        "Decide d=2 outlier sensor only": decide(2, SPIKE),
+        "Decide d=2 ok/frozen literal (dirty regr.)": decide(2, FROZEN, transition=FREEZES, literal=True),
+        "Decide d=2 ok/outl/frozen cleaned, Markov": decide(2, SPIKE, FROZEN, transition=FREEZES_OR_OUTLIERS),
+        "Decide d=2 ok/frozen cleaned, Markov": decide(2, FROZEN, transition=FREEZES),
+        "GPB(2) ok/frozen cleaned, Markov": gpb(2, FROZEN, transition=FREEZES),
+        "Beam 9 ok/frozen cleaned, Markov": beam(9, FROZEN, transition=FREEZES),
+        "IMM ok/frozen Markov": Entry(bank(IMM(), FROZEN, transition=FREEZES)),
+    }  # fmt: skip
+    moving = (Change(0.002**2, prob=1.0 - STATIONARY), Change(0.06**2, prob=STATIONARY, name="fast"))
+    persistent = {"KF tuned 0.001": kalman(0.001)}
+    for name, transition in (("iid", None), ("Markov", REGIMES)):
+        for d in (2, 7):
+            persistent[f"Decide d={d} {name}"] = decide(d, transition=transition, changes=moving)
+        for n in (2,) if transition is None else (1, 2, 4):
+            persistent[f"GPB({n}) {name}"] = gpb(n, transition=transition, changes=moving)
+        persistent[f"IMM {name}"] = Entry(bank(IMM(), transition=transition, changes=moving))
+    persistent["Beam 16 Markov"] = beam(16, transition=REGIMES, changes=moving)
+    persistent["oracle (regime known)"] = oracle(changes=moving)
+    variable = {
+        "fixed d=5": decide(5), "fixed d=3": decide(3), "threshold tau=0.02 dmax=6": auto(0.02),
+        "threshold tau=0.001 dmax=6": auto(0.001), "look-ahead c=0.005 dmax=6": auto(0.0, 0.005),
+        "look-ahead c=.01 dmax=6 asym10": auto(0.0, 0.01, loss_of(10.0)),
+    }  # fmt: skip
+    return [
+        Contest("Clean", "none", 10.0, 100, 600, 0, clean, references.CLEAN),
+        Contest(
+            "5 % innovation outliers, ten times the noise",
+            "innovation",
+            10.0,
+            60,
+            600,
+            2000,
+            outliers,
+            references.OUTLIERS,
+        ),
+        Contest("The same, merging and a beam", "innovation", 10.0, 50, 400, 2000, mixed, references.HYBRID),
+        Contest("5 % additive outliers", "additive", 10.0, 60, 600, 3000, additive, references.ADDITIVE),
+        Contest("Sensor frozen for 5 % of the time", "frozen", 10.0, 60, 600, 4000, frozen, references.FROZEN),
+        Contest("Regimes of fast drift that persist", "regimes", 10.0, 60, 600, 5000, persistent, references.REGIMES),
+        Contest("Variable depth", "none", 10.0, 50, 400, 0, variable, references.VARIABLE),
+    ]
