@@ -54,13 +54,25 @@ def errors(run: Track) -> Errors:
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     gaps = run._known[:, 0]  # 0 before the lags are filled
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
-    steady = constant_least_squares(run)["e"][:, 0]
+    steady = _constant(run, y)
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
-    own = (run.innovation, y - persistence(y), steady, arx.innovation)
+    own = (_error(run, y), y - persistence(y), steady, arx.innovation)
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
     for error in own:
         scored &= np.isfinite(error)
     return Errors(*own, scored)
+
+
+def _error(run: Track, y: Array) -> Array:
+    """One-step errors of the output; a model whose regressors hold the present output has innovations of its own."""
+    return np.where(run.ok, y - run.prediction, np.nan) if hasattr(run.model, "log_jacobian") else run.innovation
+
+
+def _constant(run: Track, y: Array) -> Array:
+    """The same of constant least squares on the past."""
+    if hasattr(run.model, "log_jacobian"):
+        return _error(track(run.model, RLS(1.0), run.y, run.u), y)
+    return np.asarray(constant_least_squares(run.model, run.y, run.u, run._known)["e"][:, 0])
 
 
 def compare(run: Track) -> Comparison:
