@@ -238,7 +238,7 @@ def select(
         raise ValueError("select: structures are compared for one output at a time.")
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
-    pool, structures = pool_of(bound, output, inputs, known)
+    pool, structures = pool_of(bound, [repr(model) for model in given], output, inputs, known)
     if isinstance(models, Model):
         structures, predictions = _subsets(pool, tracker, structures[0], keep, most)
     else:

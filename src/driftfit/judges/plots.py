@@ -155,6 +155,7 @@ def plot_selection(said: Selection, most: int) -> Figure:
     table.invert_yaxis()
     table.axvline(0.0, color=GREY, lw=0.8)
     table.set_xlabel("log-likelihood below the best, +- one standard error", fontsize=9)
+    table.set_xscale("symlog", linthresh=10.0)
     order = {structure.name: p for structure, p in zip(said.structures, said.predictions, strict=True)}
     top = np.where(said.judged, order[rows[0].name].loglik, 0.0)
     for row, colour in zip(rows[1:6], COLOURS, strict=False):

@@ -107,22 +107,24 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), np.where(known, loglik, np.nan))
 
 
-def pool_of(models: Sequence[Model], y: Array, u: Array, known: Array) -> tuple[Pool, list[Structure]]:
+def pool_of(
+    models: Sequence[Model], names: Sequence[str], y: Array, u: Array, known: Array
+) -> tuple[Pool, list[Structure]]:
     """The record with the union of the models' regressors, and the models as structures; models are bound."""
     linear = [model for model in models if _terms(model) is not None]
     if not linear:
         empty = Pool(y, u, known, np.zeros((len(y), 0)), (), np.ones(len(y)))
-        return empty, [Structure(repr(model), model.n, model, None) for model in models]
+        return empty, [Structure(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
     seen = constant_least_squares(union, y, u, known)
     phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
     pool = Pool(y, u, known, phi, union.names, seen["dt"][:, 0].copy())
     structures = []
-    for model in models:
+    for name, model in zip(names, models, strict=True):
         terms = _terms(model)
         columns = None if terms is None else tuple(order[term] for term in terms)
-        structures.append(Structure(repr(model), model.n, model, columns))
+        structures.append(Structure(name, model.n, model, columns))
     return pool, structures
 
 
