@@ -73,7 +73,7 @@ def main(records: int = 20) -> None:
             found = np.array([count(seed, every) for seed in range(records)])
             begun, samples = found.sum(axis=0)
             spread = 2.0 * found[:, 0].std() * np.sqrt(records)
-            ends = (f"{samples / (begun + spread):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
+            ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
             table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
     Console(width=110).print(table)
 
