@@ -156,6 +156,7 @@ def plot_selection(said: Selection, most: int) -> Figure:
     table.axvline(0.0, color=GREY, lw=0.8)
     table.set_xlabel("log-likelihood below the best, +- one standard error", fontsize=9)
     table.set_xscale("symlog", linthresh=10.0)
+    table.set_xlim(right=5.0)
     order = {structure.name: p for structure, p in zip(said.structures, said.predictions, strict=True)}
     top = np.where(said.judged, order[rows[0].name].loglik, 0.0)
     for row, colour in zip(rows[1:6], COLOURS, strict=False):
