@@ -5,12 +5,9 @@ STYLE = """
   --blue: #1f5fa8; --red: #c23b22; --grey: #8a8a8a; --good: #23713b; }
 @media (prefers-color-scheme: dark) { :root { --page: #14171a; --ink: #e6e9ec; --soft: #9aa4ae; --rule: #343b42;
   --card: #1d2226; --blue: #6aa9f0; --red: #f0806a; --grey: #8f979e; --good: #6cc48a; } }
-@media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
-  --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } body { font-size: 10pt; }
-  section, figure, tr { break-inside: avoid; } main { max-width: none; padding: 0; } }
 @page { size: A4; margin: 15mm; }
 body { margin: 0; background: var(--page); color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+  font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 main { max-width: 64rem; margin: 0 auto; padding: 1.5rem; }
 h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
 .soft, figcaption, caption { color: var(--soft); font-size: .88rem; }
@@ -26,6 +23,10 @@ th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child { tex
 figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: .5rem 0; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margin: .2rem 0; }
+@media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
+  --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } html { font-size: 11px; }
+  figure, tr, li, .verdict { break-inside: avoid; } h2 { break-after: avoid; } main { max-width: none; padding: 0; }
+  .wide { overflow: visible; } th, td { white-space: normal; } }
 """
 
 READING = """<p>The output is described as a sum of regressors times parameters. The parameters are followed sample by
