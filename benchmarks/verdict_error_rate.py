@@ -16,9 +16,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from driftfit.judges.attribute import holm
 from driftfit.judges.constancy import constancy
 from driftfit.judges.quadratic import quantile
-from driftfit.verdict import holm
 
 LEVEL = 0.05
 NOISES = ("steady", "outliers", "heavy tails", "changing noise", "changing noise and inputs")

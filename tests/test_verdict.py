@@ -6,11 +6,11 @@ from scipy import stats
 from support import THETA, arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
-from driftfit.judges.constancy import constancy, robust_fit, shift
+from driftfit.judges.attribute import attribute, holm
+from driftfit.judges.constancy import constancy, robust_fit
 from driftfit.judges.paired import newey_west, paired
 from driftfit.judges.quadratic import quantile, tail
 from driftfit.judges.whiteness import crossing, whiteness
-from driftfit.verdict import holm
 
 BRIDGE = 1.0 / (np.pi * np.arange(1, 400)) ** 2
 """Weights of the integral of a squared Brownian bridge."""
@@ -108,13 +108,21 @@ def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
     assert said.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
 
 
-def test_shift_is_least_squares_on_both_sides():
-    phi, y = record(200, 8)
-    y[120:] += phi[120:, 0]
-    got = shift(phi, y, 120, 0)
-    one, two = (np.linalg.lstsq(phi[part], y[part])[0][0] for part in (slice(120), slice(120, None)))
-    assert (got.before, got.after) == (pytest.approx(one, abs=0.05), pytest.approx(two, abs=0.05))
-    assert got.std == pytest.approx(np.sqrt(1 / 120 + 1 / 80), rel=0.3)
+def test_steps_are_found_one_after_the_other_with_their_sizes():
+    """A large move of one gain of an ARX system makes others look moved; two steps of two parameters are told apart."""
+    phi, y = record(600, 8)
+    y += 2.0 * phi[:, 0] * (np.arange(600) >= 200) - 0.8 * phi[:, 2] * (np.arange(600) >= 450)
+    got = attribute(phi, y, constancy(phi, y), 0.05)
+    assert [step.parameter for step in got.steps[:2]] == [0, 2]
+    assert abs(got.first(0) - 200) < 6
+    assert abs(got.first(2) - 450) < 25
+    assert got.first(1) is None
+    assert (got.after - got.before)[[0, 2]] == pytest.approx([2.0, -0.8], abs=0.3)
+    assert got.std[0] == pytest.approx(np.sqrt(1 / 200 + 1 / 400), rel=0.3)
+    path = np.where(np.arange(600)[:, None] < 350, THETA, THETA + np.array([0.0, 0.0, 1.0, 0.0]))
+    said = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()
+    assert said.moving == ("b1",)
+    assert said.parameters[2].when == "350"
 
 
 def test_robust_fit_is_the_minimum_of_hubers_loss():

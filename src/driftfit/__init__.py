@@ -8,6 +8,7 @@ from driftfit.live import Live
 from driftfit.models.arx import ARX
 from driftfit.models.regression import Regression
 from driftfit.result import Track
+from driftfit.select import grid, select
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
@@ -31,6 +32,8 @@ __all__ = [
     "Regression",
     "Track",
     "frontier",
+    "grid",
+    "select",
     "track",
     "tune",
 ]

@@ -135,7 +135,7 @@ def diagnose(run: Track) -> Diagnosis:
     checks = (
         _whiteness(white),
         *_inputs(run, z),
-        *_level(z, _robust(run)),
+        *_level(z, white, _robust(run)),
         *_distribution(z, _robust(run)),
         _excitation(run, excited),
         _constancy(run, constant),
@@ -184,15 +184,15 @@ def _robust(run: Track) -> bool:
     return isinstance(run.tracker, AdaptiveKalman)
 
 
-def _level(z: Array, robust: bool) -> tuple[Check, Check]:
+def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
     count = int(np.isfinite(z).sum())
     level = _core(z)
     slack = 3.0 * np.sqrt(2.0 / count) if count else 0.0
-    what = (
-        "larger than it says; raise r (or q, where they are correlated too)"
-        if level > 1.0
-        else ("smaller than it says; lower r")
-    )
+    sign = white.r[0] if len(white.r) and white.p < 0.05 else 0.0
+    if level > 1.0:
+        what = f"larger than it says; raise {'q, since they are correlated too' if sign > 0.0 else 'r'}"
+    else:
+        what = f"smaller than it says; lower {'q, since one overshoots the last' if sign < 0.0 else 'r'}"
     advice = f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() finds the numbers."
     levels = np.array([_core(part) for part in np.array_split(z, PARTS)])
     ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")

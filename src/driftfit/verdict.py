@@ -9,7 +9,8 @@ Two questions that have different answers:
 * *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
   constant ARX, on the same samples, with paired tests (`driftfit.judges.paired`).
 
-A parameter is named as one that moves where the joint test rejects and its own does, after Holm's correction.
+A parameter is named as one that moves where the joint test rejects, and its own still does when what was named before
+it is taken into account (`driftfit.judges.attribute`).
 
 The test takes the noise to be uncorrelated, as one-step errors of a complete model are. A model without enough lags
 has correlated noise, which is hard to tell from a drifting intercept; then the verdict says so, and ``lags=`` allows
@@ -27,11 +28,11 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.compare import errors
-from driftfit.judges.constancy import Constancy, constancy, shift
+from driftfit.judges.attribute import Attribution, attribute
+from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.paired import Paired, paired
 from driftfit.judges.seen import Seen, regressors
 from driftfit.judges.whiteness import whiteness
-from driftfit.kernel import Array
 from driftfit.result import Track, root_mean_square
 from driftfit.settings import whole
 from driftfit.summary import WIDTH, facts, table_of
@@ -46,9 +47,9 @@ class Moved:
     """What the record says of one parameter.
 
     ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
-    parameters with correlated regressors. ``moves``: named as one that moves. ``at``, ``when``: the sample, and its
-    time as text, from which on it most likely is another; ``before``, ``after``: its constant estimates on both sides,
-    ``std`` the standard error of their difference.
+    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
+    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``, ``after``: its value before
+    its first and after its last step, ``std`` the standard error of their difference.
     """
 
     name: str
@@ -209,8 +210,8 @@ def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
     seen = regressors(run)
     test = constancy(seen.phi, seen.y, lags)
     drifts = bool(test.p_joint < level)
-    moves = holm(test.p_own, level) & drifts
-    parameters = tuple(_moved(run, seen, test, i, bool(moves[i])) for i in range(len(test.p)))
+    steps = attribute(seen.phi, seen.y, test, level, lags) if drifts else None
+    parameters = tuple(_moved(run, seen, test, steps, i) for i in range(len(test.p)))
     own, *others, scored = errors(run)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
@@ -229,19 +230,12 @@ def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
     )
 
 
-def holm(p: Array, level: float) -> Array:
-    """Which of n hypotheses Holm's procedure rejects."""
-    order = np.argsort(p)
-    passed = p[order] < level / np.arange(len(p), 0, -1)
-    rejected = np.zeros(len(p), bool)
-    rejected[order] = np.logical_and.accumulate(passed)
-    return rejected
-
-
-def _moved(run: Track, seen: Seen, test: Constancy, i: int, moves: bool) -> Moved:
-    at = min(int(test.at[i]), len(seen.at) - 1)
-    sides = shift(seen.phi, seen.y, at, i) if moves else (float("nan"),) * 3
-    sample = int(seen.at[at]) if len(seen.at) else 0
-    name = run.model.names[i]
+def _moved(run: Track, seen: Seen, test: Constancy, steps: Attribution | None, i: int) -> Moved:
+    name, at = run.model.names[i], steps.first(i) if steps else None
+    own = float(test.p_own[i] if steps is None else steps.p[i])
+    if steps is None or at is None:
+        sample, sides = int(seen.at[min(int(test.at[i]), len(seen.at) - 1)]) if len(seen.at) else 0, (np.nan,) * 3
+    else:
+        sample, sides = int(seen.at[at]), (float(steps.before[i]), float(steps.after[i]), float(steps.std[i]))
     when = run.time_text(sample)
-    return Moved(name, float(test.L[i]), float(test.p[i]), float(test.p_own[i]), moves, sample, when, *sides)
+    return Moved(name, float(test.L[i]), float(test.p[i]), own, at is not None, sample, when, *sides)

@@ -191,28 +191,3 @@ def _dates(path: Array, std: Array) -> tuple[Array, Array]:
     z = path / np.where(std > 0.0, std, np.inf)
     low, high = int(EDGE * N), max(int((1.0 - EDGE) * N), int(EDGE * N) + 1)
     return low + np.argmax(np.abs(z[low:high]), axis=0) + 1, z
-
-
-class Shift(NamedTuple):
-    """One parameter before and after a date."""
-
-    before: float
-    after: float
-    std: float
-    """Standard error of the difference."""
-
-
-def shift(phi: Array, y: Array, at: int, i: int) -> Shift:
-    """Parameter i before and from sample ``at`` on, all parameters being free on both sides."""
-    (one, var_one), (two, var_two) = (_estimate(phi[part], y[part], i) for part in (slice(at), slice(at, None)))
-    return Shift(one, two, float(np.sqrt(var_one + var_two)))
-
-
-def _estimate(phi: Array, y: Array, i: int) -> tuple[float, float]:
-    """Robust estimate of parameter i and its heteroscedasticity-consistent variance."""
-    if len(y) <= phi.shape[1]:
-        return float("nan"), float("nan")
-    fit = robust_fit(phi, y)
-    inverse = np.linalg.pinv(phi.T @ (phi * fit.inside[:, None]))
-    weighted = phi * fit.psi[:, None]
-    return float(fit.theta[i]), float((inverse @ (weighted.T @ weighted) @ inverse)[i, i])

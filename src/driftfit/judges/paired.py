@@ -10,10 +10,10 @@ Source: Diebold and Mariano (1995); the variance is that of Newey and West (1987
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
 from driftfit.kernel import Array
 
@@ -48,4 +48,4 @@ def paired(name: str, rival: Array, own: Array) -> Paired:
     if not v > 0.0:
         return Paired(name, rms, 0.0, 0.5)
     t = float(d.mean() / np.sqrt(v / len(d)))
-    return Paired(name, rms, t, float(special.ndtr(-t)))
+    return Paired(name, rms, t, 0.5 * math.erfc(t / math.sqrt(2.0)))

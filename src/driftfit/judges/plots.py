@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
+    from driftfit.select import Selection
 
 COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d17aa5")
 
@@ -140,4 +141,32 @@ def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
     axes[0].set_title("alarms red, labels grey; statistics over their limits", fontsize=9, loc="left")
     axes[-1].set_xlabel(time_label(run))
     date_axis(axes[-1], run)
+    return figure
+
+
+def plot_selection(said: Selection, most: int) -> Figure:
+    """Distance from the best with standard errors, and the loss of the leading structures over time."""
+    rows = said.rows[:most]
+    figure = new_figure(11.0, max(3.2, 0.27 * len(rows) + 1.2))
+    table, loss = figure.subplots(1, 2, width_ratios=[1.1, 1.0])
+    place = np.arange(len(rows))
+    table.errorbar([-row.below for row in rows], place, xerr=[row.std for row in rows], fmt="o", ms=4, color=BLUE, lw=1)
+    table.set_yticks(place, [row.name if len(row.name) < 60 else f"{row.name[:57]}..." for row in rows], fontsize=7)
+    table.invert_yaxis()
+    table.axvline(0.0, color=GREY, lw=0.8)
+    table.set_xlabel("log-likelihood below the best, +- one standard error", fontsize=9)
+    table.set_xscale("symlog", linthresh=10.0)
+    table.set_xlim(right=5.0)
+    order = {structure.name: p for structure, p in zip(said.structures, said.predictions, strict=True)}
+    top = np.where(said.judged, order[rows[0].name].loglik, 0.0)
+    for row, colour in zip(rows[1:6], COLOURS, strict=False):
+        gap = np.cumsum(np.where(said.judged, order[row.name].loglik, 0.0) - top)
+        loss.plot(gap, lw=1.1, color=colour, label=row.name if len(row.name) < 40 else f"{row.name[:37]}...")
+    loss.axhline(0.0, color=GREY, lw=0.8)
+    loss.set_xlabel("sample", fontsize=9)
+    loss.set_title("log-likelihood below the best so far", fontsize=9, loc="left")
+    if len(rows) > 1:
+        loss.legend(fontsize=7, frameon=False)
+    for axis in (table, loss):
+        axis.grid(alpha=0.25, lw=0.5)
     return figure

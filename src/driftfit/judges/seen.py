@@ -8,6 +8,7 @@ import numpy as np
 
 from driftfit.drivers import drivers, output_type
 from driftfit.kernel import Array
+from driftfit.models.base import Model
 from driftfit.smoothers.walk import COLLECTED, collect
 from driftfit.trackers.rls import RLS
 from driftfit.warm import fresh_tile
@@ -27,24 +28,22 @@ class Seen(NamedTuple):
     """(N,)"""
 
 
-def constant_least_squares(run: Track) -> Array:
-    """RLS(1) over the record of a run: (T,) records of phi, y, dt, valid, e, s, ok and more.
+def constant_least_squares(model: Model, y: Array, u: Array, known: Array) -> Array:
+    """RLS(1) over a record, y (T,), u (T, m), known (T, 3): (T,) records of phi, y, dt, valid, e, s, ok and more.
 
-    Lags that are missing are filled by these constants, not by the tracker of the run.
+    Lags that are missing are filled by these constants.
     """
     steady = RLS(1.0)
-    tile = fresh_tile(run.model, steady)
-    out = np.empty(len(run), output_type(tile, COLLECTED))
-    known = run._known[:, :, None]
-    drivers(run.model.steps, steady.steps._replace(store=collect)).run(
-        tile, run.y[:, None], run.u[:, :, None], known, out
-    )
+    tile = fresh_tile(model, steady)
+    out = np.empty(len(y), output_type(tile, COLLECTED))
+    steps = steady.steps._replace(store=collect)
+    drivers(model.steps, steps).run(tile, y[:, None], u[:, :, None], known[:, :, None], out)
     return out
 
 
 def regressors(run: Track) -> Seen:
     """The samples of a regression that a record makes for the model of a run."""
-    out = constant_least_squares(run)
+    out = constant_least_squares(run.model, run.y, run.u, run._known)
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run._known[:, 1] if len(run._known) == 1 else run._known[at, 1]
     root = 1.0 / np.sqrt(noise)

@@ -84,6 +84,6 @@ def furnace(seed: int = 0, T: int = 5000, reach: float = 3.0) -> Furnace:
             drive = B[0] * past[t + 2] + B[1] * past[t + 1] + B[2] * past[t]
             w.append(drive - A[0] * w[-1] - A[1] * w[-2] - A[2] * w[-3])
         L = WORKING_POINT + np.array(w[3:])
-        if SHORTEST < L.min() and L.max() < LONGEST:
+        if L.min() > SHORTEST and L.max() < LONGEST:
             return Furnace(u, resistance(L, gradient), L, gradient, v)
         seed += 1000

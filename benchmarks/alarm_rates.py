@@ -1,0 +1,82 @@
+"""False alarms that are set, and false alarms that happen.
+
+Systems without a fault, records of 20,000 samples; "set" is one false alarm in so many samples, "measured" the samples
+for each alarm that began, with two standard errors. ARX(2, 2) with Gaussian noise, with outliers (5 % are ten times as
+large), and one parameter that walks and stands at the very edge of its band, which is the worst case of a band alarm.
+
+Run: python benchmarks/alarm_rates.py [records a line, 20 by default]
+"""
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy import signal
+
+from driftfit import ARX, Kalman, Regression, Track, track
+from driftfit.judges.onsets import onsets
+
+T = 20_000
+A, B = [1.0, -1.2, 0.5], [0.0, 1.0, 0.4]
+
+
+def system(seed: int, outliers: bool) -> Track:
+    """A constant ARX(2, 2), followed by a filter that allows a little drift."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
+    v *= np.where(rng.random(T) < 0.05, 10.0, 1.0) if outliers else 1.0
+    y = signal.lfilter(B, A, u) + signal.lfilter([1.0], A, v)
+    return track(ARX(2, 2), Kalman(q=0.0, r=0.01 * (5.95 if outliers else 1.0)), y, u)
+
+
+def at_the_edge(seed: int, every: float) -> tuple[int, int]:
+    """Onsets of "outside the band" for a band that ends exactly where the walking parameter is."""
+    rng = np.random.default_rng(seed)
+    u, theta = rng.normal(size=T), 1.0 + np.cumsum(0.03 * rng.normal(size=T))
+    y = theta * u + 0.5 * rng.normal(size=T)
+    run = track(Regression(1), Kalman(q=9e-4, r=0.25), y, u)
+    # the band (-inf, theta) moves with the truth: the alarm's own statistic with high = theta_t
+    z = (run.theta[:, 0] - theta) / run.std[:, 0]
+    said = run.detect("band", every=every, reference={"theta1": (-1e9, 1e9)})
+    return len(onsets(z[50:] > said.limits[0])), T - 50
+
+
+def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, float], tuple[int, int]]:
+    def count(seed: int, every: float) -> tuple[int, int]:
+        said = system(seed, outliers).detect(kind, every=every, **settings)  # type: ignore[arg-type]
+        return len(said.onsets), T - said.start
+
+    return count
+
+
+LINES: list[tuple[str, Callable[[int, float], tuple[int, int]]]] = [
+    ("band, parameter at its edge", at_the_edge),
+    ("band, first 5000 as reference", watched("band", False, reference=5000)),
+    ("innovation, window 10", watched("innovation", False, window=10)),
+    ("innovation, window 50", watched("innovation", False, window=50)),
+    ("innovation, window 50, first 5000 as reference", watched("innovation", False, window=50, reference=5000)),
+    ("outliers: innovation, window 50", watched("innovation", True, window=50)),
+    ("outliers: the same, first 5000 as reference", watched("innovation", True, window=50, reference=5000)),
+    ("outliers: the same, calibrated by simulation", watched("innovation", True, window=50, calibrate=True)),
+]
+
+
+def main(records: int = 20) -> None:
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
+    for head in ("alarm", "set", "measured", "from", "to"):
+        table.add_column(head, justify="left" if head == "alarm" else "right")
+    for name, count in LINES:
+        for every in (500.0, 5000.0):
+            found = np.array([count(seed, every) for seed in range(records)])
+            begun, samples = found.sum(axis=0)
+            spread = 2.0 * found[:, 0].std() * np.sqrt(records)
+            ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
+            table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
+    Console(width=110).print(table)
+
+
+if __name__ == "__main__":
+    main(*(int(given) for given in sys.argv[1:2]))

@@ -1,0 +1,162 @@
+"""Structures: the loglik of a candidate is that of its own run, the right one is found, averages are the recursion."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import arx_record, damaged
+
+from driftfit import ARX, AugmentedFLS, Kalman, Regression, grid, select, track
+from driftfit.models.base import Model
+
+K = Kalman(q=1e-4, r=0.01)
+ORDERS = grid(ARX, na=[1, 2], nb=[1, 2])
+
+
+@pytest.fixture(scope="module")
+def record():
+    return arx_record(500, 3)
+
+
+@pytest.fixture(scope="module")
+def said(record):
+    return select(ORDERS, *record, tracker=K)
+
+
+def terms(run):
+    return stats.norm.logpdf(run.innovation, scale=run.innovation_std)
+
+
+def test_loglik_is_that_of_a_run_of_the_model_itself(record, said):
+    assert said.scored == 450
+    for row in said.rows:
+        run = track(said.model(row.name), K, *record)
+        # shorter lags of their own would let a structure begin a sample earlier
+        assert row.loglik == pytest.approx(np.sum(terms(run)[50:]), rel=1e-4)
+        assert row.rms == pytest.approx(np.sqrt(np.mean(run.innovation[50:] ** 2)), rel=1e-4)
+        assert row.n == run.model.n
+
+
+def test_the_true_structure_is_found(said):
+    assert said.model() == ARX(2, 2, inputs=1)
+    assert said.model(said.simplest).n == 4
+    assert said.rows[0].below == 0.0
+    assert all(a.loglik >= b.loglik for a, b in zip(said.rows, said.rows[1:], strict=False))
+    assert said.regressors() == ("a1", "a2", "b1", "b2")
+
+
+def test_useless_lags_are_within_the_error_and_not_the_simplest():
+    y, u = arx_record(400, 6, theta=[0.8, 0.0, 1.0, 0.0])
+    said = select(ORDERS, y, u, tracker=K)
+    assert said.model(said.simplest).n == 2
+    assert max(row.below for row in said.rows) < 20.0
+
+
+def test_delay_is_found_and_structures_share_their_samples():
+    y, u = arx_record(400, 5)
+    moved = np.concatenate([[np.nan] * 2, y[:-2]])  # an output that was recorded two samples late
+    said = select(grid(ARX, na=2, nb=2, nk=[1, 2, 3]), moved, u, tracker=K)
+    assert said.model().nk == 3
+
+
+def test_subsets_are_all_up_to_five_and_a_search_beyond():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(300, 7))
+    y = u[:, 1] - 0.5 * u[:, 2] + 0.3 * rng.normal(size=300)
+    calm = Kalman(q=1e-6, r=0.09)
+    few = select(Regression(["a", "b", "c"]), y, u[:, :3], tracker=calm)
+    assert len(few.rows) == 7
+    assert set(few.regressors(few.simplest)) == {"b", "c"}
+    with pytest.raises(ValueError, match="no model by itself"):
+        few.model()
+    kept = select(Regression(["a", "b", "c"]), y, u[:, :3], tracker=calm, keep=["a"], most=2)
+    assert {row.name for row in kept.rows} == {"a", "a b", "a c"}
+    many = select(Regression(7), y, u, tracker=calm, most=3)
+    assert {"theta2", "theta3"} <= set(many.regressors())
+    assert len(many.rows) < 7 + 6 + 5 + 4
+    assert max(row.n for row in many.rows) <= 3
+
+
+def test_average_is_the_recursion_written_out(said):
+    got = said.average(0.95)
+    order = [s.name for s in said.structures]
+    w = np.full(len(order), 1.0 / len(order))
+    y = said.pool.y
+    for t in range(len(y)):
+        raised = w**0.95
+        raised /= raised.sum()
+        assert got.weights[t] == pytest.approx(raised, abs=1e-9)
+        likelihood = np.exp([p.loglik[t] for p in said.predictions])
+        w = raised * likelihood if np.isfinite(likelihood).all() else raised
+        w = np.maximum(w / w.sum(), 1e-300)
+    t = 300
+    y_k = np.array([p.y_hat[t] for p in said.predictions])
+    s_k = np.array([p.s[t] for p in said.predictions])
+    mean = got.weights[t] @ y_k
+    assert got.y_hat[t] == pytest.approx(mean)
+    assert got.std[t] ** 2 == pytest.approx(got.weights[t] @ (s_k + (y_k - mean) ** 2))
+    assert got.inclusion[t, 0] == pytest.approx(1.0)
+    assert got.rms == pytest.approx(np.sqrt(np.mean((y - got.y_hat)[said.judged] ** 2)))
+
+
+def test_average_follows_a_change_of_structure():
+    rng = np.random.default_rng(4)
+    u = rng.normal(size=(600, 2))
+    y = np.where(np.arange(600) < 300, u[:, 0], u[:, 1]) + 0.2 * rng.normal(size=600)
+    both = select(Regression(["first", "second"]), y, u, tracker=Kalman(q=1e-5, r=0.04)).average(0.9)
+    first, second = (both.inclusion[:, both.regressors.index(name)] for name in ("first", "second"))
+    assert first[280] > 0.9
+    assert second[280] < 0.6
+    assert second[580] > 0.9
+
+
+def test_a_model_that_is_no_set_of_columns_runs_by_itself(record):
+    class Bent(Regression):
+        """A regression that claims a Jacobian, so that it is none of the known kinds."""
+
+        @property
+        def outputs(self):
+            return ("y",)
+
+        def log_jacobian(self, theta, y):
+            return np.full(len(y), 0.25)
+
+    y, u = record
+    models: list[Model] = [Regression(1), Bent(1)]
+    said = select(models, y, u, tracker=K)
+    plain, bent = (next(row for row in said.rows if row.name.startswith(name)) for name in ("Regression", "Bent"))
+    assert bent.loglik - plain.loglik == pytest.approx(0.25 * said.scored)
+
+
+def test_damaged_records_and_the_table(said):
+    y, u = damaged(*arx_record(500, 3))
+    assert select(ORDERS, y, u, tracker=K).model().n == 4
+    assert said.table.height == 4
+    assert said.best in str(said)
+    assert len(said.plot().axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        (([],), "no candidate"),
+        ((Regression(31),), "at most 30"),
+    ],
+)
+def test_wrong_settings(arguments, match):
+    u = np.random.default_rng(0).normal(size=(80, 31))
+    with pytest.raises(ValueError, match=match):
+        select(*arguments, u[:, 0], u, tracker=K)
+
+
+def test_other_wrong_settings(record, said):
+    with pytest.raises(ValueError, match="no variance"):
+        select(ORDERS, *record, tracker=AugmentedFLS(mu=1.0))
+    with pytest.raises(ValueError, match="no regressor"):
+        select(ARX(2, 2), *record, tracker=K, keep=["a9"])
+    with pytest.raises(ValueError, match="forgetting"):
+        said.average(1.5)
+    with pytest.raises(ValueError, match="no structure"):
+        said.model("ARX(9)")
+    with pytest.raises(ValueError, match="grid"):
+        grid(ARX, na=[-1])
+    assert len(grid(ARX, na=[0, 1], nb=[0, 1])) == 3
