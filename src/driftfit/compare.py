@@ -59,7 +59,7 @@ def errors(run: Track) -> Errors:
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     gaps = run._known[:, 0]  # 0 before the lags are filled
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
-    steady = constant_least_squares(run)
+    steady = constant_least_squares(run.model, run.y, run.u, run._known)
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     own = (tracked, y - persistence(y), constant, arx.innovation)
