@@ -129,6 +129,10 @@ class Outside(types.ExternalFunction):
 
     identity: str
 
+    def __reduce__(self) -> Any:
+        """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
+        return _machine, (self.symbol,)
+
     def load(self) -> None:
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
@@ -141,8 +145,13 @@ class Outside(types.ExternalFunction):
 
 
 register_default(Outside)(models.OpaqueModel)
+_MACHINES: dict[str, Outside] = {}
 _OUTSIDE: dict[str, Any] = {}
 _LOADED: dict[str, Any] = {}
+
+
+def _machine(symbol: str) -> Outside:
+    return _MACHINES[symbol]
 
 
 def outside(function: Callable[..., Any]) -> Outside:
@@ -153,6 +162,7 @@ def outside(function: Callable[..., Any]) -> Outside:
     machine = Outside(symbol, types.void(types.intp))
     machine.identity = dispatcher.identity
     _OUTSIDE[symbol] = dispatcher
+    _MACHINES[symbol] = machine
     return machine
 
 
@@ -167,6 +177,7 @@ def _pointer(context: Any, address: Any) -> Any:
 
 
 _pointer.identity = "pointer"
+_pointer._set_uuid("pointer")  # Numba would give it a new one in every process, and never find its callers on disk
 
 
 def routine(function: Callable[..., Any]) -> Any:

@@ -7,7 +7,7 @@
     I      = [-R_d U + sqrt(R_d^2 U^2 - (R_d^2 + X_d^2)(U^2 - U_p^2))] / (R_d^2 + X_d^2)     current, kA (mOhm, V)
     R_arc  = U / I                                                measured, mOhm
 
-The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so that the
+The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so the
 whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset: with d_1 = 1
 the b_j carry it and d stays. Score a, p1, p2, ratios b_j / b_1, and the local gain b_1 / F'(R).
 
