@@ -7,8 +7,8 @@
     I      = [-R_d U + sqrt(R_d^2 U^2 - (R_d^2 + X_d^2)(U^2 - U_p^2))] / (R_d^2 + X_d^2)     current, kA (mOhm, V)
     R_arc  = U / I                                                measured, mOhm
 
-The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so that the
-whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset: with d_1 = 1
+The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so
+that the whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset: with d_1 = 1
 the b_j carry it and d stays. Score a, p1, p2, ratios b_j / b_1, and the local gain b_1 / F'(R).
 
 Source: Feng and Hong (2021), example 4. Departures: the working point L0 = 20 cm is ours (the paper says "around the
@@ -84,6 +84,6 @@ def furnace(seed: int = 0, T: int = 5000, reach: float = 3.0) -> Furnace:
             drive = B[0] * past[t + 2] + B[1] * past[t + 1] + B[2] * past[t]
             w.append(drive - A[0] * w[-1] - A[1] * w[-2] - A[2] * w[-3])
         L = WORKING_POINT + np.array(w[3:])
-        if SHORTEST < L.min() and L.max() < LONGEST:
+        if L.min() > SHORTEST and L.max() < LONGEST:
             return Furnace(u, resistance(L, gradient), L, gradient, v)
         seed += 1000

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps
+from driftfit.drivers import LARGEST, TrackerSteps
 from driftfit.kernel import Array, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.models.basis import PiecewiseLinear
@@ -169,7 +169,7 @@ def _steps(orders: tuple[int, int, int, int], nk: int, out: Curves, linear: bool
         power = 0.0
         for j in range(nb):
             for k in range(n_in):
-                known = known if abs(s.f_lag[k, nk + j, l]) < np.inf else 0.0
+                known = known if abs(s.f_lag[k, nk + j, l]) < LARGEST else 0.0
             power += s.theta[na + j, l] * s.theta[na + j, l]
         if s.begun[l] == 0 and s.cells[STARTED, l] > 0.0:
             past_levels(s.theta[:, l], s.g_lag[:, :, l], orders, s.w[:, l], s.S[:, :, l], s.p_w[l])
