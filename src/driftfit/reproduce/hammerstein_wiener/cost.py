@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -43,11 +44,11 @@ def measure(samples: int = 5000) -> dict[tuple[int, ...], dict[str, float]]:
         theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
         parts = empty(model, samples)
         row = {}
-        for method in METHODS[:3]:
-            row[method] = _least(lambda m=method: separate(theta, order, METHODS.index(m), *parts), samples)  # type: ignore[misc]
+        for place, method in enumerate(METHODS[:3]):
+            row[method] = _least(partial(separate, theta, order, place, *parts), samples)
         if model.n < 30:
             tracker = Kalman(q=1e-3, r=1.0, p0=1e2)
-            row["filter"] = _least(lambda m=model, k=tracker: track(m, k, y, u), samples)  # type: ignore[misc]
+            row["filter"] = _least(partial(track, model, tracker, y, u), samples)
         found[order] = row
     return found
 
