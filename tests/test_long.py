@@ -61,18 +61,31 @@ def test_an_unstable_system_with_bounded_output(tracker):
     assert root_mean_square(run.innovation[run.ok][1000:]) < 0.2
 
 
+def impulse(theta):
+    """The first responses of y to u, for mean parameters (4,)."""
+    a1, a2, b1, b2 = theta
+    y = [b1, a1 * b1 + b2]
+    for _ in range(6):
+        y.append(a1 * y[-1] + a2 * y[-2])
+    return np.array(y)
+
+
 @pytest.mark.parametrize("tracker", TRACKERS)
 def test_a_structure_that_changes_half_way(tracker):
-    """The second lags appear at half time: their parameters are 0 before and what they became after."""
+    """The second lags appear at half time: their parameters are 0 before and what they became after.
+
+    To a filter of the output error a pole that a zero cancels is as good as none: its response counts.
+    """
     half = LONG // 2
     path = np.where(np.arange(LONG)[:, None] < half, [0.7, 0.0, 1.0, 0.0], THETA)
     y, u = arx_record(LONG, 4, theta=path)
     run = track(model_of(tracker, ARX(2, 2)), tracker, y, u)
     theta = as_arx(tracker, run.theta)
-    np.testing.assert_allclose(theta[half - 2000 : half].mean(axis=0), path[0], atol=0.05)
-    np.testing.assert_allclose(theta[half + 1000 : half + 3000].mean(axis=0), THETA, atol=0.05)
-    np.testing.assert_allclose(theta[-2000:].mean(axis=0), THETA, atol=0.05)
-    if tracker.covariance:  # the term is told from 0 only where it exists
+    shown = impulse if tracker.output_error else np.asarray
+    np.testing.assert_allclose(shown(theta[half - 2000 : half].mean(axis=0)), shown(path[0]), atol=0.05)
+    np.testing.assert_allclose(shown(theta[half + 1000 : half + 3000].mean(axis=0)), shown(THETA), atol=0.05)
+    np.testing.assert_allclose(shown(theta[-2000:].mean(axis=0)), shown(THETA), atol=0.05)
+    if tracker.covariance and not tracker.output_error:  # the term is told from 0 only where it exists
         low, high = run.band()
         outside = (low[:, 1] > 0.0) | (high[:, 1] < 0.0)
         assert outside[1000:half].mean() < 0.1

@@ -225,13 +225,21 @@ def _intercept(run: Track) -> Array | None:
 
 def _warn(found: Blocks, run: Track) -> None:
     """Say where a separation cannot be relied on."""
+    used, n = int(run.ok.sum()), run.model.n
+    if used < n:
+        warnings.warn(
+            f"blocks: {used} usable samples cannot tell {n} products apart; what is shown is mostly the start.",
+            UserWarning,
+            stacklevel=4,
+        )
     late = slice(min(len(found) // 2, 5 * run.model.n), None)
     with np.errstate(invalid="ignore"):
         heads = 1.0 / np.linalg.norm(found.c[late], axis=1), 1.0 / np.linalg.norm(found.d[late], axis=1)
     for head, name, other in zip(heads, ("c_1", "d_1"), ('input="b1"', 'output="slope"'), strict=True):
-        if np.nanmin(head, initial=1.0) < WEAK:
+        usual = float(np.nanmedian(head)) if np.isfinite(head).any() else 1.0
+        if usual < WEAK:
             warnings.warn(
-                f"blocks: {name} = 1 is a bad gauge here, the other coefficients reach {1.0 / np.nanmin(head):.3g}; "
+                f"blocks: {name} = 1 is a bad gauge here, the other coefficients are {1.0 / usual:.3g} times as large; "
                 f"order the functions so that the first matters, or use {other}.",
                 UserWarning,
                 stacklevel=4,

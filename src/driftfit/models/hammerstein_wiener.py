@@ -140,14 +140,14 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return steps.memory(self.structure, self.nk, self.into.parameters, self.out.parameters, self.out.limits)
+        return steps.memory(
+            self.structure, self.nk, self.into.parameters, self.out.parameters, self.out.limits, self.output_noise
+        )
 
     @property
     def steps(self) -> ModelSteps:
         adaptive = self.into.adaptive
-        return steps.build(
-            self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive, self.output_noise
-        )
+        return steps.build(self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive)
 
     def touched(self, t: int, signal: str) -> range:
         """The samples that cannot be used when "y" or "u" is missing at t."""

@@ -37,15 +37,18 @@ INSIDE = 0.97
 FLOOR = 1e-4
 """Least variance of the equation error under measurement noise."""
 
-# places in `cells`: the grid, what was seen, where the output block is defined, and results
-LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW = range(12)
+# places in `cells`: the grid, what was seen, where the output block is defined, results, sigma^2 or 0
+LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE = range(13)
 
 
-def memory(structure: Structure, delay: int, into: Any, out: Any, limits: tuple[float, float]) -> dict[str, Any]:
+def memory(
+    structure: Structure, delay: int, into: Any, out: Any, limits: tuple[float, float], sigma: float | None
+) -> dict[str, Any]:
     """Fields of the record; ``into`` and ``out`` are the numbers of the bases."""
     na, nb, n_in, n_out, _ = structure
-    cells = np.zeros(12)
+    cells = np.zeros(13)
     cells[[LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED]] = np.inf, -np.inf, *limits, 1.0, np.nan
+    cells[VARIANCE] = 0.0 if sigma is None else sigma * sigma
     return {
         "f_lag": np.full((n_in, nb + delay), np.nan), "u_past": np.full(nb + delay, np.nan),
         "g_lag": np.full((n_out, max(na, 1)), np.nan), "h_lag": np.full((n_out, max(na, 1)), np.nan),
@@ -179,7 +182,7 @@ def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
     inverse = inverse_of(out)
 
     def lane_regress(
-        u: float, y: float, dt: float, orders: tuple[int, int, int, int, int], variance: float, theta: Array,
+        u: float, y: float, dt: float, orders: tuple[int, int, int, int, int], theta: Array,
         phi: Array, f_lag: Array, u_past: Array, g_lag: Array, h_lag: Array, g_now: Array, h_now: Array, d_now: Array,
         f_now: Array, into: Array, out: Array, curve: Array,
         level: Array, cells: Array,
@@ -239,6 +242,7 @@ def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
         if seen:
             cells[LOWEST] = min(cells[LOWEST], y)
             cells[HIGHEST] = max(cells[HIGHEST], y)
+        variance = cells[VARIANCE]
         factor = noise_factor(theta, d_now, h_now, h_lag, na, n_out, variance) if variance > 0.0 else 1.0
         return -g_now[0] if seen else np.nan, dt if started > 0.0 else 0.0, factor
 
@@ -283,20 +287,17 @@ def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
 
 
 @lru_cache
-def build(
-    structure: Structure, nk: int, into: Curves, out: Curves, linear: bool, adaptive: bool, sigma: float | None
-) -> ModelSteps:
-    """The steps of one structure; ``linear`` says that the output block is the identity, ``sigma`` that r follows."""
+def build(structure: Structure, nk: int, into: Curves, out: Curves, linear: bool, adaptive: bool) -> ModelSteps:
+    """The steps of one structure; ``linear`` says that the output block is the identity."""
     na, nb, n_in, _, _ = structure
     lane_regress, lane_push = _lane_steps(into, out)
     orders = (na, nb, nk, int(linear), int(adaptive))
-    variance = 0.0 if sigma is None else sigma * sigma
 
     @kernel
     def regress(s: State, l: int) -> None:
         s.cells[GIVEN, l] = s.noise[l]
         s.y[l], s.dt[l], factor = lane_regress(
-            s.u[0, l], s.y[l], s.dt[l], orders, variance, s.theta[:, l], s.phi[:, l], s.f_lag[:, :, l],
+            s.u[0, l], s.y[l], s.dt[l], orders, s.theta[:, l], s.phi[:, l], s.f_lag[:, :, l],
             s.u_past[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l], s.g_now[:, l], s.h_now[:, l], s.d_now[:, l],
             s.f_now[:, l], s.into[:, l], s.out[:, l],
             s.curve[:, :, l], s.level[:, l], s.cells[:, l],

@@ -7,9 +7,9 @@
     I      = [-R_d U + sqrt(R_d^2 U^2 - (R_d^2 + X_d^2)(U^2 - U_p^2))] / (R_d^2 + X_d^2)     current, kA (mOhm, V)
     R_arc  = U / I                                                measured, mOhm
 
-The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so the
-whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset: with d_1 = 1
-the b_j carry it and d stays. Score a, p1, p2, ratios b_j / b_1, and the local gain b_1 / F'(R).
+The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so
+that the whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset:
+with d_1 = 1 the b_j carry it and d stays. Score a, p1, p2, ratios b_j / b_1, and the local gain b_1 / F'(R).
 
 Source: Feng and Hong (2021), example 4. Departures: the working point L0 = 20 cm is ours (the paper says "around the
 working point"; about zero the length would be negative), and records whose arc leaves 2 to 45 cm are drawn again.

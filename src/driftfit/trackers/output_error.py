@@ -24,13 +24,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps
+from driftfit.drivers import LARGEST, TrackerSteps
 from driftfit.kernel import Array, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.models.basis import PiecewiseLinear
 from driftfit.models.curves import Curves
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.models.hammerstein_wiener_steps import GIVEN, PREDICTED, RAW, STARTED, STEP, inverse_of
+from driftfit.models.hammerstein_wiener_steps import GIVEN, HIGHEST, LOWEST, PREDICTED, RAW, STARTED, inverse_of
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.extended_kalman import minimal_cells, structure_of
@@ -38,7 +38,9 @@ from driftfit.trackers.extended_kalman import minimal_cells, structure_of
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
 REACH = 3.0
-"""Ranges of F within which w is held."""
+"""Times the largest w of the outputs seen: w is held within that."""
+FARTHEST = 1e6
+"""The same before any output was seen."""
 LARGEST_VARIANCE = 1e20
 """Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
 
@@ -169,13 +171,16 @@ def _steps(orders: tuple[int, int, int, int], nk: int, out: Curves, linear: bool
         power = 0.0
         for j in range(nb):
             for k in range(n_in):
-                known = known if abs(s.f_lag[k, nk + j, l]) < np.inf else 0.0
+                known = known if abs(s.f_lag[k, nk + j, l]) < LARGEST else 0.0
             power += s.theta[na + j, l] * s.theta[na + j, l]
         if s.begun[l] == 0 and s.cells[STARTED, l] > 0.0:
             past_levels(s.theta[:, l], s.g_lag[:, :, l], orders, s.w[:, l], s.S[:, :, l], s.p_w[l])
             s.begun[l] = 1
-        span = max(abs(s.level[0, l]), abs(s.level[s.level.shape[0] - 1, l]))
-        reach = REACH * span if s.cells[STEP, l] > 0.0 and not linear else 1e6
+        low, high = s.cells[LOWEST, l], s.cells[HIGHEST, l]
+        if not linear:
+            low, high = s.level[0, l], s.level[s.level.shape[0] - 1, l]
+        reach = REACH * max(abs(low), abs(high))
+        reach = reach if 0.0 < reach < np.inf else FARTHEST
         noise = s.q_w[l] + (0.0 if known > 0.0 else power * s.v_power[l])
         advance(s.theta[:, l], s.phi[:, l], s.w[:, l], s.S[:, :, l], s.row[:, l], s.moved[:, l], orders, noise, reach)
         for k in range(n_out - 1):

@@ -1,0 +1,156 @@
+"""The table of the reproduction: measured medians and worst seeds beside the reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.progress import track as progress
+from rich.table import Table
+
+from driftfit.kernel import Array
+from driftfit.reproduce.hammerstein_wiener import runs
+from driftfit.reproduce.hammerstein_wiener.runs import Errors, FurnaceRun
+from driftfit.systems.arc_furnace import furnace
+
+ORDERS = (4, 5, 6)
+CHECKED_UP_TO = 1.0
+"""Medians above this are spikes or failures, and are not compared."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was measured, by example and by seed."""
+
+    first: list[dict[str, Any]]
+    second: list[dict[tuple[str, float], float]]
+    third: list[dict[str, Any]]
+    raw: dict[int, list[FurnaceRun]]
+    legendre: list[FurnaceRun]
+    bias: dict[str, float]
+
+
+ROWS: tuple[tuple[str, str, str, float | None, str], ...] = (
+    ("1", "average", 'two-stage, "average"', 0.021, "11 to 37"),
+    ("1", "svd", '"svd"', 0.020, "0.035"),
+    ("1", "svd-joint", '"svd-joint"', 0.019, "0.033"),
+    ("1", "gls", '"gls"', 0.017, "0.031"),
+    ("1", "structured", 'Q of the shape of products, "gls"', 0.0153, "0.026"),
+    ("1", "ekf", "EKF on minimal parameters", 0.0150, "0.0235"),
+    ("1", "printed", "SVD as printed, no scale", 2.4, ""),
+    ("1", "one-step", "one-step rms", 0.016, ""),
+    ("1", "free run", "free run rms", 0.014, ""),
+    ("3", "clean svd-joint", 'noise-free, "svd-joint"', 0.012, ""),
+    ("3", "clean ekf", "noise-free, EKF", 0.009, ""),
+    ("3", "noisy average", '20 dB, Q = 10, "average"', 0.55, "238"),
+    ("3", "noisy svd-joint", '20 dB, Q = 10, "svd-joint"', 0.41, "3.4"),
+    ("3", "noisy start", "20 dB, the start for ever", 0.38, ""),
+    ("3", "slow svd-joint", '20 dB, Q/R = 1e-3, "svd-joint"', 0.096, "0.15"),
+    ("3", "aware gls", '20 dB, noise-aware, "gls"', 0.078, ""),
+    ("3", "aware ekf", "20 dB, noise-aware, EKF", 0.075, ""),
+    ("3", "output error", "20 dB, output-error EKF from 300", 0.056, "0.074"),
+    ("3", "nis", "20 dB, its mean NIS", 0.98, ""),
+    ("3", "noisy one-step", "20 dB, one-step rms, Q/R = 1e3", 0.60, ""),
+    ("3", "slow one-step", "20 dB, one-step rms, Q/R = 1e-3", 0.076, ""),
+    ("3", "slow free run", "20 dB, free run rms", 0.060, ""),
+)
+"""(example, key, what, reference of the median, reference of the worst seed)."""
+ARRIVALS = {
+    ("two-stage", 0.01): "14", ("two-stage", 10.0): "14", ("two-stage", 1000.0): "16 (most 19)",
+    ("ekf", 0.01): "94 (96 % of runs)", ("ekf", 10.0): "204", ("ekf", 1000.0): "fails in 92 % of runs",
+    ("inflated", 0.01): "67", ("inflated", 10.0): "139", ("inflated", 1000.0): "370 (83 % of runs)",
+}  # fmt: skip
+BIAS = {"40 dB": 0.002, "30 dB": 0.018, "20 dB": 0.167, "10 dB": 0.82, "equation 0.05": 0.005, "equation 0.2": 0.089}
+RAW = {4: 0.36, 5: 0.43, 6: 0.47}
+
+
+def measure(seeds: int, quick: bool = False) -> Found:
+    """Run everything."""
+    numbers = range(seeds)
+    furnaces = [furnace(s) for s in range(1 if quick else min(seeds, 20))]
+    orders = ORDERS[:1] if quick else ORDERS
+    return Found(
+        [runs.first_example(s) for s in progress(numbers, "example 1", transient=True)],
+        [runs.second_example(s) for s in progress(numbers, "example 2", transient=True)],
+        [runs.third_example(s) for s in progress(numbers, "example 3", transient=True)],
+        {q: [runs.fourth_example(f, q, True, "average") for f in furnaces] for q in orders},
+        [runs.fourth_example(f, 4, False, "svd") for f in furnaces],
+        _bias(seeds),
+    )
+
+
+def _bias(seeds: int) -> dict[str, float]:
+    """Median over the seeds of the error of batch least squares."""
+    settings: dict[str, tuple[float | None, float]] = {f"{db} dB": (float(db), 0.0) for db in (40, 30, 20, 10)}
+    settings |= {f"equation {e}": (None, e) for e in (0.05, 0.2)}
+    return {name: float(np.median([runs.bias(db, e, s) for s in range(seeds)])) for name, (db, e) in settings.items()}
+
+
+def values(found: Found, example: str, key: str) -> tuple[float, float]:
+    """Median over the seeds of the median, and the worst rms (NaN for plain numbers)."""
+    rows = [seed[key] for seed in (found.first if example == "1" else found.third)]
+    if isinstance(rows[0], Errors):
+        return float(np.median([row.median for row in rows])), float(max(row.rms for row in rows))
+    return float(np.median(rows)), float("nan")
+
+
+def arrivals(found: Found, key: tuple[str, float]) -> tuple[float, float]:
+    """Median of the samples to arrive over the runs that did, and the share that did."""
+    rows = np.array([seed[key] for seed in found.second])
+    there = np.isfinite(rows)
+    return (float(np.median(rows[there])) if there.any() else float("inf")), float(there.mean())
+
+
+def end(paths: list[Array], last: int = 1000) -> float:
+    """Median over the records of the median of the last samples."""
+    return float(np.median([np.median(path[-last:]) for path in paths]))
+
+
+def gains(found: Found) -> list[float]:
+    """Median local gain over the true one near samples 500, 1500, 3000 and 4800."""
+    at = (500, 1500, 3000, 4800)
+    return [float(np.median([np.median(run.gain[t - 50 : t + 50]) for run in found.legendre])) for t in at]
+
+
+def table(found: Found) -> Table:
+    """Measured beside the reference."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, title="Errors of the parameters", title_justify="left")
+    for head, justify in (("", "left"), ("what", "left"), ("median", "right"), ("(reference)", "right"),
+                          ("worst rms", "right"), ("(reference)", "right")):  # fmt: skip
+        shown.add_column(head, justify=justify)  # type: ignore[arg-type]
+    for example, key, what, median, worst in ROWS:
+        now, most = values(found, example, key)
+        cells = (f"{now:.4g}", f"{median:g}", "" if np.isnan(most) else f"{most:.3g}", worst)
+        shown.add_row(example, what, *cells)
+    shown.add_section()
+    for run, reference in ARRIVALS.items():
+        samples, share = arrivals(found, run)
+        what = f"samples to arrive, {run[0]}, theta0 = {run[1]:g}"
+        shown.add_row("2", what, f"{samples:.0f} ({100 * share:.0f} %)", reference, "", "")
+    shown.add_section()
+    for name, reference_bias in BIAS.items():
+        shown.add_row("", f"batch least squares, {name}", f"{found.bias[name]:.3g}", f"{reference_bias:g}", "", "")
+    shown.add_section()
+    for q, paths in found.raw.items():
+        shown.add_row("4", f'raw powers, "average", Er, q = {q}', f"{end([r.a + r.b + r.p for r in paths]):.3g}",
+                      f"{RAW[q]:g}", "", "")  # fmt: skip
+    for name, reference in (("a", "7e-5"), ("p", "6e-4")):
+        ends: list[Array] = [getattr(run, name) for run in found.legendre]
+        what = f'Legendre q = 4, "svd", squared error of {name}'
+        shown.add_row("4", what, f"{end(ends):.2g}", reference, "", "")
+    ratios = " ".join(f"{g:.2f}" for g in gains(found))
+    shown.add_row("4", "Legendre, local gain at 500, 1500, 3000, 4800", ratios, "0.6 0.97 1.00 1.00", "", "")
+    return shown
+
+
+def worst_ratio(found: Found) -> tuple[float, str]:
+    """The largest relative deviation of a median from its reference, half a unit of its last digit allowed."""
+    worst = (0.0, "")
+    for example, key, what, reference, _ in ROWS:
+        if reference is not None and reference < CHECKED_UP_TO:
+            digits = len(f"{reference:g}".partition(".")[2])
+            off = max(abs(values(found, example, key)[0] - reference) - 0.5 * 10.0**-digits, 0.0) / reference
+            worst = max(worst, (float(off), f"example {example}, {what}"))
+    return worst

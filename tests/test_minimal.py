@@ -1,0 +1,213 @@
+"""Filters on minimal parameters, hand-off, free run, diagnostics, the furnace."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from support import same
+
+from driftfit import Kalman, Live, Regression, track, tune
+from driftfit.blocks.diagnostics import diagnose_blocks
+from driftfit.blocks.free_run import free_run, reflected
+from driftfit.blocks.hand_off import hand_off
+from driftfit.models.basis import DeadZone, Legendre, Polynomial
+from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.systems.arc_furnace import THRESHOLDS, A, furnace, length, resistance
+from driftfit.systems.drift import RandomWalk
+from driftfit.systems.hammerstein_wiener import simulate, unstable_in_closed_loop
+from driftfit.trackers.extended_kalman import ExtendedKalman
+from driftfit.trackers.output_error import OutputError
+
+SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
+K = Kalman(q=1e-5, r=1e-4, p0=1e2, theta0=0.01)
+SIGMA = 0.03
+
+
+def record(T=400, seed=0, noise=0.0):
+    """A small system whose every parameter walks, and measurement noise."""
+    rng = np.random.default_rng(seed)
+    laws = [[RandomWalk(x, 1e-3) for x in group] for group in ((-0.5,), (0.5, -0.3), (0.3,), (0.1,))]
+    s = simulate(SMALL, *laws, T=T, rng=rng, u=rng.uniform(-1.0, 1.0, T))
+    return s._replace(y=s.y0 + noise * rng.normal(size=T))
+
+
+def naive_ekf(model, phi, z, q, r, p0, xi, inflation):
+    """The filter as its equations say, with full matrices and the Joseph form."""
+    P = p0 * np.eye(len(xi))
+    path = []
+    for x, value in zip(phi, z, strict=True):
+        if np.isfinite(x).all() and np.isfinite(value):
+            P = P + q * np.eye(len(xi))
+            H = x @ model.structure.jacobian(xi)
+            h = H @ P @ H
+            s = (1.0 + inflation) * h + r
+            k = P @ H / s
+            xi = xi + k * (value - x @ model.structure.products(xi))
+            left = np.eye(len(xi)) - np.outer(k, H)
+            P = left @ P @ left.T + (s - h) * np.outer(k, k)
+        path.append(xi)
+    return np.array(path), P
+
+
+@pytest.mark.parametrize("inflation", [0.0, 1.0])
+def test_the_extended_filter_is_its_naive_twin(inflation):
+    s = record(150)
+    start = s.xi[0] + 0.1
+    ekf = ExtendedKalman(q=1e-5, r=1e-4, p0=0.1, theta0=start, inflation=inflation)
+    run = track(SMALL, ekf, s.y, s.u)
+    u, y = s.u, s.y
+    phi = np.full((150, SMALL.n), np.nan)
+    for t in range(2, 150):
+        phi[t] = [y[t - 1], -u[t - 1], -u[t - 2], y[t] ** 2, -(u[t - 1] ** 2), -(u[t - 2] ** 2), y[t - 1] ** 2]
+    path, P = naive_ekf(SMALL, phi, -y, 1e-5, 1e-4, 0.1, start, inflation)
+    assert_allclose(run.theta, path, rtol=1e-8, atol=1e-10)
+    assert_allclose(run.cov(-1), P, rtol=1e-6, atol=1e-12)
+    assert run.names == ("a1", "b1", "b2", "c2", "d2")
+    root = run.prediction[100]
+    xi = run.theta[99]
+    right = -np.delete(phi[100] * SMALL.structure.products(xi), 3).sum()
+    assert root + xi[4] * root**2 == pytest.approx(right, abs=1e-9)
+    found = run.blocks()
+    assert same(found.xi, run.theta)
+    assert_allclose(found.std.c[:, 1], run.std[:, 3])
+
+
+def test_minimal_filters_want_their_model():
+    for tracker in (ExtendedKalman(q=1e-5, r=1e-4), OutputError(q=1e-5, r=1e-4)):
+        with pytest.raises(ValueError, match="HammersteinWiener"):
+            track(Regression(1), tracker, [1.0, 2.0], [1.0, 1.0])
+        with pytest.raises(ValueError, match="cannot be told apart"):
+            track(HammersteinWiener(0, 1, input=Polynomial(2)), tracker, [1.0, 2.0], [1.0, 1.0])
+
+
+def test_hand_off_continues_the_record():
+    s = record(300)
+    found = hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u)
+    assert 21 <= found.at < 100
+    assert found.xi.shape == s.xi.shape
+    assert len(found.then) == 300 - found.at - 1
+    assert found.then.ok.all()  # the lags came along
+    error = np.linalg.norm(found.xi - s.xi, axis=1)
+    assert np.median(error[200:]) < 0.03
+    first = found.first.blocks("gls")
+    assert same(found.then.tracker.theta0, tuple(first.xi[-1]))
+    with pytest.raises(ValueError, match="leaves nothing"):
+        hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u, at=299)
+    with pytest.raises(ValueError, match="no window"):
+        hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, np.zeros(300))
+
+
+def test_the_output_error_filter_is_honest_under_measurement_noise():
+    """Item 15: mean NIS near 1, and no bias where stage one has one."""
+    nis, errors, stage = [], [], []
+    for seed in range(4):
+        s = record(1500, seed, SIGMA)
+        noisy = replace(SMALL, output_noise=SIGMA)
+        start = Kalman(q=1e-6, r=1.0, p0=1e2, theta0=0.01)
+        found = hand_off(noisy, start, OutputError(q=1e-6, r=SIGMA**2), s.y, s.u, at=150)
+        nis.append(np.nanmean((found.then.innovation / found.then.innovation_std) ** 2))
+        errors.append(np.median(np.linalg.norm(found.then.theta - s.xi[151:], axis=1)[-500:]))
+        run = track(noisy, start, s.y, s.u)
+        stage.append(np.median(np.linalg.norm(run.blocks("gls").xi - s.xi, axis=1)[-500:]))
+    assert 0.8 < np.mean(nis) < 1.25
+    assert np.median(errors) < np.median(stage)
+    missing = s.y.copy()
+    missing[[400, 401, 700]] = np.nan
+    run = track(SMALL, replace(found.then.tracker, q_w=1e-6), missing, s.u)
+    assert np.flatnonzero(~run.ok)[-3:].tolist() == [400, 401, 700]
+    assert np.isfinite(run.prediction[[400, 401, 700, 702]]).all()
+    z = run.innovation / run.innovation_std
+    terms = -0.5 * (np.log(2.0 * np.pi * run.innovation_std**2) + z * z)
+    assert run.loglik == pytest.approx(terms[run.ok].sum())
+
+
+def test_a_free_run_needs_no_outputs():
+    s = record(400)
+    run = track(SMALL, K, s.y, s.u)
+    free = free_run(run)
+    assert np.isnan(free.y[:50]).all()
+    assert np.sqrt(np.nanmean((free.y - s.y) ** 2)) < 0.1 * s.y.std()
+    assert free.rising[50:].all()
+    assert free.stable.all()
+    poles = np.roots(np.r_[1.0, reflected(np.array([-2.5, 1.0]))])
+    assert_allclose(np.sort(poles), [0.5, 0.5], atol=1e-6)
+
+
+def test_diagnostics_tell_good_from_bad():
+    s = record(300)
+    run = track(SMALL, K, s.y, s.u)
+    found = diagnose_blocks(run, every=20)
+    assert found.trusted[3:].all()
+    assert found.dull() == ()
+    y, u = s.y, s.u
+    seen = [
+        [y[t - 1], -u[t - 1], -u[t - 2], y[t] ** 2, -(u[t - 1] ** 2), -(u[t - 2] ** 2), y[t - 1] ** 2]
+        for t in range(279, 300)
+    ]
+    scaled = np.array(seen) / np.linalg.norm(seen, axis=0)
+    assert found.excitation[-1] == pytest.approx(np.linalg.eigvalsh(scaled.T @ scaled)[0], rel=1e-6)
+    P = run.cov(299)
+    assert found.trace[-1] == pytest.approx(np.trace(P))
+    assert found.memory[-1] == pytest.approx((np.linalg.eigvalsh(P)[-1] + 1e-5) / 1e-5)
+    assert found.radius[-1] == pytest.approx(abs(run.blocks().a[-1, 0]))
+    dull = diagnose_blocks(track(SMALL, K, s.y, np.full(300, 0.5)), every=100)
+    assert not dull.trusted.any()
+    assert {"b1", "b2"} <= set(dull.dull())
+    bent = run.theta[-1].copy()
+    bent[3] = -9.0
+    run._out["theta"][-1, :, 0] = bent
+    assert diagnose_blocks(run, every=300).slope[0] < 0.0
+    with pytest.raises(ValueError, match="at least 21"):
+        diagnose_blocks(run, window=5)
+
+
+def test_an_estimate_that_does_not_increase_is_flagged_and_predicted_with_its_envelope():
+    s = record(200)
+    run = track(SMALL, K, s.y, s.u)
+    live = Live(SMALL, K)
+    for t in range(200):
+        live.update(float(s.y[t]), float(s.u[t]))
+    live._tile["theta"][0, 3, 0] = -5.0
+    y_hat, _ = live.predict(0.3)
+    assert np.isfinite(y_hat)
+    assert s.y.min() - np.ptp(s.y) < y_hat < s.y.max() + np.ptp(s.y)
+    run._out["theta"][:, 3, 0] = -5.0
+    assert not free_run(run).rising[60:].any()
+
+
+def test_an_unstable_block_with_a_bounded_output_is_followed():
+    s = unstable_in_closed_loop(600)
+    assert s.unstable == 0
+    assert np.abs(s.y).max() < 10.0
+    run = track(s.model, Kalman(q=1e-5, r=1e-4, p0=1e4), s.y, s.u)
+    found = run.blocks()
+    assert_allclose(found.a[-1], s.a[-1], atol=0.02)
+    assert found.radius[-1] == pytest.approx(1.05, abs=0.02)
+
+
+def test_the_likelihood_finds_the_drift():
+    """The concentrated likelihood with the Jacobian, over a grid of ratios run as lanes."""
+    s = record(400)
+    tuned = tune(SMALL, Kalman(), s.y, s.u)
+    ratio = tuned.tracker.q[0] / tuned.tracker.r
+    assert ratio > 1e-2  # without measurement noise there is little but drift
+    noisy = tune(SMALL, Kalman(), *record(400, noise=0.1)[1:3])
+    assert noisy.tracker.q[0] / noisy.tracker.r < 0.01 * ratio
+    run = track(SMALL, tuned.tracker, s.y, s.u)
+    assert run.loglik == pytest.approx(tuned.loglik, rel=1e-6)
+
+
+def test_the_furnace():
+    """Item 16, and what can be known of it."""
+    f = furnace(0, T=1500)
+    assert_allclose(length(f.R, f.gradient), f.L, rtol=1e-10)
+    L = np.linspace(2.0, 45.0, 50)
+    assert (np.diff(resistance(L, np.full(50, 4.0))) > 0.0).all()
+    numeric = (length(f.R + 1e-7, f.gradient) - length(f.R - 1e-7, f.gradient)) / 2e-7
+    assert_allclose(f.length_per_resistance, numeric, rtol=1e-6)
+    model = HammersteinWiener(3, 3, input=DeadZone(3.0), output=Legendre(2, (f.R.min(), f.R.max())))
+    run = track(model, Kalman(q=1.0, r=0.01, p0=1e8, theta0=0.01), f.R, f.u)
+    found = run.blocks("svd")
+    assert_allclose(np.median(found.c[-200:, 1:], axis=0), THRESHOLDS, atol=0.1)
+    assert_allclose(np.median(found.a[-200:], axis=0), A, atol=0.3)
