@@ -198,12 +198,15 @@ class Track:
         The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
         each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
         time; the samples are sorted by it, smoothed in that order, and put back. ValueError for a tracker that is no
-        random walk in Gaussian noise.
+        random walk in Gaussian noise. A `Bank` is smoothed given the events that it found
+        (`driftfit.hypotheses.smooth.EventSmoothed`).
         """
         from driftfit.smoothers.smoothed import Smoothed
 
         if self._start is not None:
             raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
+        if "report" in self.tracker.outputs:
+            return cast("Smoothed", self.hypotheses.smooth())
         return Smoothed.of(self, keep, order_by)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
