@@ -160,3 +160,18 @@ def test_the_bank_without_settings_has_no_scale():
     other = track(ARX(2, 2), Bank(), 1e3 * y, 1e-2 * u)
     np.testing.assert_allclose(other.theta[20:, :2], one.theta[20:, :2], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(other.theta[20:, 2:], 1e5 * one.theta[20:, 2:], rtol=1e-6, atol=1e-4)
+
+
+@pytest.mark.parametrize("bank", [BANK, Bank()], ids=["known", "unknown noise"])
+def test_an_operator_is_believed(bank):
+    y, u = record(60, 5, ())
+    live = Live(Regression(N), bank)
+    for t in range(50):
+        live.update(y[t], u[t])
+    before = live.cov
+    live.reset(p=[0.5, 0.0], theta=[3.0, 4.0])
+    np.testing.assert_allclose(live.hypotheses.mixture().mean, [3.0, 4.0])
+    np.testing.assert_allclose(live.cov - before, np.diag([0.5, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(live.hypotheses.mixture().cov, live.cov, atol=1e-9)
+    live.update(None, u[50])
+    np.testing.assert_allclose(live.theta, [3.0, 4.0])

@@ -207,7 +207,7 @@ class Live:
             self.tracker.widen(self.lane(), moved)
         if theta is not None:
             values = vector("Live.reset", "theta", numbers("Live.reset", "theta", theta), count)
-            self._tile["theta"][0, chosen, 0] = values
+            self.tracker.place(self.lane(), chosen, values)
 
     def _chosen(self, which: Any) -> list[int]:
         """Indices of parameters."""

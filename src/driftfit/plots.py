@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from driftfit.fleet import Fleet
     from driftfit.outputs import Outputs
     from driftfit.result import Track
+    from driftfit.smoothers.piecewise import Segments
     from driftfit.smoothers.smoothed import Smoothed
 
 BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
@@ -182,6 +183,29 @@ def plot_smoothed(smoothed: Smoothed, level: float = 0.95) -> Figure:
             axis.grid(alpha=0.25, lw=0.5)
     axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
     axes[-1].set_xlabel("time" if smoothed.run._time is not None else "sample")
+    return figure
+
+
+def plot_segments(segments: Segments, level: float = 0.95) -> Figure:
+    """Constant parameters with bands, stretch by stretch, over the tracked path."""
+    run, n = segments.run, len(segments.names)
+    figure = new_figure(9.0, 1.7 * n + 0.8)
+    axes = figure.subplots(n, 1, sharex=True, squeeze=False).ravel()
+    half = NormalDist().inv_cdf(0.5 + level / 2.0) * segments.std
+    for i, axis in enumerate(axes):
+        axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, label="tracked")
+        for k, (a, b) in enumerate(zip(segments.bounds[:-1], segments.bounds[1:], strict=True)):
+            reach, value = run.time[[a, b - 1]], segments.theta[k, i]
+            axis.plot(reach, [value, value], color=BLUE, lw=1.6, label="segment" if k == 0 else None)
+            if np.isfinite(half[k, i]):
+                axis.fill_between(reach, value - half[k, i], value + half[k, i], color=BLUE, alpha=0.2, lw=0)
+        low, high = segments.theta[:, i] - half[:, i], segments.theta[:, i] + half[:, i]
+        frame(axis, np.concatenate([low, high, run.theta[settled(run), i]]))
+        axis.set_ylabel(segments.names[i])
+        axis.grid(alpha=0.25, lw=0.5)
+    axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
+    axes[-1].set_xlabel(time_label(run))
+    date_axis(axes[-1], run)
     return figure
 
 

@@ -204,12 +204,16 @@ class Track(Judged):
         each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
         time; the samples are sorted by it, smoothed in that order, and put back. ``undetermined``: what to give for
         parameters that the record does not determine, whose std is inf: "min_norm", the answer nearest to theta0;
-        "nan"; or "raise". ValueError for a tracker that is no random walk in Gaussian noise.
+        "nan"; or "raise". A `Bank` is smoothed given the events that it found
+        (`driftfit.hypotheses.smooth.EventSmoothed`). ValueError for another tracker that is no random walk in Gaussian
+        noise.
         """
         from driftfit.smoothers.smoothed import Smoothed
 
         if self._start is not None:
             raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
+        if "report" in self.tracker.outputs:
+            return cast("Smoothed", self.hypotheses.smooth())
         return Smoothed.of(self, keep, order_by, undetermined)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:

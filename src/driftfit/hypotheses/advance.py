@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.hypotheses.forecast import expect
+from driftfit.hypotheses.forecast import expect, expect_together, simple
 from driftfit.hypotheses.grow import grow
 from driftfit.hypotheses.leaves import (
     AGE,
@@ -50,7 +50,9 @@ from driftfit.hypotheses.plan import (
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
 from driftfit.kernel import Array, core, floats, kernel, outside, wholes
 
-LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, COUNT = range(12)
+LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
+    range(13)
+)
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample.
 """
@@ -75,38 +77,44 @@ def reduce(
     expanded = many[EXPANDED] > 0
     parent, event, start, order = links[0], links[1], links[2], links[3]
     now[KEPT] = 1.0
-    if kind == REFILTER:
-        if many[STORED] < int(knobs[DEPTH]):
-            for l in range(L):
-                group[l] = l
-            K = L
-        else:
-            K = refilter(
+    full = kind == REFILTER and many[STORED] >= int(knobs[DEPTH])
+    if kind == REFILTER and not full:
+        for l in range(L):
+            group[l] = l
+        many[GROUPS] = L
+    alone = kind != INTERACT and not full and sort(group, L, many[GROUPS], start, order) == many[GROUPS]
+    if not alone and not expanded:
+        write_out(T, L, H, Hm, parent, event, T2)
+        flip(many)
+        T, T2 = T2, T
+    if full:
+        many[STORED] -= 1
+        return int(
+            refilter(
                 root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
                 now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, Qt, X,
-            )  # fmt: skip
-            many[STORED] -= 1
-            if not expanded:
-                write_out(T, L, H, Hm, parent, event, T2)
-            return int(K)
-        many[GROUPS] = K
+            )
+        )  # fmt: skip
+    flip(many)
     if kind == INTERACT:
-        if not expanded:
-            write_out(T, L, H, Hm, parent, event, T2)
         return int(mix(B, L, prior, n, na, unknown, A, order, X[0], T, T2))
     G = many[GROUPS]
-    if sort(group, L, G, start, order) == G:
+    if alone:
         pick(T, expanded, H, Hm, parent, event, order, G, T2)
         take(B, order, G, FIRST + n + n * (n + 1) // 2 + na, A)
     else:
-        if not expanded:
-            write_out(T, L, H, Hm, parent, event, T2)
         combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
     kept = 0.0
     for l in range(L):
         kept += B[WEIGHT, l] if group[l] >= 0 else 0.0
     now[KEPT] = min(kept, 1.0)
     return int(G)
+
+
+@core
+def flip(many: Array) -> None:
+    """The two tables of the past change places."""
+    many[FLIPPED] = 1 - many[FLIPPED]
 
 
 @core
@@ -155,6 +163,8 @@ def advance(
     n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
     tri = n * (n + 1) // 2
     kind, parent, event = int(knobs[KIND]), links[0], links[1]
+    first_table, second_table = T, T2
+    T, T2 = (T2, T) if many[FLIPPED] > 0 else (T, T2)
     noise, still = now[IN_NOISE], now[IN_DT] == 0.0
     told, first = given[0] == given[0], many[FLOORS] == 0
     row = given if told else initial if first else P[0]
@@ -172,11 +182,18 @@ def advance(
     priors(T, event, expanded, first, alike, L, P, row, prior)
     if still:
         standstill(prior, L, Hm)
-    regressors(phi, B, L, n, na, Z)
-    blur(B, L, n, prior, Hm, Qt, maps, theta0, alike, C, m, factor)
-    spread(C, Z, m, L, g, h, y_hat)
     variance_factor(B, L, unknown, factor)
-    now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
+    plain = na == 0 and simple(maps, sensors)
+    if plain:
+        now[Y_HAT], now[S2] = expect_together(
+            B[WEIGHT], L, factor, prior, phi, theta, cov, Qt, sensors, now[R] * noise, scratch
+        )
+    if not plain or now[IN_OK] == 0.0:
+        regressors(phi, B, L, n, na, Z)
+        blur(B, L, n, prior, Hm, Qt, maps, theta0, alike, C, m, scratch[0])
+        spread(C, Z, m, L, g, h, y_hat)
+    if not plain:
+        now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
 
     if now[IN_OK] > 0.0:
         K = reduce(
@@ -187,6 +204,7 @@ def advance(
             increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
             store(samples[many[STORED]], now, phi)
             many[STORED] += 1
+        T, T2 = (second_table, first_table) if many[FLIPPED] > 0 else (first_table, second_table)
         many[EXPANDED] = 0
         own = kind == INTERACT
         if own:
@@ -232,6 +250,8 @@ def advance(
                     B[FIRST + n + k, l] = C[k, l]
             if not expanded:
                 write_out(T, L, H, Hm, parent, event, T2)
+                flip(many)
+                T, T2 = T2, T
                 many[EXPANDED] = 1
             shift(T, L, prior, Hm)
             many[FLOORS] += 1

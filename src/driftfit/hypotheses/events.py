@@ -8,11 +8,14 @@ them, its interval the fewest that hold nine tenths of the mass.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from driftfit.kernel import Array
+
+if TYPE_CHECKING:
+    from driftfit.hypotheses.smooth import EventSmoothed
 
 FAINT = 0.02
 """Probability below which a sample does not count to a cluster."""
@@ -54,6 +57,15 @@ class Event:
         """The same, counted from another sample."""
         times = {name: getattr(self, name) + by for name in ("date", "first", "last", "known")}
         return replace(self, **times)
+
+    def measured(self, smoothed: EventSmoothed) -> Event:
+        """The same, with how far each parameter moved."""
+        mean, cov = smoothed.increment(self.date)
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        names = smoothed.names
+        return replace(
+            self, shift=dict(zip(names, mean.tolist(), strict=True)), std=dict(zip(names, std.tolist(), strict=True))
+        )
 
     def row(self) -> dict[str, Any]:
         """For a table."""

@@ -56,3 +56,51 @@ def expect(
     if mass != 1.0:
         variance /= mass
     return mean, variance if noise < np.inf else np.inf
+
+
+@core
+def simple(maps: Array, sensors: Array) -> bool:
+    """Whether all changes are walks and all sensors differ in their noise alone."""
+    other = 0
+    for i in range(len(maps)):
+        other += 1 if maps[i, 0] != 1.0 or maps[i, 1] != 0.0 else 0
+    for j in range(len(sensors)):
+        other += 1 if sensors[j, VALUE] != 0.0 or sensors[j, FROZEN] > 0.0 else 0
+    return other == 0
+
+
+@core
+def expect_together(
+    w: Array, L: int, factor: Array, prior: Array, phi: Array, theta: Array, P: Array, Q: Array, sensors: Array,
+    r: float, X: Array,
+) -> tuple[float, float]:  # fmt: skip
+    """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
+
+        y = z' mean,   s = z' (cov + sum_i f_i Q_i) z + sum_j f_j factor_j r,
+
+    f being the probabilities of events, times what covariances are in units of.
+    """
+    n, Hm = len(phi), len(sensors)
+    Hd, part, share = len(prior) // Hm, X[0], X[1]
+    rest = 0.0
+    for i in range(Hd):
+        share[i] = 0.0
+    for e in range(len(prior)):
+        for l in range(L):
+            part[l] = w[l] * (factor[l] * prior[e, l])
+        f = total(part, L)
+        share[e // Hm] += f
+        rest += f * sensors[e % Hm, FACTOR]
+    mean, wide = 0.0, 0.0
+    for i in range(n):
+        g = 0.0
+        for j in range(n):
+            row, column = max(i, j), min(i, j)
+            at = row * (row + 1) // 2 + column
+            step = 0.0
+            for k in range(Hd):
+                step += share[k] * Q[k, at]
+            g += (P[row, column] + step) * phi[j]
+        mean += phi[i] * theta[i]
+        wide += phi[i] * g
+    return mean, wide + rest * r

@@ -153,7 +153,7 @@ def grow(
     spread(C, Z, m, columns, g, h, y_hat)
     for j in range(Hm):
         block = slice(j * columns, (j + 1) * columns)
-        inherit(A, K, B, block)
+        inherit(A, K, B, block, unknown, bases)
         if sensors[j, FROZEN] > 0.0:
             leave(B, block, n, C, m)
             frozen(B[NU, block], B[S, block], y, last, sensors[j, WIDTH], r, unknown, likely)
@@ -170,13 +170,16 @@ def grow(
 
 
 @core
-def inherit(A: Array, K: int, B: Array, block: slice) -> None:
-    """What children have of their parents: log w, nu, S, codes, age."""
+def inherit(A: Array, K: int, B: Array, block: slice, unknown: bool, bases: Array) -> None:
+    """What children have of their parents: log w, age, nu and S, and the codes that are kept."""
     for row in range(LOG, FIRST):
-        for at in range(block.start, block.stop, K):
-            to = B[row, at : at + K]
-            for l in range(K):
-                to[l] = A[row, l]
+        needed = row in (LOG, AGE) or (unknown and row in (NU, S))
+        coded = (row == CODE and bases[0] > 1.0) or (row == SENSORS and bases[1] > 1.0)
+        if needed or coded or (row == CHANGES and bases[2] > 1.0):
+            for at in range(block.start, block.stop, K):
+                to = B[row, at : at + K]
+                for l in range(K):
+                    to[l] = A[row, l]
 
 
 @core

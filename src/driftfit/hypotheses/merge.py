@@ -137,9 +137,6 @@ def combine(
             match(B, members, n, na, unknown, part, A, k)
             A[LOG, k] = math.log(mass)
         average(T, members, part, T2, k)
-    for row in range(len(T)):
-        for k in range(G):
-            T[row, k] = T2[row, k]
     normalise(A, G)
 
 
@@ -175,8 +172,5 @@ def mix(
         match(B, order[:count], n, na, unknown, share[:count], A, e)
         average(T, order[:count], share[:count], T2, e)
         A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
-    for row in range(len(T)):
-        for e in range(H):
-            T[row, e] = T2[row, e]
     normalise(A, H)
     return H

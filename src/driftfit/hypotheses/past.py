@@ -8,7 +8,7 @@ every leaf.
 from __future__ import annotations
 
 from driftfit.hypotheses.leaves import WEIGHT
-from driftfit.kernel import Array, core
+from driftfit.kernel import Array, core, kernel
 
 
 @core
@@ -26,9 +26,6 @@ def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, T2
     for row in range(2 * block - 1, len(T), block):
         for l in range(L):
             T2[row, l] *= T2[H, l]
-    for row in range(len(T)):
-        for l in range(L):
-            T[row, l] = T2[row, l]
 
 
 @core
@@ -75,9 +72,6 @@ def pick(
         for row in range(2 * block - 1, len(T), block):
             for k in range(G):
                 T2[row, k] *= T2[H, k]
-    for row in range(len(T)):
-        for k in range(G):
-            T[row, k] = T2[row, k]
 
 
 @core
@@ -88,6 +82,18 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
     for k in range(len(members)):
         for row in range(len(T)):
             T2[row, to] += share[k] * T[row, members[k]]
+
+
+@kernel
+def dot(a: Array, b: Array, count: int) -> float:
+    """Sum of products, in two interleaved chains."""
+    one, two = 0.0, 0.0
+    for l in range(0, count - 1, 2):
+        one += a[l] * b[l]
+        two += a[l + 1] * b[l + 1]
+    if count % 2 > 0:
+        one += a[count - 1] * b[count - 1]
+    return one + two
 
 
 @core
@@ -104,8 +110,7 @@ def marginals(
     if expanded:
         for k in range(W):
             for e in range(H):
-                for l in range(L):
-                    lags[k, e] += w[l] * T[k * block + e, l]
+                lags[k, e] = dot(w, T[k * block + e], L)
         for l in range(L):
             quiet += w[l] * T[last, l]
         return 1.0 - min(quiet, 1.0)
@@ -116,9 +121,7 @@ def marginals(
         mass[parent[l]] += w[l]
     for k in range(1, W):
         for e in range(H):
-            row = (k - 1) * block + e
-            for l in range(K):
-                lags[k, e] += mass[l] * T[row, l]
+            lags[k, e] = dot(mass, T[(k - 1) * block + e], K)
     for l in range(K):
         mass[l] = 0.0
     for l in range(L):

@@ -18,6 +18,7 @@ from driftfit.kernel import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.hypotheses.smooth import EventSmoothed
     from driftfit.live import Live
     from driftfit.result import Track
     from driftfit.trackers.bank import Bank
@@ -181,8 +182,25 @@ class Hypotheses:
         rows = self.latest[after:T]
         return [Decision(after + k, T - 1, int(p.argmax()), float(p.max())) for k, p in enumerate(rows) if p[0] == p[0]]
 
+    def smooth(self, threshold: float = 0.5) -> EventSmoothed:
+        """The path of the whole record given the events."""
+        from driftfit.hypotheses.smooth import EventSmoothed
+
+        return EventSmoothed(self.run, self._found(threshold))
+
     def events(self, threshold: float = 0.5) -> list[Event]:
-        """Changes and sensor faults whose probability exceeds the threshold, in order of time."""
+        """Changes and sensor faults whose probability exceeds the threshold, in order of time.
+
+        How far parameters moved at a change is said with the record's whole future in sight, by `smooth`.
+        """
+        found = self._found(threshold)
+        if not any(event.kind == "change" for event in found):
+            return found
+        smoothed = self.smooth(threshold)
+        return [event.measured(smoothed) if event.kind == "change" and event.date else event for event in found]
+
+    def _found(self, threshold: float) -> list[Event]:
+        """Events without what they moved."""
         bank = self.tracker
         told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
         return all_of(told, threshold)

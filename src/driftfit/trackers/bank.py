@@ -24,7 +24,7 @@ merged at the present, not at the root; log weights; output lags per leaf. Cost 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -37,7 +37,7 @@ from driftfit.hypotheses import plan
 from driftfit.hypotheses import reduction as reductions
 from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
 from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.leaves import FIRST
+from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.prior import events
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
@@ -302,6 +302,26 @@ class Bank(Tracker):
         for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
             start = lane["table"][PACKED.index(name), 0] // 8
             lane["memory"][start : start + len(values)] = values
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        super().widen(lane, p)
+        n = len(p)
+        diagonal = FIRST + n + np.array([i * (i + 3) // 2 for i in range(n)])
+        B = self._leaves(lane)
+        factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
+        B[diagonal] += p[:, None] / np.where(factor > 0.0, factor, 1.0)
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        """All leaves are moved alike, so that the mixture stands where it is said to."""
+        B, at = self._leaves(lane), list(which)
+        B[FIRST + np.array(at)] += (values - lane["theta"][at])[:, None]
+        super().place(lane, which, values)
+
+    def _leaves(self, lane: Mapping[str, Array]) -> Array:
+        """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
+        start, rows, columns = lane["table"][PACKED.index("B")]
+        B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
+        return B[:, : max(int(lane["many"][core.LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
         """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""

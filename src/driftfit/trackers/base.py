@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -110,6 +110,10 @@ class Tracker(Settings, ABC):
         scale = float(lane["scale"])
         np.einsum("ii->i", P)[:] += p / scale if scale > 0.0 else p
         lane["var"][:] += p
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        """Set entries of theta in the fields of one lane."""
+        lane["theta"][list(which)] = values
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         """Covariance (n, n) of theta from the fields of one lane; inf on the diagonal where nothing is known."""

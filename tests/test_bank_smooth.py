@@ -1,0 +1,82 @@
+"""Smoothing given events, and segments."""
+
+import numpy as np
+import pytest
+from test_bank import N, R, changes, record
+
+from driftfit import Bank, Kalman, Regression, track
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.reduction import Beam
+from driftfit.hypotheses.sensor import Sensor
+from driftfit.hypotheses.smooth import problem_of, solve
+from driftfit.smoothers.piecewise import piecewise
+
+KNOWN = [Sensor.nominal(R)]
+Y, U = record(120, 5, (40, 90))
+
+
+def test_the_smoother_is_the_dense_posterior():
+    run = track(Regression(N), Bank(changes(), KNOWN, reduce=Beam(9), p0=2.0), Y, U)
+    smoothed = run.smooth()
+    problem = problem_of(run, smoothed.events)
+    T = len(Y)
+    prior = np.zeros((T * N, T * N))
+    total = problem.C0
+    covs = []
+    for t in range(T):
+        total = total + problem.Q[t]
+        covs.append(total)
+    for a in range(T):
+        for b in range(T):
+            prior[a * N : (a + 1) * N, b * N : (b + 1) * N] = covs[min(a, b)]
+    rows = np.zeros((T, T * N))
+    for t in range(T):
+        rows[t, t * N : (t + 1) * N] = problem.phi[t]
+    gain = prior @ rows.T @ np.linalg.inv(rows @ prior @ rows.T + np.diag(problem.r))
+    mean, cov = (gain @ problem.y).reshape(T, N), prior - gain @ rows @ prior
+    np.testing.assert_allclose(smoothed.theta, mean, atol=1e-7)
+    step = np.zeros((N, T * N))
+    step[:, 40 * N : 41 * N], step[:, 39 * N : 40 * N] = np.eye(N), -np.eye(N)
+    shift, spread = smoothed.increment(40)
+    np.testing.assert_allclose(shift, step @ mean.ravel(), atol=1e-7)
+    np.testing.assert_allclose(spread, step @ cov @ step.T, atol=1e-7)
+
+
+def test_one_hypothesis_is_the_smoother_of_the_kalman_filter():
+    bank = track(Regression(N), Bank([Change(0.01)], KNOWN, p0=2.0), Y, U).smooth()
+    kalman = track(Regression(N), Kalman(0.01, R, p0=2.0), Y, U).smooth()
+    np.testing.assert_allclose(bank.theta, kalman.theta, atol=1e-9)
+    np.testing.assert_allclose(bank.std, kalman.std, atol=1e-9)
+
+
+def test_events_say_what_moved_and_how_far():
+    run = track(Regression(N), Bank(changes(), KNOWN, p0=2.0), Y, U)
+    segments = piecewise(run)
+    events = run.hypotheses.events()
+    assert segments.bounds.tolist() == [0, *(event.date for event in events), 120]
+    for k, event in enumerate(events):
+        for i, name in enumerate(run.names):
+            assert event.shift[name] == pytest.approx(segments.theta[k + 1, i] - segments.theta[k, i], abs=0.1)
+            assert 0.01 < event.std[name] < 0.2
+
+
+def test_segments_are_the_limit_of_large_jumps():
+    bank = Bank([Change(0.0), Change(1e4, prob=0.01)], KNOWN, p0=1e6)
+    run = track(Regression(N), bank, Y, U)
+    breaks = [40, 90]
+    problem = problem_of(run, [])
+    Q = np.zeros((120, N, N))
+    Q[breaks] = 1e4 * np.eye(N)
+    theta, _, _ = solve(problem._replace(Q=Q))
+    segments = piecewise(run, breaks)
+    np.testing.assert_allclose(theta, segments.path, atol=1e-5)
+    assert segments.table().height == 3
+    assert len(segments.plot().axes) == N
+    with pytest.raises(ValueError, match="within 1"):
+        piecewise(run, [0])
+
+
+def test_smoothing_beats_filtering():
+    run = track(Regression(N), Bank(), Y, U)
+    truth = np.repeat(piecewise(run, [40, 90]).theta, [40, 50, 30], axis=0)
+    assert np.abs(run.smooth().theta - truth).mean() < np.abs(run.theta - truth).mean()
