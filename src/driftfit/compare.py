@@ -54,7 +54,7 @@ def errors(run: Track) -> Errors:
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     gaps = run._known[:, 0]  # 0 before the lags are filled
     time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
-    steady = _constant(run, y)
+    steady = _constant(run, y, time)
     arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
     own = (_error(run, y), y - persistence(y), steady, arx.innovation)
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
@@ -68,10 +68,10 @@ def _error(run: Track, y: Array) -> Array:
     return np.where(run.ok, y - run.prediction, np.nan) if hasattr(run.model, "log_jacobian") else run.innovation
 
 
-def _constant(run: Track, y: Array) -> Array:
+def _constant(run: Track, y: Array, time: Array | None) -> Array:
     """The same of constant least squares on the past."""
     if hasattr(run.model, "log_jacobian"):
-        return _error(track(run.model, RLS(1.0), run.y, run.u), y)
+        return _error(track(run.model, RLS(1.0), y, run.u, time=time), y)
     return np.asarray(constant_least_squares(run.model, run.y, run.u, run._known)["e"][:, 0])
 
 
