@@ -288,16 +288,20 @@ def _probability(
     run: Track, every: float, reference: Reference, window: int
 ) -> tuple[Array, Array, tuple[str, ...], int]:
     """The probability of a change in the tracker's window."""
-    if CHANGE not in run.tracker.outputs:
+    if CHANGE in run.tracker.outputs:
+        p = run._written(CHANGE)
+    elif REPORT in run.tracker.outputs:
+        bank: Any = getattr(run, HYPOTHESES)
+        p = bank.window
+    else:
         raise ValueError(
             f"detect: {type(run.tracker).__name__} carries no probability of a change; track with Bank, or use "
             'kind="band" or kind="innovation".'
         )
-    p = np.reshape(run._written(CHANGE), (len(run), -1))[:, :1]
-    return p, np.ones(1), ("probability",), _burn(run)
+    return np.reshape(p, (len(run), -1))[:, :1], np.ones(1), ("probability",), _burn(run)
 
 
-CHANGE = "window"
-"""The field in which a tracker of hypotheses stores the probability of a change in its window."""
+CHANGE, REPORT, HYPOTHESES = "window", "report", "hypotheses"
+"""Where the probability of a change is: a field that a tracker stores, or ``run.hypotheses.window`` of a `Bank`."""
 
 _STATISTICS = {"band": _band, "innovation": _innovation, "probability": _probability}

@@ -146,7 +146,11 @@ def diagnose(run: Track) -> Diagnosis:
 def _whiteness(white: Whiteness) -> Check:
     first = white.r[0] if len(white.r) else np.nan
     sign = "positive" if first > 0.0 else "negative"
-    hint = "more drift (a larger q, less memory), or one more lag" if first > 0.0 else "less drift, or another delay"
+    hint = (
+        "more drift (a larger q, less memory), or one more lag"
+        if first > 0.0
+        else "less drift, or one more lag (noise on the output does this too)"
+    )
     advice = (
         f"The innovations are correlated ({first:.2f} at the first lag, {sign}): something that can be predicted is "
         f"left. Try {hint}."

@@ -145,13 +145,15 @@ class Selection:
         return polars.DataFrame({head: [getattr(row, head) for row in self.rows] for head in heads})
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        table = table_of("Structures", "", "n", "loglik", "below best", "+-", "rms error")
+        table = table_of("Structures", "", "n", "loglik", "below", "+-", "rms")
+        table.columns[0].no_wrap, table.columns[0].overflow, table.columns[0].ratio = False, "fold", 5
         for row in self.rows[:20]:
-            numbers = (f"{row.loglik:.1f}", f"{row.below:.1f}", f"{row.std:.1f}", f"{row.rms:.4g}")
+            numbers = (f"{row.loglik:.1f}", f"{row.below:.1f}", f"{row.std:.1f}", f"{row.rms:.3g}")
             table.add_row(Text(row.name), str(row.n), *numbers)
         yield table
         if len(self.rows) > 20:
             yield Text(f" and {len(self.rows) - 20} more", "dim")
+        yield Text(" below: log-likelihood below the best, +- its standard error", "dim")
         yield Text(f" best: {self.best}")
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")

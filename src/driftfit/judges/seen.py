@@ -37,7 +37,7 @@ def constant_least_squares(model: Model, y: Array, u: Array, known: Array) -> Ar
     tile = fresh_tile(model, steady)
     out = np.empty(len(y), output_type(tile, COLLECTED))
     steps = steady.steps._replace(store=collect)
-    drivers(model.steps, steps).run(tile, y[:, None], u[:, :, None], known[:, :, None], out)
+    drivers(model.steps, steps).run(tile, y[:, None], u[:, :, None], known[:, :3, None], out)
     return out
 
 
