@@ -70,7 +70,7 @@ def compare(run, twin, y, u, atol=1e-10, lags=1):
         (GPB(2), naive_bank.gpb(2), 1),
         (GPB(3), naive_bank.gpb(3), 2),
     ],
-    ids=str,
+    ids=["Beam(7)", "Decide(3)", "GPB(2)", "GPB(3)"],
 )
 def test_every_reduction_is_what_its_naive_twin_says(prior, reduce, naive, lags):
     transition, P, initial = PRIORS[prior]
