@@ -1,16 +1,19 @@
 """The scoreboard measures what it says: oracle and peers run the filter they name, scores count what they should."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, cli, track
+from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, cli, track, trackers
 from driftfit.bench import accuracy, accuracy_page, contestants, oracle, peers, real, scores, speed, speed_page
 from driftfit.bench.contest import Contest, Finish, Job, hold
 from driftfit.bench.machine import installed
 from driftfit.bench.records import Outcome, Record, regressors, simulated
 from driftfit.bench.speed_peers import Signals
 from driftfit.bench.speed_process import needed
+from driftfit.systems import scenarios
 
 RATIO = (1e-3, 0.0)
 
@@ -215,3 +218,18 @@ def test_signals_keep_their_first_part():
     data = speed.signals(30)
     assert isinstance(data.first(10), Signals)
     np.testing.assert_array_equal(data.first(10).phi, data.phi[:10])
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def test_every_scenario_is_on_the_page_and_the_chapter_shows_its_table():
+    page = (DOCS / "scoreboard_accuracy.md").read_text()
+    for name in scenarios.found():
+        assert f"## {name}\n" in page
+        assert (DOCS / "figures" / f"scoreboard_{name}.png").exists()
+    summary = page.split("## All scenarios\n\n")[1].split("\n\n")[0]
+    for kind in trackers.found().values():
+        if kind.own_model(1, 1, 1) is None:
+            assert kind.__name__ in summary
+    assert summary in (DOCS / "choosing_a_tracker.md").read_text()

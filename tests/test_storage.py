@@ -126,6 +126,14 @@ def test_a_class_that_is_not_here_is_named(saved, which):
         load(path)
 
 
+@pytest.mark.parametrize("which", ["model", "tracker"])
+def test_a_setting_that_is_not_here_is_named(saved, which):
+    path, load = saved
+    rewrite(path, lambda header: header[which]["settings"].update(viscosity=1.0))
+    with pytest.raises(ValueError, match=r"written by another version: .*'viscosity'"):
+        load(path)
+
+
 @pytest.mark.parametrize("other", [("driftfit.models.arx:ARX", {"na": 1, "nb": 2, "inputs": 1})])
 def test_a_state_of_another_model_is_refused(saved, other):
     path, load = saved

@@ -29,8 +29,8 @@ CAUSES: dict[str, str] = {
 
 REAL_CAUSES = (
     "On the industry portfolios and the money demand the differences between the trackers that follow anything are "
-    "within chance; constant least squares is not. Trackers with one tuned number are a little ahead where the drift is "
-    "slow and steady, as on the simulated walks."
+    "within chance; constant least squares is not. Trackers with one tuned number are a little ahead where the drift "
+    "is slow and steady, as on the simulated walks."
 )
 """What the real records say."""
 
