@@ -6,13 +6,16 @@ from driftfit.fleet import Fleet
 from driftfit.frontier import frontier
 from driftfit.live import Live
 from driftfit.models.arx import ARX
+from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.result import Track
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
+from driftfit.trackers.extended_kalman import ExtendedKalman
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.output_error import OutputError
 from driftfit.trackers.rls import RLS
 from driftfit.tune import tune
 
@@ -23,9 +26,12 @@ __all__ = [
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
+    "ExtendedKalman",
     "Fleet",
+    "HammersteinWiener",
     "Kalman",
     "Live",
+    "OutputError",
     "Regression",
     "Track",
     "frontier",
