@@ -6,6 +6,7 @@ from driftfit.fleet import Fleet
 from driftfit.frontier import frontier
 from driftfit.live import Live
 from driftfit.models.arx import ARX
+from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.result import Track
 from driftfit.select import grid, select
@@ -13,8 +14,10 @@ from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank import Bank
+from driftfit.trackers.extended_kalman import ExtendedKalman
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.output_error import OutputError
 from driftfit.trackers.rls import RLS
 from driftfit.tune import tune
 
@@ -26,9 +29,12 @@ __all__ = [
     "AdaptiveKalman",
     "AugmentedFLS",
     "Bank",
+    "ExtendedKalman",
     "Fleet",
+    "HammersteinWiener",
     "Kalman",
     "Live",
+    "OutputError",
     "Regression",
     "Track",
     "frontier",

@@ -34,6 +34,8 @@ NEWTON = 4
 """Steps after the grid: the first is good to 1e-3 of the range at least, and each doubles the digits."""
 INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
+EXACT = 4e-16
+"""Relative error of the level at which Newton's method stops."""
 FLOOR = 1e-4
 """Least variance of the equation error under measurement noise."""
 
@@ -169,7 +171,9 @@ def inverse_of(out: Curves) -> Any:
                 for k in range(n_out):
                     value += d_now[k] * g_now[k]
                     slope += d_now[k] * h_now[k]
-                y = min(max(y + (right - value) / slope, low), high) if slope > 0.0 else y
+                if not slope > 0.0 or abs(right - value) <= EXACT * (1.0 + abs(right)):
+                    break
+                y = min(max(y + (right - value) / slope, low), high)
         return float(y)
 
     return _named(solve, g, slopes)
@@ -233,7 +237,9 @@ def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
         seen = abs(y) < LARGEST
         point = y if seen else cells[PREDICTED]
         g(point, out, g_now)
-        slopes(point, out, h_now)
+        variance = cells[VARIANCE]
+        if variance > 0.0:
+            slopes(point, out, h_now)
         for k in range(n_out):
             seen = seen and abs(g_now[k]) < LARGEST
         for k in range(n_out - 1):
@@ -242,7 +248,6 @@ def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
         if seen:
             cells[LOWEST] = min(cells[LOWEST], y)
             cells[HIGHEST] = max(cells[HIGHEST], y)
-        variance = cells[VARIANCE]
         factor = noise_factor(theta, d_now, h_now, h_lag, na, n_out, variance) if variance > 0.0 else 1.0
         return -g_now[0] if seen else np.nan, dt if started > 0.0 else 0.0, factor
 

@@ -75,9 +75,9 @@ def parameters(s: Simulated, paths: Mapping[str, Array], part: slice, title: str
     names = s.model.structure.minimal_names[part]
     axes = figure.subplots(len(names), 1, sharex=True)
     for axis, name, i in zip(axes, names, range(part.start, part.stop), strict=True):
+        axis.plot(s.xi[:, i], lw=2.6, color=GREY, alpha=0.7, label="true")
         for method, xi in paths.items():
-            axis.plot(xi[:, i], lw=0.8, color=METHODS[method], label=method)
-        axis.plot(s.xi[:, i], lw=1.6, color=GREY, label="true")
+            axis.plot(xi[:, i], lw=0.6, color=METHODS[method], label=method)
         shown = np.concatenate([s.xi[:, i], paths["svd"][500:, i]])
         low, high = np.quantile(shown, (0.005, 0.995))
         axis.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
