@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy import integrate, special, stats
-from test_bank import N, P3, PROBS, Q, R, changes, record, state, told
+from test_bank import P3, PROBS, N, Q, R, changes, record, state, told
 
 from driftfit import Bank, Regression, track
 from driftfit.hypotheses import lookahead, merge
@@ -15,6 +16,16 @@ from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide
 from driftfit.hypotheses.sensor import Sensor
 
 Y, U = record(60, 11, (25,))
+
+
+@njit
+def matched(B, members, unknown, share, A):
+    merge.match(B, members, 2, 0, unknown, share, A, 0)
+
+
+@njit
+def integrated(parts, count, loss, f, nodes):
+    return lookahead.integrate(parts, count, loss, f, nodes)
 
 
 def unknown(**more):
@@ -89,7 +100,7 @@ def leaves(seed, count, known):
 @pytest.mark.parametrize("known", [True, False])
 def test_merging_keeps_the_moments(known):
     B, A = leaves(3, 4, known), np.zeros((FIRST + 5, 1))
-    merge.match.py_func(B, np.arange(4), 2, 0, not known, B[WEIGHT].copy(), A, 0)
+    matched(B, np.arange(4), not known, B[WEIGHT].copy(), A)
 
     def moments(X, w):
         g = np.ones(X.shape[1]) if known else X[NU] / X[S]
@@ -104,7 +115,7 @@ def test_merging_keeps_the_moments(known):
 
     np.testing.assert_allclose(moments(A, np.ones(1)), moments(B, B[WEIGHT]), atol=1e-8)
     same = np.repeat(B[:, :1], 3, axis=1)
-    merge.match.py_func(same, np.arange(3), 2, 0, not known, np.full(3, 1.0 / 3.0), A, 0)
+    matched(same, np.arange(3), not known, np.full(3, 1.0 / 3.0), A)
     np.testing.assert_allclose(A[NU:, 0], B[NU:, 0], rtol=1e-8)
 
 
@@ -115,7 +126,7 @@ def test_what_waiting_is_worth():
     parts[0, :4], parts[1, :4] = [0, 0, 1, 1], [0.5, 0.1, 0.25, 0.15]
     parts[2, :4], parts[3, :4] = [0.0, 0.5, 1.5, 0.0], [0.3, 2.0, 0.4, 3.0]
     loss = np.array([[0.0, 1.0], [3.0, 0.0]])
-    value = lookahead.integrate.py_func(parts, 4, loss, np.zeros(2), np.zeros(4 * lookahead.NODES))
+    value = integrated(parts, 4, loss, np.zeros(2), np.zeros(4 * lookahead.NODES))
     risk = min(loss[:, k] @ [0.6, 0.4] for k in (0, 1))
     assert value <= risk + 1e-12
     of = rng.choice(4, 100_000, p=parts[1])
