@@ -20,7 +20,7 @@ KALMAN = Kalman(q=[1e-6, 0.01], r=NOISE**2, p0=1.0)
 
 
 def gain(t: int) -> float:
-    return 1.0 if t < 60 else 0.25 if t < 120 else -0.8
+    return 1.0 if t < 60 else 2.6 if t < 120 else 0.7
 
 
 def certain(m: np.ndarray, P: np.ndarray, y: float, ref: float) -> float:

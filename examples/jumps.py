@@ -1,7 +1,8 @@
 """Parameters that jump: what a bank of hypotheses says, and when.
 
-Prints the events that were found and the segments between them; saves two pictures, of parameters with the
-probabilities of events under them, and of the tree while a jump is being decided. Usage: jumps.py [folder]
+Prints the events that were found and the segments between them; saves pictures, of parameters with the probabilities
+of events under them, of the segments, and of the tree while a jump is being decided.
+Run: python examples/jumps.py [folder]
 """
 
 import sys

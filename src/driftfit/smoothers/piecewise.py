@@ -3,7 +3,8 @@
     theta_k = argmin sum_{t in segment k} w_t (y_t - phi_t' theta)^2,   cov = r (Phi' W Phi)^-1
 
 It is the limit of the smoother given events as the covariance of a jump grows and that of the drift vanishes; it is not
-a method of its own. Changes come from a `Bank`, or from the user. r is pooled over the segments unless it is given. A
+a method of its own. Changes come from a `Bank`, or from the user; what a bank takes for
+a fault of the sensor is left out. r is pooled over the segments unless it is given. A
 segment that does not determine a direction takes the solution of least norm there, and its std is inf.
 
 Use it when parameters stand still between changes and the stretches are what matters. Cost: O(T n^2).
@@ -40,7 +41,12 @@ class Segments:
             raise ValueError(f"piecewise: breaks must be samples within 1 .. {T - 1}; got {inner}.")
         self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
         seen = replay(run)
-        self._ok, self._phi, self._y = seen["ok"][:, 0] > 0.0, seen["phi"][..., 0], seen["y"][:, 0]
+        known = seen["ok"][:, 0] > 0.0
+        if "report" in run.tracker.outputs:  # a sensor at fault tells nothing of the segment
+            from driftfit.hypotheses.smooth import faults
+
+            known &= faults(run.tracker, run, run.hypotheses.events()) == 1.0  # type: ignore[arg-type]
+        self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
         self._solve(r)
 
     def _solve(self, r: float | None) -> None:
