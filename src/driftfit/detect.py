@@ -13,7 +13,7 @@
   (`driftfit.judges.onsets`), half of the rate for each. With ``reference`` the g are normal scores of the
   innovations among those of the reference, so that outliers and tails that were normal there are normal later.
 * probability: the limit is found by simulation. Records with constant parameters are made from the run (its inputs,
-  its parameters at ``at``, its standardised innovations redrawn) and tracked; the limit is exceeded by onsets at the
+  its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
   rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
 
 Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many

@@ -1,9 +1,10 @@
 """Limits by simulation: records like one that was seen, but with parameters that stay.
 
-    y*_t = phi*_t' theta + sqrt(r) g_t,     g drawn from the standardised innovations of the run
+    y*_t = phi*_t' theta + v_t,     v drawn from the innovations of the run
 
 phi* holds the lags of y* itself and the inputs that were recorded; each record is tracked by the tracker of the run.
-The limit is the number that the statistic begins to exceed once in ``every`` samples.
+The v are scaled so that its innovations are as large as those that were seen. The limit is the number that the
+statistic begins to exceed once in ``every`` samples.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from driftfit.drivers import LARGEST
 from driftfit.judges.onsets import onsets
 from driftfit.kernel import Array
-from driftfit.simulate import input_regressors, noise_at
+from driftfit.simulate import input_regressors
 from driftfit.track import drive
 
 if TYPE_CHECKING:
@@ -30,31 +31,38 @@ MOST = 400
 
 def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track]:
     """Runs over simulated records with the parameters of sample ``at``; ValueError for models with other regressors."""
+    rng = np.random.default_rng(seed)
+    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
+    U, pool, theta = _last_known(U), innovations(run), run.theta[at]
+    noise = np.broadcast_to(np.where(np.isfinite(run._known[:, 1]), np.sqrt(run._known[:, 1]), 1.0), len(run))
+
+    def played() -> Track:
+        return _tracked(run, _played(theta, na, U, noise * rng.choice(pool, len(run))))
+
+    # innovations are larger than noise, by what the parameters add to them: scale until they are as large as those seen
+    pool = pool * np.clip(np.std(pool) / np.std(innovations(played())), 0.2, 1.0)
+    for _ in range(min(MOST, int(np.ceil(TIMES * every / len(run))))):
+        yield played()
+
+
+def _tracked(run: Track, y: Array) -> Track:
+    """The run's tracker over another output."""
     from driftfit.result import Track
 
-    rng = np.random.default_rng(seed)
-    T, theta, r = len(run), run.theta[at], noise_at(run, at)
-    z = standardised(run)
-    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
-    U = _last_known(U)
-    noise = np.sqrt(np.broadcast_to(run._known[:, 1], T))
-    noise = np.where(np.isfinite(noise), noise, 1.0)
-    for _ in range(min(MOST, int(np.ceil(TIMES * every / T)))):
-        e = np.sqrt(r) * noise * rng.choice(z, T)
-        y = _played(theta, na, U, e)
-        tile = run._fresh_tile()
-        known = run._known
-        out = drive(run.model, run.tracker, tile, y, run.u, known)
-        yield Track(run.model, run.tracker, y, run.u, None, known, out, tile)
+    tile = run._fresh_tile()
+    out = drive(run.model, run.tracker, tile, y, run.u, run._known)
+    return Track(run.model, run.tracker, y, run.u, None, run._known, out, tile)
 
 
-def standardised(run: Track) -> Array:
-    """Innovations over their standard deviations, after the start."""
+def innovations(run: Track) -> Array:
+    """Innovations after the start, at weight 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        z = run.innovation / run.innovation_std
-    z = z[min(max(50, 5 * run.model.n), len(run) // 2) :]
-    z = z[np.isfinite(z)]
-    return z if len(z) > 20 else np.random.default_rng(0).normal(size=1000)
+        e = run.innovation / np.sqrt(run._known[:, 1])
+    e = e[min(max(50, 5 * run.model.n), len(run) // 2) :]
+    e = e[np.isfinite(e)]
+    if len(e) < 20:
+        raise ValueError(f"detect: a calibration needs at least 20 innovations after the start; this run has {len(e)}.")
+    return e
 
 
 def _played(theta: Array, na: int, U: Array, e: Array) -> Array:
