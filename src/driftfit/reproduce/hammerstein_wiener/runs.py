@@ -31,11 +31,11 @@ FAST = ExtendedKalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
 STARTS = (0.01, 10.0, 1000.0)
 CLOSE, STAY = 0.15, 200
 """An estimate has arrived when its error is below CLOSE for STAY samples on end."""
-LAST = 1000
+LAST, BURN = 1000, 200
 
 
 class Errors(NamedTuple):
-    """Median and root mean square of an error over the last thousand samples."""
+    """Median of an error over the last thousand samples, and its root mean square after the first BURN."""
 
     median: float
     rms: float
@@ -47,9 +47,8 @@ def off(xi: Array, s: Simulated, start: int = 0) -> Array:
 
 
 def late(error: Array) -> Errors:
-    """The end of a path of errors."""
-    part = error[-LAST:]
-    return Errors(float(np.median(part)), float(np.sqrt(np.mean(part**2))))
+    """A path of errors, condensed."""
+    return Errors(float(np.median(error[-LAST:])), float(np.sqrt(np.mean(error[BURN:] ** 2))))
 
 
 def separated(run: Track, method: str) -> Array:
@@ -132,7 +131,7 @@ def third_example(seed: int) -> dict[str, Errors | float]:
     slow = track(s.model, Kalman(q=1e-3, r=1.0, p0=1e8, theta0=0.01), s.y, s.u)
     found["slow svd-joint"] = late(off(separated(slow, "svd-joint"), s))
     found["slow one-step"] = float(np.sqrt(np.nanmean((s.y - slow.prediction)[-4000:] ** 2)))
-    found["slow free run"] = float(np.sqrt(np.nanmean((s.y - free_run(slow).y)[-4000:] ** 2)))
+    found["slow free run"] = float(np.sqrt(np.nanmean((s.y0 - free_run(slow).y)[-4000:] ** 2)))
     aware = replace(CUBIC, output_noise=s.sigma)
     stage = Kalman(q=4e-6, r=1.0, p0=1e4, theta0=0.01)
     found["aware gls"] = late(off(separated(track(aware, stage, s.y, s.u), "gls"), s))
