@@ -7,6 +7,8 @@ from support import arx_record, damaged
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, grid, select, track
 from driftfit.models.base import Model
+from driftfit.models.basis import Polynomial
+from driftfit.models.hammerstein_wiener import HammersteinWiener
 
 K = Kalman(q=1e-4, r=0.01)
 ORDERS = grid(ARX, na=[1, 2], nb=[1, 2])
@@ -160,3 +162,18 @@ def test_other_wrong_settings(record, said):
     with pytest.raises(ValueError, match="grid"):
         grid(ARX, na=[-1])
     assert len(grid(ARX, na=[0, 1], nb=[0, 1])) == 3
+
+
+def test_orders_and_basis_of_a_hammerstein_wiener_model():
+    """The open problem of choosing na, nb and the basis: the true ones are found."""
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1.5, 1.5, 400)
+    w, v = np.zeros(400), u + 0.5 * u**2
+    for t in range(1, 400):
+        w[t] = 0.5 * w[t - 1] + v[t - 1] + 0.02 * rng.normal()
+    candidates = grid(HammersteinWiener, na=1, nb=1, input=[None, Polynomial(2), Polynomial(3)])
+    said = select(candidates, w, u, tracker=Kalman(q=1e-8, r=4e-4))
+    assert said.model().input == Polynomial(2)
+    run = track(said.model(), Kalman(q=1e-8, r=4e-4), w, u)
+    assert not run.verdict().drifts
+    assert run.verdict().rms == pytest.approx(0.02, rel=0.15)
