@@ -113,3 +113,13 @@ def test_wrong_groups_are_refused(groups):
 def test_groups_beyond_the_parameters_are_refused():
     with pytest.raises(ValueError, match="there are 3"):
         track(Regression(3), AdaptiveKalman(groups=[[3]]), np.ones(5), np.ones((5, 3)))
+
+
+def test_a_coarse_sensor_that_stands_still_does_not_poison():
+    """Flow in whole litres that seldom changes: probabilities of whole filters fall below the smallest number."""
+    rng = np.random.default_rng(3)
+    u = np.where(rng.random(2000) < 0.3, 0.38, 0.05)
+    y = 32.0 + np.where(rng.random(2000) < 0.1, rng.choice([-1.0, 1.0], 2000), 0.0) * (np.arange(2000) // 150 % 3 == 2)
+    run = track(ARX(2, 2), AdaptiveKalman(), y, u)
+    assert np.isfinite(run.theta).all()
+    assert np.isfinite(run.innovation_std[1000:]).all()

@@ -132,7 +132,7 @@ def test_summary_and_pictures():
     assert "a1[flow<-level]" in run.summary()
     assert "b1[level<-u]" in run.summary()
     assert len(run.plot().axes) == 2 * 3
-    assert "level 118" in repr(run)
+    assert "level 119" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
     assert "One-step prediction error" in shared.summary()

@@ -41,6 +41,9 @@ from driftfit.trackers.drift_ladder import filters, mix
 from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation
 from driftfit.trackers.noise_levels import FINEST, OUTLIER, any_level, learn_noise, noise_prior
 
+LEAST = 1e-100
+"""Probability that a filter is never below."""
+
 RESIDUALS = 4
 """Residuals seen before the filters start."""
 
@@ -118,6 +121,8 @@ def weigh(s: State, l: int) -> None:
             s.joint[j, k, l] /= total
             s.nu[j, l] += s.joint[j, k, l]
             s.mu[k, l] += s.joint[j, k, l]
+    for k in range(K):
+        s.mu[k, l] = max(s.mu[k, l], LEAST)  # at 0 a mode that only such modes lead to would have no mixture at all
     # an outlier says nothing about the level: the chain keeps what it was
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)

@@ -87,7 +87,11 @@ class Tracker(Settings, ABC):
 
     def beside(self, T: int, prob: Any, drift: Any) -> Array:
         """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
-        raise ValueError(f"{type(self).__name__} has no hypotheses: prob= and a drift for each change are for a Bank.")
+        given = "prob" if prob is not None else f"drift of shape {np.shape(drift)}"
+        raise ValueError(
+            f"{type(self).__name__} has one hypothesis and takes drift of shape (T,), but got {given}; prob= and a drift "
+            "for each change are for a Bank."
+        )
 
     def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
         """What is known of the next sample of a stream; None is what holds otherwise."""
