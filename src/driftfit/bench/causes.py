@@ -13,6 +13,10 @@ CAUSES: dict[str, str] = {
         "is below every row of one ratio."
     ),
     "ramp": "The ratio is learned from the record; hindsight has the one that is best on these very runs.",
+    "sparse_jumps": (
+        "Parameters that stand still between jumps are what `Bank()` assumes. Where they walk, or where outliers come "
+        "that it was given no hypothesis for, it is far behind."
+    ),
     "missing_data": (
         "The ratio has to be learned from fewer samples, and after the outage from none; a tuned row was told it from "
         "other runs of the same scenario."

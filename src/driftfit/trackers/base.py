@@ -89,8 +89,8 @@ class Tracker(Settings, ABC):
         """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
         given = "prob" if prob is not None else f"drift of shape {np.shape(drift)}"
         raise ValueError(
-            f"{type(self).__name__} has one hypothesis and takes drift of shape (T,), but got {given}; prob= and a drift "
-            "for each change are for a Bank."
+            f"{type(self).__name__} has one hypothesis and takes drift of shape (T,), but got {given}; prob= and a "
+            "drift for each change are for a Bank."
         )
 
     def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
