@@ -10,9 +10,7 @@ and within 15 samples of a jump. Run: python examples/jump_control.py
 
 import numpy as np
 
-from driftfit import ARX, Bank, Kalman, Live
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.sensor import Sensor
+from driftfit import ARX, Bank, Change, Kalman, Live, Sensor
 
 NOISE, T, RUNS = 0.1, 180, 30
 BANK = Bank([Change(1e-6), Change(1.0, prob=0.01, which=[1], name="gain")], [Sensor.nominal(NOISE**2)], p0=1.0)

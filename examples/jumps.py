@@ -10,11 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from driftfit import ARX, Bank, Live, track
-from driftfit.hypotheses.change import Change
+from driftfit import ARX, Bank, Change, Decide, Live, Sensor, track
 from driftfit.hypotheses.pictures import plot_tree
-from driftfit.hypotheses.reduction import Decide
-from driftfit.hypotheses.sensor import Sensor
 from driftfit.smoothers.piecewise import piecewise
 
 

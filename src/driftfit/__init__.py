@@ -4,6 +4,9 @@ from importlib.metadata import version
 
 from driftfit.fleet import Fleet
 from driftfit.frontier import frontier
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.hypotheses.sensor import Sensor
 from driftfit.live import Live
 from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -25,17 +28,25 @@ __version__ = version("driftfit")
 __all__ = [
     "ARX",
     "FLS",
+    "GPB",
+    "IMM",
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
     "Bank",
+    "Beam",
+    "Change",
+    "Decide",
     "ExtendedKalman",
+    "FirstFloor",
     "Fleet",
     "HammersteinWiener",
+    "Hybrid",
     "Kalman",
     "Live",
     "OutputError",
     "Regression",
+    "Sensor",
     "Track",
     "frontier",
     "grid",
