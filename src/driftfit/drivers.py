@@ -54,14 +54,16 @@ def clean(s: State, l: int) -> None:
     """
     valid = 1.0
     for i in range(s.phi.shape[0]):
-        finite = abs(s.phi[i, l]) < LARGEST
-        s.phi[i, l] = s.phi[i, l] if finite else 0.0
+        x = s.phi[i, l]
+        finite = abs(x) < LARGEST
+        s.phi[i, l] = x if finite else 0.0
         valid = valid if finite else 0.0
-    finite = abs(s.y[l]) < LARGEST
-    s.y[l] = s.y[l] if finite else 0.0
+    y, noise = s.y[l], s.noise[l]
+    finite = abs(y) < LARGEST
+    s.y[l] = y if finite else 0.0
     s.valid[l] = valid
     s.seen[l] = 1.0 if finite else 0.0
-    s.ok[l] = valid if finite and s.noise[l] < np.inf else 0.0
+    s.ok[l] = valid if finite & (noise < np.inf) else 0.0
 
 
 @kernel
@@ -254,9 +256,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         for l in range(L):
             push(s, l)
         for l in range(L):
-            s.y_hat[l] = s.y_hat[l] if s.valid[l] > 0.0 else np.nan
-            s.s[l] = s.s[l] if s.valid[l] > 0.0 else np.nan
-            s.e[l] = s.e[l] if s.ok[l] > 0.0 else np.nan
+            y_hat, v, e, valid = s.y_hat[l], s.s[l], s.e[l], s.valid[l] > 0.0
+            s.y_hat[l] = y_hat if valid else np.nan
+            s.s[l] = v if valid else np.nan
+            s.e[l] = e if s.ok[l] > 0.0 else np.nan
 
     @Driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:

@@ -161,7 +161,7 @@ class Verdict:
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
             shown = (f"{m.statistic:.3f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
-            change = (f"{m.before:.4g}", f"{m.after:.4g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
+            change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
             table.add_row(Text(m.name), *shown, *change)
         yield table
         table = table_of("One-step prediction error, root mean square", "", "error", "t", "p")

@@ -38,5 +38,9 @@ REAL_CAUSES = (
 )
 """What the real records say."""
 
-SPEED_CAUSES = ""
+SPEED_CAUSES = (
+    "The first result is where driftfit loses to packages without a compiler: seconds the first time on a computer, "
+    "half a second after that, of which loading Numba is half. With Numba and LLVM it is also among the larger to "
+    "install."
+)
 """Why a peer is faster, where one is."""

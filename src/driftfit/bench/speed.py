@@ -13,16 +13,22 @@ from typing import Any
 import numpy as np
 
 from driftfit.bench import speed_peers as peers
-from driftfit.bench.contest import Contest, Finish, Job, hold, need
+from driftfit.bench.contest import Contest, Finish, Job, hold
 from driftfit.bench.machine import times
 from driftfit.bench.speed_floors import floor
 from driftfit.bench.speed_peers import P0, Q, R, Signals
+from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.reduction import IMM, Beam
+from driftfit.hypotheses.sensor import Sensor
 from driftfit.kernel import Array
 from driftfit.live import Live
+from driftfit.models.basis import Polynomial
+from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
+from driftfit.trackers.bank import Bank
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
@@ -171,8 +177,6 @@ def fleet(T: int) -> Contest:
 
 def bank(T: int) -> Contest:
     """Two drift rates with a Markov prior, interacting multiple models."""
-    module = "driftfit.trackers.bank"
-    Bank, Change, IMM, Sensor = (need(module, name) for name in ("Bank", "Change", "IMM", "Sensor"))
     data = signals(T)
     tracker = Bank(
         changes=[Change(q=Q), Change(q=100.0 * Q)], sensors=[Sensor.nominal(r=R)], p0=P0,
@@ -186,9 +190,7 @@ def bank(T: int) -> Contest:
 
 def hammerstein_wiener(T: int) -> Contest:
     """The over-parametrised regression of a Hammerstein-Wiener model with cubic blocks."""
-    Model = need("driftfit.models.hammerstein_wiener", "HammersteinWiener")
-    Polynomial = need("driftfit.models.basis", "Polynomial")
-    model = Model(2, 2, input=Polynomial(3), output=Polynomial(3))
+    model = HammersteinWiener(2, 2, input=Polynomial(3), output=Polynomial(3))
     rng = np.random.default_rng(SEED)
     y, u = 0.1 * rng.normal(size=T), rng.normal(size=T).tolist()
     live = Live(model, Kalman(q=Q, r=R, p0=P0))
@@ -263,7 +265,6 @@ def _series(count: int) -> Callable[[], object]:
 
 
 def _leaves(count: int) -> Callable[[], object]:
-    Bank, Beam = (need("driftfit.trackers.bank", name) for name in ("Bank", "Beam"))
     return record("", Bank(reduce=Beam(count)), signals(2000)).run
 
 

@@ -210,33 +210,38 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
         broken = s.dt[l] > GAP
         depth = s.u_lag.shape[1]
         for i in range(na):
-            s.y_lag[i, l] = np.nan if broken else s.y_lag[i, l]
-            s.phi[i, l] = s.y_lag[i, l]
+            lag = s.y_lag[i, l]
+            lag = np.nan if broken else lag
+            s.y_lag[i, l] = lag
+            s.phi[i, l] = lag
         for j in range(m):
             # the present input takes place 0, so lag k is entry k and nk = 0 needs no case of its own
             for i in range(depth - 1, 0, -1):
-                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
+                lag = s.u_lag[j, i - 1, l]
+                s.u_lag[j, i, l] = np.nan if broken else lag
             s.u_lag[j, 0, l] = s.u[j, l]
             for i in range(nb[j]):
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:
             s.phi[n, l] = 1.0
         # "drop": until every lag has been filled once no time passes for the tracker
-        started = 1.0
+        before, dt, complete = s.started[l], s.dt[l], 1.0
         for i in range(s.phi.shape[0]):
-            started = started if abs(s.phi[i, l]) < LARGEST else s.started[l]
+            complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
+        started = 1.0 if complete > 0.0 else before
         s.started[l] = started
-        s.dt[l] = s.dt[l] if started > 0.0 else 0.0
+        s.dt[l] = dt if started > 0.0 else 0.0
 
     @kernel
     def push(s: State, l: int) -> None:
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance knows nothing (a diffuse start): as a lag it would pass for an output
-        known = s.valid[l] > 0.0 and (s.s[l] != np.inf or s.noise[l] == np.inf)
-        fill = s.y_hat[l] if known and s.filled[l] < na else np.nan
-        s.filled[l] = 0.0 if s.seen[l] > 0.0 else s.filled[l] + 1.0
+        y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.seen[l] > 0.0
+        known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
+        fill = y_hat if known else np.nan
+        s.filled[l] = 0.0 if seen else filled + 1.0
         if na > 0:
-            s.y_lag[0, l] = s.y[l] if s.seen[l] > 0.0 else fill
+            s.y_lag[0, l] = y if seen else fill
 
     return ModelSteps(regress, push)
