@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy import signal
 
-from driftfit import ARX, Kalman, Regression, Track, track
+from driftfit import ARX, Bank, Change, Kalman, Regression, Sensor, Track, track
 from driftfit.judges.onsets import onsets
 
 T = 20_000
@@ -52,12 +52,24 @@ def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, flo
     return count
 
 
+def jumps(seed: int, every: float) -> tuple[int, int]:
+    """Onsets of the change probability of a bank that waits for jumps, where there are none."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=T)
+    y = 2.0 * u + 0.1 * rng.normal(size=T)
+    changes = [Change(1e-6), Change(1.0, prob=0.005)]
+    run = track(Regression(1), Bank(changes, [Sensor.nominal(r=0.01)], p0=1.0), y, u)
+    said = run.detect("probability", every=every)
+    return len(said.onsets), T - said.start
+
+
 LINES: list[tuple[str, Callable[[int, float], tuple[int, int]]]] = [
     ("band, parameter at its edge", at_the_edge),
     ("band, first 5000 as reference", watched("band", False, reference=5000)),
     ("innovation, window 10", watched("innovation", False, window=10)),
     ("innovation, window 50", watched("innovation", False, window=50)),
     ("innovation, window 50, first 5000 as reference", watched("innovation", False, window=50, reference=5000)),
+    ("change probability of a Bank", jumps),
     ("outliers: innovation, window 50", watched("innovation", True, window=50)),
     ("outliers: the same, first 5000 as reference", watched("innovation", True, window=50, reference=5000)),
     ("outliers: the same, calibrated by simulation", watched("innovation", True, window=50, calibrate=True)),

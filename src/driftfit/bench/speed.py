@@ -271,8 +271,8 @@ def _leaves(count: int) -> Callable[[], object]:
 GROWTH: dict[str, tuple[tuple[int, ...], Callable[[int], Callable[[], object]], str]] = {
     "T": ((1_000, 10_000, 100_000, 1_000_000), _samples, "track, Kalman, n = 4"),
     "n": ((1, 2, 4, 8, 16), _parameters, "track, Kalman, T = 20 000"),
-    "series": ((1, 8, 32, 128, 512), _series, "fleet, Kalman, n = 4, T = 200"),
-    "leaves": ((2, 4, 8, 16, 32), _leaves, "track, Bank with Beam, n = 4, T = 2000"),
+    "series": ((1, 8, 32, 128, 512, 2048), _series, "fleet, Kalman, n = 4, T = 200"),
+    "leaves": ((4, 16, 64, 256), _leaves, "track, Bank with Beam, n = 4, T = 2000"),
 }
 
 

@@ -110,6 +110,8 @@ def draw(slopes: Slopes) -> Figure:
         axis.loglog(sizes, seconds[-1] * (sizes / sizes[-1]) ** exponent, "--", color=GREY, lw=0.9)
         axis.set_title(f"{what}\nslope {exponent:.2f}", fontsize=8)
         axis.set_xlabel(name)
+        axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
+        axis.minorticks_off()
         axis.grid(alpha=0.25, lw=0.5)
     panels[0].set_ylabel("seconds")
     return figure
