@@ -5,28 +5,30 @@ from __future__ import annotations
 CAUSES: dict[str, str] = {
     "no_drift": (
         "Where nothing ever moves, least squares is optimal. `AdaptiveKalman` keeps filters that would follow a drift "
-        "or a jump, and their share of the mixture is the price: it never becomes sure that nothing will move."
-    ),
-    "mixed_rates": (
-        "One ladder of drift ratios moves all parameters, and here one walks fast, one slowly, two stand. Told which "
-        "one is fast, `AdaptiveKalman(groups=[[0]])` has 0.77 of the error for ARX and 0.87 for the regression, which "
-        "is below every row of one ratio."
+        "or a jump. Without the ways up to them its error falls by 5 % (3 % for ARX); the rest is that it begins with "
+        "all ratios equally probable, and filters of small ratios are told from none only slowly."
     ),
     "ramp": "The ratio is learned from the record; hindsight has the one that is best on these very runs.",
     "sparse_jumps": (
         "Parameters that stand still between jumps are what `Bank()` assumes. Where they walk, or where outliers come "
         "that it was given no hypothesis for, it is far behind."
     ),
+    "mixed_rates": (
+        "One ladder of drift ratios moves all parameters, and here one walks fast, one slowly, two stand. Told which "
+        "one is fast, `AdaptiveKalman(groups=[[0]])` has 0.77 of the error for ARX and 0.87 for the regression, which "
+        "is below every row of one ratio."
+    ),
     "missing_data": (
-        "The ratio has to be learned from fewer samples, and after the outage from none; a tuned row was told it from "
-        "other runs of the same scenario."
+        "The price of learning: with the ratio of the scenario on every rung the error falls by 2.7 %, with one noise "
+        "level besides by 3.6 %, and the difference is gone."
     ),
     "lost_excitation": (
-        "While the input is dull nothing says how fast parameters drift; a tuned row was told it from other runs."
+        "The price of learning: with the ratio of the scenario on every rung the error falls by 1 %, with one noise "
+        "level besides by 2 %."
     ),
     "collinear_inputs": (
-        "The direction that collinear regressors do not show says nothing of its drift; a tuned row was told it from "
-        "other runs."
+        "The price of learning: with the ratio of the scenario on every rung the error falls by 1.5 %, with one noise "
+        "level besides by 3.6 %."
     ),
 }
 """By scenario."""
