@@ -8,8 +8,6 @@ a whole record at most 5 times the filter step; an update with blocks at n = 14 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -17,21 +15,10 @@ import numpy as np
 from driftfit import Kalman, Live, Regression, track
 from driftfit.blocks.paths import empty
 from driftfit.blocks.separate import METHODS, separate
+from driftfit.reproduce.hammerstein_wiener.cost import least
 from driftfit.systems.hammerstein_wiener import CUBIC, example
 
 T = 5000
-REPEATS = 9
-
-
-def least(function: Callable[[], object], count: int) -> float:
-    """Nanoseconds per item, the least of several."""
-    function()
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return 1e9 * min(times) / count
 
 
 def stream(live: Live, y: list[float], u: list[float]) -> None:

@@ -15,6 +15,7 @@ import dis
 import hashlib
 import math
 from collections.abc import Callable
+from operator import attrgetter
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -138,10 +139,9 @@ class Outside(types.ExternalFunction):
         if self.symbol not in _LOADED:
             dispatcher = _OUTSIDE[self.symbol]
             dispatcher.compile((types.intp,))
-            done = next(iter(dispatcher.overloads.values()))
-            _LOADED[self.symbol] = done.library  # which owns the code
-            address = done.library.get_pointer_to_function(done.fndesc.llvm_cfunc_wrapper_name)
-            add_symbol(self.symbol, address)
+            owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
+            _LOADED[self.symbol] = owner  # of the code, which would go with it
+            add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
 
 
 register_default(Outside)(models.OpaqueModel)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 SINGLE = ("evidence", "window", "kept", "leaves")
+"""Entries of the head of a report, in its order."""
 
 
 class Mixture(NamedTuple):

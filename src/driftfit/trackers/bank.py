@@ -41,6 +41,7 @@ from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.prior import events
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
+from driftfit.hypotheses.results import SINGLE
 from driftfit.hypotheses.sensor import STUCK, Sensor
 from driftfit.hypotheses.steps import STEPS
 from driftfit.kernel import Array
@@ -52,8 +53,6 @@ from driftfit.trackers.diffuse import knowing, knowing_nothing
 
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
-TOLD = ("evidence", "window", "kept", "leaves")
-"""Entries of the head of a report."""
 
 
 @dataclass(frozen=True)
@@ -325,8 +324,8 @@ class Bank(Tracker):
 
     def told(self, report: Array, name: str) -> Array:
         """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
-        if name in TOLD:
-            return report[..., TOLD.index(name)]
+        if name in SINGLE:
+            return report[..., SINGLE.index(name)]
         shape = self._shape
         lags = shape.floors * self._count
         start, rows, columns = {"lag_prob": (HEAD, shape.floors, self._count), "decided": (HEAD + lags, shape.held, 3)}[
