@@ -100,14 +100,29 @@ def kernel(function: Callable[..., Any]) -> Any:
     return _identified(njit(forceinline=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function))
 
 
+def _kept(function: Callable[..., Any], **options: bool) -> Any:
+    """Compile with a place on disk under a name that goes with the identity.
+
+    Numba's cache for a function does not see that a function in another file, which this one calls, was edited.
+    """
+    assert isinstance(function, FunctionType)
+    name = identity(function)
+    twin = FunctionType(function.__code__, function.__globals__, function.__name__, None, function.__closure__)
+    twin.__qualname__, twin.__doc__ = f"{function.__name__}_{name[:16]}", function.__doc__
+    twin.__module__ = function.__module__
+    dispatcher = njit(error_model="numpy", nogil=True, cache=True, **options)(twin)
+    dispatcher.identity = name
+    dispatcher._set_uuid(name)
+    return dispatcher
+
+
 def shared(function: Callable[..., Any]) -> Any:
     """Compile a function of one lane's arrays once for all sizes, for what runs seldom.
 
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     is compiled once and found on disk after that.
     """
-    assert isinstance(function, FunctionType)
-    return _identified(njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True, cache=True)(function))
+    return _kept(function, no_cfunc_wrapper=True)
 
 
 def core(function: Callable[..., Any]) -> Any:
@@ -116,9 +131,7 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    assert isinstance(function, FunctionType)
-    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-    return _identified(njit(cache=True, _nrt=False, **options)(function))
+    return _kept(function, no_cfunc_wrapper=True, no_cpython_wrapper=True, _nrt=False)
 
 
 class Outside(types.ExternalFunction):
@@ -157,7 +170,7 @@ def _machine(symbol: str) -> Outside:
 def outside(function: Callable[..., Any]) -> Outside:
     """Make a machine of a function of one address."""
     assert isinstance(function, FunctionType)
-    dispatcher = _identified(njit(error_model="numpy", nogil=True, cache=True)(function))
+    dispatcher = _kept(function)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     machine = Outside(symbol, types.void(types.intp))
     machine.identity = dispatcher.identity

@@ -59,20 +59,9 @@ def expect(
 
 
 @core
-def simple(maps: Array, sensors: Array) -> bool:
-    """Whether all changes are walks and all sensors differ in their noise alone."""
-    other = 0
-    for i in range(len(maps)):
-        other += 1 if maps[i, 0] != 1.0 or maps[i, 1] != 0.0 else 0
-    for j in range(len(sensors)):
-        other += 1 if sensors[j, VALUE] != 0.0 or sensors[j, FROZEN] > 0.0 else 0
-    return other == 0
-
-
-@core
 def expect_together(
-    w: Array, L: int, factor: Array, prior: Array, phi: Array, theta: Array, P: Array, Q: Array, sensors: Array,
-    r: float, X: Array,
+    w: Array, L: int, factor: Array, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
+    sensors: Array, r: float, X: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
 
@@ -85,22 +74,27 @@ def expect_together(
     rest = 0.0
     for i in range(Hd):
         share[i] = 0.0
-    for e in range(len(prior)):
+    unit = 0.0
+    if alike:
         for l in range(L):
-            part[l] = w[l] * (factor[l] * prior[e, l])
-        f = total(part, L)
-        share[e // Hm] += f
-        rest += f * sensors[e % Hm, FACTOR]
-    mean, wide = 0.0, 0.0
+            part[l] = w[l] * factor[l]
+        unit = total(part, L)
+    for i in range(Hd):
+        for j in range(Hm):
+            f = unit * prior[i * Hm + j, 0]
+            if not alike:
+                for l in range(L):
+                    part[l] = w[l] * (factor[l] * prior[i * Hm + j, l])
+                f = total(part, L)
+            share[i] += f
+            rest += f * sensors[j, FACTOR]
+    mean, wide, at = 0.0, 0.0, 0
     for i in range(n):
-        g = 0.0
-        for j in range(n):
-            row, column = max(i, j), min(i, j)
-            at = row * (row + 1) // 2 + column
-            step = 0.0
-            for k in range(Hd):
-                step += share[k] * Q[k, at]
-            g += (P[row, column] + step) * phi[j]
         mean += phi[i] * theta[i]
-        wide += phi[i] * g
+        for j in range(i + 1):
+            entry = P[i, j]
+            for k in range(Hd):
+                entry += share[k] * Q[k, at]
+            wide += (phi[i] * phi[j]) * (entry if i == j else 2.0 * entry)
+            at += 1
     return mean, wide + rest * r

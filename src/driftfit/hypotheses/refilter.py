@@ -21,7 +21,7 @@ Y, NOISE, TIME = 0, 1, 2
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
     r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, theta0: Array, sensors: Array,
-    row: Array, bases: Array, parent: Array, event: Array, prior: Array, Qt: Array, X: Array,
+    row: Array, bases: Array, parent: Array, event: Array, prior: Array, na: int, own: bool, Qt: Array, X: Array,
 ) -> int:  # fmt: skip
     """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
     H, n = len(row), len(theta0)
@@ -44,20 +44,24 @@ def refilter(
         for k in range(tri):
             Qt[e, k] = 0.0
     root[LOG, 0] = 0.0
-    floor(root, 1, B, samples[0], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X)
+    L = min(D, 1)
+    floor(
+        root, L, B, samples[0], r, unknown, fade, least, na, Qt, maps, theta0, sensors, prior, own, bases, parent,
+        event, X,
+    )  # fmt: skip
     for k in range(len(root)):
         root[k, 0] = B[k, 0]
         A[k, 0] = B[k, 0]
     root[LOG, 0], A[LOG, 0], A[CODE, 0] = 0.0, 0.0, 0.0
-    L = 1
     for at in range(1, D):
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
         increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
         L = floor(
-            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X
-        )
+            A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, theta0, sensors, prior, own, bases, parent,
+            event, X,
+        )  # fmt: skip
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):
@@ -70,12 +74,13 @@ def refilter(
 
 @core
 def floor(
-    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, Q: Array,
-    maps: Array, theta0: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
+    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, na: int, Q: Array,
+    maps: Array, theta0: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,
+    X: Array,
 ) -> int:  # fmt: skip
     return int(
         grow(
-            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, 0, Q, maps,
-            theta0, sensors, prior, False, bases, parent, event, X,
+            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, na, Q, maps,
+            theta0, sensors, prior, own, not own, bases, parent, event, X,
         )
     )  # fmt: skip

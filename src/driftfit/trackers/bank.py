@@ -31,12 +31,14 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
+from driftfit.eights import WIDTH
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
 from driftfit.hypotheses import plan
 from driftfit.hypotheses import reduction as reductions
 from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
 from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.forecast import FROZEN, VALUE
 from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.prior import events
@@ -232,7 +234,7 @@ class Bank(Tracker):
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
-            arrays["root"], scale = arrays["B"][:, :1].copy(), 1.0
+            arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
         return {
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
@@ -249,10 +251,12 @@ class Bank(Tracker):
         chain, initial = self._events
         rows, lower = FIRST + n + tri + na, np.tril_indices(n)
         steps = [one.increments(n) for one in self.all_changes]
+        parents, children = _room(max(shape.parents, K // (Hd * Hm)), Hd, Hm)
+        past = -(-W * (H + 1) // WIDTH) * WIDTH
         refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
         return {
-            "A": np.zeros((rows, shape.parents)), "B": np.zeros((rows, K)), "T": np.zeros((W * (H + 1), K)),
-            "T2": np.zeros((W * (H + 1), K)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm), K)),
+            "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
+            "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm), children)),
             "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
             "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
             "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
@@ -261,7 +265,7 @@ class Bank(Tracker):
             "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
             "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
             "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-            "root": np.zeros((rows, 1)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
+            "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
             "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters else 1, 3 + n)),
             "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
         }  # fmt: skip
@@ -356,15 +360,26 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
         into.append(array.ravel().view(np.float64))
     table[core.THETA, 1] = n
     table[core.FLAGS] = na, unknown, alike
+    walks = (arrays["maps"] == (1.0, 0.0)).all()
+    noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    table[core.PLAIN] = na == 0 and walks and noises
     memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 64), "table": table}
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table}
+
+
+def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
+    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
+    blocks = (parents, parents * Hd, parents * Hd * Hm)
+    up = [-(-size // WIDTH) * WIDTH for size in blocks]
+    most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
+    return up[0], -(-most // WIDTH) * WIDTH
 
 
 def _padded(x: Array, least: int) -> Array:
     """With zeros up to one of few sizes."""
     size = least
     while size < len(x):
-        size *= 4
+        size *= 2
     return np.concatenate([x, np.zeros(size - len(x))])
 
 
