@@ -83,10 +83,21 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
     )
 
 
-def _identified(dispatcher: Any) -> Any:
-    """Let Numba's cache and `identity` know a compiled function by what it does."""
-    dispatcher.identity = identity(dispatcher.py_func)
-    dispatcher._set_uuid(dispatcher.identity)
+def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
+    """Compile under IEEE rules and without the GIL; Numba's cache and `identity` know it by what it does.
+
+    What is kept on disk gets a name that goes with its identity: Numba's cache for a function does not see that a
+    function in another file, which this one calls, was edited.
+    """
+    assert isinstance(function, FunctionType)
+    name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
+    if cache:
+        source = function
+        function = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
+        function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
+    dispatcher = njit(error_model="numpy", nogil=True, cache=cache, **options)(function)
+    dispatcher.identity = name
+    dispatcher._set_uuid(name)
     return dispatcher
 
 
@@ -96,24 +107,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     Always inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at
     n = 4). Division follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
-    assert isinstance(function, FunctionType)
-    return _identified(njit(forceinline=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function))
-
-
-def _kept(function: Callable[..., Any], **options: bool) -> Any:
-    """Compile with a place on disk under a name that goes with the identity.
-
-    Numba's cache for a function does not see that a function in another file, which this one calls, was edited.
-    """
-    assert isinstance(function, FunctionType)
-    name = identity(function)
-    twin = FunctionType(function.__code__, function.__globals__, function.__name__, None, function.__closure__)
-    twin.__qualname__, twin.__doc__ = f"{function.__name__}_{name[:16]}", function.__doc__
-    twin.__module__ = function.__module__
-    dispatcher = njit(error_model="numpy", nogil=True, cache=True, **options)(twin)
-    dispatcher.identity = name
-    dispatcher._set_uuid(name)
-    return dispatcher
+    return _compiled(function, forceinline=True, no_cfunc_wrapper=True)
 
 
 def shared(function: Callable[..., Any]) -> Any:
@@ -122,7 +116,10 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     is compiled once and found on disk after that.
     """
-    return _kept(function, no_cfunc_wrapper=True)
+    return _compiled(function, cache=True, no_cfunc_wrapper=True)
+
+
+_PLAIN = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False}
 
 
 def core(function: Callable[..., Any]) -> Any:
@@ -131,7 +128,12 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    return _kept(function, no_cfunc_wrapper=True, no_cpython_wrapper=True, _nrt=False)
+    return _compiled(function, cache=True, **_PLAIN)
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """A `core` that is written into the place where it is used: passing its arrays would cost more than its work."""
+    return _compiled(function, cache=True, forceinline=True, **_PLAIN)
 
 
 class Outside(types.ExternalFunction):
@@ -170,7 +172,7 @@ def _machine(symbol: str) -> Outside:
 def outside(function: Callable[..., Any]) -> Outside:
     """Make a machine of a function of one address."""
     assert isinstance(function, FunctionType)
-    dispatcher = _kept(function)
+    dispatcher = _compiled(function, cache=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     machine = Outside(symbol, types.void(types.intp))
     machine.identity = dispatcher.identity
@@ -195,8 +197,7 @@ _pointer._set_uuid("pointer")  # Numba would give it a new one in every process,
 
 def routine(function: Callable[..., Any]) -> Any:
     """Compile a part of a step that the lane loop is better without: it may be called instead of inlined."""
-    assert isinstance(function, FunctionType)
-    return _identified(njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function))
+    return _compiled(function, no_cfunc_wrapper=True)
 
 
 class Driver:

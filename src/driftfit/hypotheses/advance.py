@@ -49,7 +49,7 @@ from driftfit.hypotheses.plan import (
     number,
 )
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
-from driftfit.kernel import Array, core, floats, kernel, outside, wholes
+from driftfit.kernel import Array, core, floats, kernel, outside, part, wholes
 
 LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
     range(13)
@@ -67,7 +67,7 @@ HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
 
-@core
+@part
 def reduce(
     A: Array, B: Array, T: Array, T2: Array, many: Array, now: Array, prior: Array, row: Array, knobs: Array,
     bases: Array, links: Array, group: Array, n: int, na: int, Hm: int, unknown: bool, Q: Array, sizes: Array, c: Array,
@@ -79,12 +79,12 @@ def reduce(
     parent, event, start, order = links[0], links[1], links[2], links[3]
     now[KEPT] = 1.0
     full = kind == REFILTER and many[STORED] >= int(knobs[DEPTH])
-    alone = kind == CUT or kind == BEAM  # the plan has put them in order
+    alone = kind in (CUT, BEAM)  # the plan has put them in order
     if kind == REFILTER and not full:
         for l in range(L):
             order[l] = l
         many[GROUPS], alone = L, True
-    elif kind == MERGE or kind == HYBRID:
+    elif kind in (MERGE, HYBRID):
         alone = sort(group, L, many[GROUPS], start, order) == many[GROUPS]
     if not alone and not expanded:
         write_out(T, L, H, Hm, parent, event, T2)
@@ -95,7 +95,8 @@ def reduce(
         return int(
             refilter(
                 root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
-                now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt, X,
+                now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt,
+                X,
             )
         )  # fmt: skip
     flip(many)
@@ -111,13 +112,13 @@ def reduce(
     return int(G)
 
 
-@core
+@part
 def flip(many: Array) -> None:
     """The two tables of the past change places."""
     many[FLIPPED] = 1 - many[FLIPPED]
 
 
-@core
+@part
 def plan(
     B: Array, many: Array, now: Array, knobs: Array, bases: Array, links: Array, group: Array, slots: Array,
     loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array, sensors: Array, phi: Array,
@@ -151,7 +152,7 @@ def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) 
             B[at, l] = y if seen else y_hat[l]
 
 
-@core
+@part
 def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
@@ -263,7 +264,7 @@ def advance(
         now[LAST] = now[IN_Y]
 
 
-@core
+@part
 def store(sample: Array, now: Array, phi: Array) -> None:
     sample[Y], sample[NOISE], sample[TIME] = now[IN_Y], now[IN_NOISE], now[IN_TIME]
     for i in range(len(phi)):
@@ -312,7 +313,7 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
     many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
-@core
+@part
 def note(ring: Array, clock: int, window: float, lags: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
     row = (clock - 1) % len(ring)

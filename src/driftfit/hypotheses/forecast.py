@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.hypotheses.leaves import total
-from driftfit.kernel import Array, core
+from driftfit.kernel import Array, core, part
 
 FACTOR, VALUE, FROZEN, WIDTH, CLEANS = range(5)
 """Columns of the table of sensors."""
@@ -58,7 +58,7 @@ def expect(
     return mean, variance if noise < np.inf else np.inf
 
 
-@core
+@part
 def expect_together(
     w: Array, L: int, factor: Array, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
     sensors: Array, r: float, X: Array,
@@ -88,13 +88,16 @@ def expect_together(
                 f = total(part, L)
             share[i] += f
             rest += f * sensors[j, FACTOR]
-    mean, wide, at = 0.0, 0.0, 0
+    mean, wide = 0.0, 0.0
     for i in range(n):
-        mean += phi[i] * theta[i]
-        for j in range(i + 1):
-            entry = P[i, j]
+        g = 0.0
+        for j in range(n):
+            row, column = max(i, j), min(i, j)
+            at = row * (row + 1) // 2 + column
+            step = 0.0
             for k in range(Hd):
-                entry += share[k] * Q[k, at]
-            wide += (phi[i] * phi[j]) * (entry if i == j else 2.0 * entry)
-            at += 1
+                step += share[k] * Q[k, at]
+            g += (P[row, column] + step) * phi[j]
+        mean += phi[i] * theta[i]
+        wide += phi[i] * g
     return mean, wide + rest * r

@@ -23,14 +23,14 @@ from driftfit.eights import WIDTH, fill, load, minus, over, plus, store, times
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE
 from driftfit.hypotheses.forecast import WIDTH as STUCK_WIDTH
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.kernel import Array, core, log
+from driftfit.kernel import Array, core, log, part
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
 """S never falls below this share of nu times the mean square of y: the data's own rounding."""
 
 
-@core
+@part
 def develop(
     A: Array, K: int, n: int, Q: Array, maps: Array, theta0: Array, own: bool, Hm: int, C: Array, m: Array
 ) -> int:
@@ -56,7 +56,7 @@ def develop(
     return K * len(Q)
 
 
-@core
+@part
 def correct(
     B: Array, at: int, columns: int, n: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
     X: Array,
@@ -85,14 +85,14 @@ def leave(B: Array, at: int, columns: int, n: int, C: Array, m: Array) -> None:
             store(B, FIRST + n + k, at + l, load(C, k, l))
 
 
-@core
+@part
 def gaussian(eps: Array, s: Array, columns: int, out: Array) -> None:
     """log N(eps; 0, s)."""
     for l in range(columns):
         out[l] = -0.5 * (LOG_2PI + log(s[l]) + eps[l] * eps[l] / s[l])
 
 
-@core
+@part
 def student(nus: Array, scales: Array, eps: Array, s: Array, fade: float, least: float, out: Array) -> None:
     """Log density with unknown variance; nu and S take the sample in."""
     before, ratio = np.nan, 0.0
@@ -182,7 +182,7 @@ def remember(
         B[first, np.uint64(at + l)] = y_hat[l] if own else y
 
 
-@core
+@part
 def weigh(
     A: Array, K: int, B: Array, at: int, columns: int, j: int, Hm: int, own: bool, alike: bool, prior: Array,
     likely: Array, parents: Array, events: Array,

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.eights import WIDTH, fill, load, minus, plus, store, sum_of, times
-from driftfit.kernel import Array, core, exp, kernel, log
+from driftfit.kernel import Array, core, exp, kernel, log, part
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -82,7 +82,7 @@ def variance_factor(B: Array, L: int, unknown: bool, out: Array) -> None:
         out[l] = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
 
 
-@core
+@part
 def mixture(B: Array, L: int, n: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
     variance_factor(B, L, unknown, X[n])
@@ -140,7 +140,7 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
             prior[j, l] = share
 
 
-@core
+@part
 def increments(
     Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
 ) -> None:

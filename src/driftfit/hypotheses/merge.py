@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.hypotheses.leaves import CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.hypotheses.past import average
-from driftfit.kernel import Array, core, kernel
+from driftfit.kernel import Array, core, kernel, part
 
 
 @core
@@ -144,7 +144,7 @@ def combine(
     return kept
 
 
-@core
+@part
 def take(B: Array, order: Array, G: int, n: int, rest: int, unknown: bool, bases: Array, A: Array) -> float:
     """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
     for row in range(FIRST + n + rest):
@@ -160,11 +160,9 @@ def take(B: Array, order: Array, G: int, n: int, rest: int, unknown: bool, bases
 @kernel
 def used(row: int, unknown: bool, bases: Array) -> bool:
     """Whether leaves need the row: the weight follows from its logarithm, and not all reductions need all codes."""
-    if row == NU or row == S:
-        return unknown
-    if row == CODE or row == SENSORS or row == CHANGES:
-        return bases[0 if row == CODE else 1 if row == SENSORS else 2] > 1.0
-    return row != WEIGHT
+    coded = row in (CODE, SENSORS, CHANGES)
+    base = bases[0 if row == CODE else 1 if row == SENSORS else 2]
+    return row != WEIGHT and (unknown or (row not in (NU, S))) and (base > 1.0 or not coded)
 
 
 @core

@@ -12,7 +12,7 @@ import numpy as np
 
 from driftfit.eights import WIDTH, fill, load, plus, store, times
 from driftfit.hypotheses.leaves import WEIGHT
-from driftfit.kernel import Array, core, kernel
+from driftfit.kernel import Array, core, kernel, part
 
 
 @kernel
@@ -56,7 +56,7 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
             T[l, k] *= quiet
 
 
-@core
+@part
 def pick(
     T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, order: Array, G: int, T2: Array
 ) -> None:
@@ -80,7 +80,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
             T2[to, at] += share[k] * T[members[k], at]
 
 
-@core
+@part
 def marginals(
     B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, mass: Array, K: int,
     lags: Array,

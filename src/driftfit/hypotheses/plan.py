@@ -11,7 +11,7 @@ import numpy as np
 from driftfit.eights import WIDTH, fill, load, plus, reaches, sum_of
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.hypotheses.lookahead import expected_risk
-from driftfit.kernel import Array, core, kernel
+from driftfit.kernel import Array, core, kernel, part
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
@@ -52,7 +52,7 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
     return float(np.int64(low).view(np.float64))
 
 
-@core
+@part
 def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
     many. What follows in the row, up to the next eight, must be zero.
@@ -86,7 +86,7 @@ def clear(V: Array, row: int, count: int) -> None:
         V[row, l] = 0.0
 
 
-@core
+@part
 def beam(B: Array, L: int, knobs: Array, links: Array, Hm: int, group: Array, X: Array) -> int:
     """The heaviest leaves; the young are protected, and jumps of all but the best parent may be left out."""
     w, value, mass = B[WEIGHT], X[0], X[1]
@@ -133,9 +133,7 @@ def merge(B: Array, L: int, group: Array, slots: Array) -> int:
 
 
 @core
-def hybrid(
-    B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array
-) -> int:
+def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
     cap, size = knobs[CAP], len(slots)
     mass, key, renumber = X[0], X[1], X[3]
