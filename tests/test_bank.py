@@ -165,6 +165,13 @@ def test_first_floor_with_prior_weights_is_one_kalman_filter():
     np.testing.assert_allclose(root[8 : 8 + N], kalman.theta[len(Y) - 1 - D], atol=1e-12)
 
 
+def test_first_floor_remembers_what_its_tree_says():
+    run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3), p0=2.0), Y, U)
+    p = told(run, "lag_prob")
+    np.testing.assert_allclose(p[3:].sum(axis=2), 1.0, atol=1e-12)
+    assert p[47, 1, 1:].sum() > 0.5  # the second jump, one sample later
+
+
 def test_offset_of_unknown_size_is_an_outlier():
     with pytest.warns(UserWarning, match="outlier of variance"):
         offset = Sensor.offset(std=2.0, r=R, prob=0.05)

@@ -47,7 +47,7 @@ from driftfit.hypotheses.plan import (
     merge,
     number,
 )
-from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
+from driftfit.hypotheses.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.kernel import Array, core, floats, kernel, outside, wholes
 
 LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
@@ -89,12 +89,12 @@ def reduce(
         T, T2 = T2, T
     if full:
         many[STORED] -= 1
-        return int(
-            refilter(
-                root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
-                now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, Qt, X,
-            )
+        L = refilter(
+            root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
+            now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, Qt, X,
         )  # fmt: skip
+        histories(A, L, int(knobs[DEPTH]), H, Hm, T)
+        return int(L)
     flip(many)
     if kind == INTERACT:
         return int(mix(B, L, prior, n, na, unknown, A, order, X[0], T, T2))

@@ -69,6 +69,22 @@ def refilter(
 
 
 @core
+def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
+    """The table of the past for the leaves of the new tree: what happened in the D - 1 floors that it has."""
+    block = H + 1
+    for row in range(len(T)):
+        for l in range(L):
+            T[row, l] = 0.0
+    for l in range(L):
+        code, quiet = int(A[CODE, l]), 1.0
+        for k in range(min(D - 1, len(T) // block)):
+            e = code % H
+            code //= H
+            quiet *= 1.0 if e < Hm else 0.0
+            T[k * block + e, l], T[k * block + H, l] = 1.0, quiet
+
+
+@core
 def floor(
     A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, Q: Array,
     maps: Array, theta0: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
