@@ -41,6 +41,7 @@ from driftfit.hypotheses.plan import (
     MERGE,
     PRIOR,
     REFILTER,
+    WAIT,
     beam,
     decide,
     hybrid,
@@ -121,11 +122,13 @@ def flip(many: Array) -> None:
 def plan(
     B: Array, many: Array, now: Array, knobs: Array, bases: Array, links: Array, group: Array, slots: Array,
     loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array, sensors: Array, phi: Array,
-    unknown: bool, na: int, stamps: Array, decided: Array, parts: Array, X: Array,
+    unknown: bool, na: int, stamps: Array, decided: Array, parts: Array, samples: Array, X: Array,
 ) -> None:  # fmt: skip
     """Which leaves go on."""
     L, kind, Hm = many[LEAVES], int(knobs[KIND]), len(sensors)
     if kind == CUT:
+        if knobs[WAIT] > 0.0:  # the regressor to come is like the last one that no event held has been seen with
+            phi = samples[max(many[STORED] - 1 - many[HELD], 0) % len(samples), TIME + 1 :]
         many[HELD] = decide(
             B, L, many[HELD], knobs, loss, P, row, same, Q, maps, theta0, sensors, phi, now[LAST], now[R], unknown, na,
             links[1], stamps, float(many[CLOCK]), decided, parts, group, X,
@@ -202,7 +205,8 @@ def advance(
         )  # fmt: skip
         if kind == REFILTER:
             increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
-            store(samples[many[STORED]], now, phi)
+        if kind == REFILTER or knobs[WAIT] > 0.0:
+            store(samples[many[STORED] % len(samples)], now, phi)
             many[STORED] += 1
         T, T2 = (second_table, first_table) if many[FLIPPED] > 0 else (first_table, second_table)
         many[EXPANDED] = 0
@@ -237,7 +241,7 @@ def advance(
         many[FLOORS] += 1
         plan(
             B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0, sensors, phi,
-            unknown, na, stamps, decided, parts, X,
+            unknown, na, stamps, decided, parts, samples, X,
         )  # fmt: skip
     else:
         push(B, L, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)

@@ -220,8 +220,8 @@ def probabilities(runs: int) -> Claim:
         told.append(
             f"depth {d}: jumps decided with p above .97 happened at that very sample in "
             f"{100 * true / max(sure, 1):.0f} %, dates are exact in {100 * exact / max(hits, 1):.0f} % and within one "
-            f"sample in {100 * near / max(hits, 1):.0f} %, probabilities of .01 to .1 (mean {means[0]:.3f}) come true in "
-            f"{100 * means[1]:.1f} %"
+            f"sample in {100 * near / max(hits, 1):.0f} %, probabilities of .01 to .1 (mean {means[0]:.3f}) come true "
+            f"in {100 * means[1]:.1f} %"
         )
     return Claim(
         "Probabilities of events are probabilities",
