@@ -215,7 +215,11 @@ class Bank(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         cleans = any(one.cleans for one in self.all_sensors)
-        return self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        if len(model.outputs) == 1 or model.shared:
+            return state
+        sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
+        return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
         nominal = self.all_sensors[0]
@@ -357,7 +361,7 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
     table[core.THETA, 1] = n
     table[core.FLAGS] = na, unknown, alike
     memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 64), "table": table}
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 64), "table": table, "flat": np.zeros(1)}
 
 
 def _padded(x: Array, least: int) -> Array:
