@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from driftfit.hypotheses.forecast import expect, expect_together, simple
+from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
+from driftfit.hypotheses.forget import plain as walks
 from driftfit.hypotheses.grow import grow
 from driftfit.hypotheses.leaves import (
     AGE,
@@ -63,6 +65,8 @@ WAITING, READY = 0, -1
     SQUARES, TIMES, SIZE,
 ) = range(19)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out."""
+GROWTH = 1e8
+"""Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
@@ -162,7 +166,9 @@ def advance(
     decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lags: Array, theta: Array, cov: Array,
     na: int, unknown: bool, same: bool,
 ) -> None:  # fmt: skip
-    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite."""
+    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
+    The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`.
+    """
     n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
     tri = n * (n + 1) // 2
     kind, parent, event = int(knobs[KIND]), links[0], links[1]
@@ -176,6 +182,8 @@ def advance(
     for k in range(len(decided)):
         decided[k, 0] = -1.0
     increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
+    settings, maps = maps[: len(Q)], maps[len(Q) :]
+    for_interval(settings, now[IN_DT], maps)
 
     # forecast: every leaf with all that may happen to it
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
@@ -193,7 +201,10 @@ def advance(
         )
     if not plain or now[IN_OK] == 0.0:
         regressors(phi, B, L, n, na, Z)
-        blur(B, L, n, prior, Hm, Qt, maps, theta0, alike, C, m, scratch[0])
+        if walks(maps):
+            blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
+        else:
+            average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
         spread(C, Z, m, L, g, h, y_hat)
     if not plain:
         now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
@@ -227,6 +238,8 @@ def advance(
         many[PARENTS], many[LEAVES] = K, L
         if gone == gone:
             now[EVIDENCE] = gone
+            for i in range(n):
+                theta0[BEFORE, i] = phi[i]
             if many[HELD] < len(stamps):
                 stamps[many[HELD]] = float(many[CLOCK])
             many[HELD] += 1
@@ -240,13 +253,14 @@ def advance(
             shift(T, L, prior, Hm)
         many[FLOORS] += 1
         plan(
-            B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0, sensors, phi,
+            B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0[0], sensors, phi,
             unknown, na, stamps, decided, parts, samples, X,
         )  # fmt: skip
     else:
         push(B, L, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
         if not still:
             for k in range(n):
+                theta0[BEFORE, k] = 0.0
                 for l in range(L):
                     B[FIRST + k, l] = m[k, l]
             for k in range(tri):
@@ -316,6 +330,14 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
 
 
 @core
+def trace(P: Array) -> float:
+    total = 0.0
+    for i in range(len(P)):
+        total += P[i, i]
+    return total
+
+
+@core
 def note(ring: Array, clock: int, window: float, lags: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
     row = (clock - 1) % len(ring)
@@ -367,6 +389,7 @@ def bank(table: int) -> None:
         root = packed(t, 23)
         for row in range(len(root)):
             root[row, 0] = packed(t, 1)[row, 0]
+        packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
         note(packed(t, 26), many[CLOCK], 0.0, packed(t, 27))
         return
@@ -374,7 +397,7 @@ def bank(table: int) -> None:
         packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
         whole(t, 7)[0], many, now, packed(t, 8),
         floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
-        packed(t, 12), packed(t, 13)[0], packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
+        packed(t, 12), packed(t, 13), packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
         packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
         packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
         floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,

@@ -20,6 +20,7 @@ import math
 import numpy as np
 
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE, WIDTH
+from driftfit.hypotheses.forget import apply
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.kernel import Array, core, log
 
@@ -30,8 +31,9 @@ FLOOR = 1e-12
 
 @core
 def develop(
-    A: Array, K: int, n: int, Q: Array, maps: Array, theta0: Array, own: bool, Hm: int, C: Array, m: Array
-) -> int:
+    A: Array, K: int, n: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array, m: Array, g: Array,
+    h: Array,
+) -> int:  # fmt: skip
     """Every leaf under every change: C and m of the columns c K + l. With ``own`` leaf l stands for the joint event l
     alone. Returns the number of columns.
     """
@@ -42,7 +44,9 @@ def develop(
             for k in range(Q.shape[1]):
                 C[k, l] = maps[c, 0] * A[first + k, l] + Q[c, k]
             for i in range(n):
-                m[i, l] = theta0[i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
+                m[i, l] = places[0, i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
+        for c in range(len(Q)):
+            apply(C, m, c * Hm, (c + 1) * Hm, c, maps, places, Q, g, h)
         return K
     for c in range(len(Q)):
         keep, block = maps[c, 0], slice(c * K, (c + 1) * K)
@@ -55,7 +59,8 @@ def develop(
             for l in range(K):
                 to[l] = A[FIRST + i, l]
             if maps[c, 1] > 0.0:
-                to[:] = theta0[i]
+                to[:] = places[0, i]
+        apply(C, m, c * K, (c + 1) * K, c, maps, places, Q, g, h)
     return K * len(Q)
 
 
@@ -134,7 +139,7 @@ def frozen(nus: Array, scales: Array, y: float, last: float, width: float, r: fl
 @core
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
-    least: float, na: int, Q: Array, maps: Array, theta0: Array, sensors: Array, prior: Array, own: bool, bases: Array,
+    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array,
     parent: Array, event: Array, X: Array,
 ) -> int:  # fmt: skip
     """The children of K leaves, with their weights not normalised; returns how many there are."""
@@ -143,7 +148,7 @@ def grow(
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
     h, y_hat, likely = X[tri + 3 * n], X[tri + 3 * n + 1], X[tri + 3 * n + 2]
     scratch = X[tri + 3 * n + 3 :]
-    columns = develop(A, K, n, Q, maps, theta0, own, Hm, C, m)
+    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, h)
     regressors(phi, A, K, n, na, Z)
     for i in range(n):
         for c in range(1, columns // K):

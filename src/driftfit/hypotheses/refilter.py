@@ -20,11 +20,11 @@ Y, NOISE, TIME = 0, 1, 2
 @core
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
-    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, theta0: Array, sensors: Array,
+    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
     row: Array, bases: Array, parent: Array, event: Array, prior: Array, Qt: Array, X: Array,
 ) -> int:  # fmt: skip
     """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
-    H, n = len(row), len(theta0)
+    H, n = len(row), places.shape[1]
     tri = n * (n + 1) // 2
     weight = X[0]
     top = float(H) ** (D - 1)
@@ -44,7 +44,7 @@ def refilter(
         for k in range(tri):
             Qt[e, k] = 0.0
     root[LOG, 0] = 0.0
-    floor(root, 1, B, samples[0], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X)
+    floor(root, 1, B, samples[0], r, unknown, fade, least, Qt, maps, places, sensors, prior, bases, parent, event, X)
     for k in range(len(root)):
         root[k, 0] = B[k, 0]
         A[k, 0] = B[k, 0]
@@ -56,7 +56,7 @@ def refilter(
                 prior[e, l] = row[e]
         increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
         L = floor(
-            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, theta0, sensors, prior, bases, parent, event, X
+            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, places, sensors, prior, bases, parent, event, X
         )
         normalise(B, L)
         for k in range(len(root)):
@@ -87,11 +87,11 @@ def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
 @core
 def floor(
     A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, Q: Array,
-    maps: Array, theta0: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
+    maps: Array, places: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
 ) -> int:  # fmt: skip
     return int(
         grow(
             A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, 0, Q, maps,
-            theta0, sensors, prior, False, bases, parent, event, X,
+            places, sensors, prior, False, bases, parent, event, X,
         )
     )  # fmt: skip

@@ -40,7 +40,7 @@ from driftfit.hypotheses.advance import C as AT_C
 from driftfit.hypotheses.advance import P as AT_P
 from driftfit.hypotheses.advance import R as NOISE
 from driftfit.hypotheses.grow import FLOOR
-from driftfit.kernel import Array, State, floats, kernel, nothing, wholes
+from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.diffuse import enter, measurement, spanned_variance
 from driftfit.trackers.excitation import learn_scales
@@ -50,7 +50,7 @@ from driftfit.trackers.excitation import learn_scales
 def only_drift(s: State, l: int) -> None:
     """The first change, for the one filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
-    keep = s.keep0[l] if time > 0.0 else 1.0
+    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
     at = 0
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):

@@ -33,7 +33,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
-from driftfit.hypotheses import plan
+from driftfit.hypotheses import forget, plan
 from driftfit.hypotheses import reduction as reductions
 from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
 from driftfit.hypotheses.change import Change
@@ -116,6 +116,10 @@ class Bank(Tracker):
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
         self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        if self.all_changes[0].reset:
+            raise ValueError("Bank: the first change is the ordinary course of things, and cannot be a reset.")
+        if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
+            raise ValueError("Bank: FirstFloor knows random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
         kinds = {other.kind for other in others}
         reduce = self.reduction
@@ -236,13 +240,15 @@ class Bank(Tracker):
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
             arrays["root"], scale = arrays["B"][:, :1].copy(), 1.0
         return {
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            "q0": arrays["Q"][0], "size0": arrays["sizes"][0], "keep0": arrays["maps"][0, 0],
+            "q0": arrays["Q"][0], "size0": arrays["sizes"][0],
+            "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
             **packed(arrays, n, na, nominal.r is None, self._alike),
         }  # fmt: skip
 
@@ -253,15 +259,21 @@ class Bank(Tracker):
         chain, initial = self._events
         rows, lower = FIRST + n + tri + na, np.tril_indices(n)
         steps = [one.increments(n) for one in self.all_changes]
+        forgets = any(one.forgets for one in self.all_changes)
+        more = tri + 2 * n if forgets else 0
+        places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
+        places[forget.MEAN], places[forget.CAP] = theta0, np.inf
+        if forgets:
+            places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in self.all_changes])
         refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
         return {
             "A": np.zeros((rows, shape.parents)), "B": np.zeros((rows, K)), "T": np.zeros((W * (H + 1), K)),
-            "T2": np.zeros((W * (H + 1), K)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm), K)),
+            "T2": np.zeros((W * (H + 1), K)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, K)),
             "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
             "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
             "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
-            "factors": np.ones(Hd), "theta0": theta0,
-            "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self.all_changes]),
+            "factors": np.ones(Hd), "theta0": places,
+            "maps": np.array([change.mapping() for change in self.all_changes] * 2),
             "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
             "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
             "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
