@@ -14,6 +14,7 @@ from driftfit.hypotheses.forecast import expect, expect_together, simple
 from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
 from driftfit.hypotheses.forget import plain as walks
 from driftfit.hypotheses.grow import grow
+from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import (
     AGE,
     FIRST,
@@ -106,7 +107,7 @@ def reduce(
     G = many[GROUPS]
     if alone:
         pick(T, expanded, H, Hm, parent, event, order, G, T2)
-        take(B, order, G, FIRST + n + n * (n + 1) // 2 + na, A)
+        take(B, order, G, len(A), A)
     else:
         combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
     kept = 0.0
@@ -163,7 +164,7 @@ def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lags: Array, theta: Array, cov: Array,
+    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lag_prob: Array, theta: Array, cov: Array,
     na: int, unknown: bool, same: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
@@ -206,6 +207,7 @@ def advance(
         else:
             average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
         spread(C, Z, m, L, g, h, y_hat)
+        widen_by_lags(B, L, L, n, na, m, h)
     if not plain:
         now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
 
@@ -245,8 +247,9 @@ def advance(
             many[HELD] += 1
         else:  # no leaf allows what was seen: go on as if it had not been
             many[IMPOSSIBLE] += 1
-            L = recover(A, K, B, FIRST + n + tri + na)
+            L = recover(A, K, B, len(A))
             many[LEAVES], many[EXPANDED] = L, 1
+            shift_covariance(B, L, B, slice(0, L), n, na, False, m, h, now[R], X[len(X) - na :])
             push(B, L, n, na, now[IN_Y], True, y_hat)
             if own:
                 priors(T, event, True, first, alike, K, P, row, prior)
@@ -257,7 +260,9 @@ def advance(
             unknown, na, stamps, decided, parts, samples, X,
         )  # fmt: skip
     else:
-        push(B, L, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
+        seen = now[IN_SEEN] > 0.0
+        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, h, now[R], X[len(X) - na :])
+        push(B, L, n, na, now[IN_Y], seen, y_hat)
         if not still:
             for k in range(n):
                 theta0[BEFORE, k] = 0.0
@@ -275,7 +280,7 @@ def advance(
             many[FLOORS] += 1
     many[CLOCK] += 1
     mixture(B, L, n, unknown, X, theta, cov)
-    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, parent, event, scratch[0], many[PARENTS], lags)
+    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, parent, event, scratch[0], many[PARENTS], lag_prob)
     if now[IN_SEEN] > 0.0:
         now[LAST] = now[IN_Y]
 
@@ -298,10 +303,10 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
 
 
 @core
-def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lags: Array, na: int) -> None:
+def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lag_prob: Array, na: int) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    n, H = len(theta), lags.shape[1]
-    lags[0, 0] = 1.0
+    n, H = len(theta), lag_prob.shape[1]
+    lag_prob[0, 0] = 1.0
     y_hat = B[WEIGHT, :1]
     y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
     push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
@@ -338,12 +343,12 @@ def trace(P: Array) -> float:
 
 
 @core
-def note(ring: Array, clock: int, window: float, lags: Array) -> None:
+def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
     row = (clock - 1) % len(ring)
     ring[row, 0] = window
-    for e in range(lags.shape[1]):
-        ring[row, 1 + e] = lags[len(lags) - 1, e]
+    for e in range(lag_prob.shape[1]):
+        ring[row, 1 + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 PACKED = (

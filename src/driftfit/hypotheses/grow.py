@@ -21,6 +21,7 @@ import numpy as np
 
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE, WIDTH
 from driftfit.hypotheses.forget import apply
+from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.kernel import Array, core, log
 
@@ -156,6 +157,7 @@ def grow(
             for l in range(K):
                 to[l] = Z[i, l]
     spread(C, Z, m, columns, g, h, y_hat)
+    widen_by_lags(A, K, columns, n, na, m, h)
     for j in range(Hm):
         block = slice(j * columns, (j + 1) * columns)
         inherit(A, K, B, block, unknown, bases)
@@ -169,7 +171,9 @@ def grow(
             else:
                 gaussian(scratch[0], scratch[1], columns, likely)
         if na > 0:
-            remember(A, K, B, block, n, na, y - sensors[j, VALUE], y_hat, sensors[j, CLEANS] > 0.0)
+            own_lags = sensors[j, CLEANS] > 0.0
+            remember(A, K, B, block, n, na, y - sensors[j, VALUE], y_hat, own_lags)
+            shift_covariance(A, K, B, block, n, na, own_lags, m, h, r, X[len(X) - na :])
         name(B, block, K, j, Hd, Hm, own, prior, likely, bases, parent, event)
     return int(columns * Hm)
 

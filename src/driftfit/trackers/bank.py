@@ -75,6 +75,9 @@ class Bank(Tracker):
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
         Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+    lag_variance : bool
+        Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
+        are; see `driftfit.hypotheses.lags`. False takes them for certain.
 
     Raises
     ------
@@ -89,6 +92,7 @@ class Bank(Tracker):
     theta0: Any = 0.0
     p0: Any = None
     initial: Any = None
+    lag_variance: bool = True
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
@@ -257,10 +261,10 @@ class Bank(Tracker):
         shape, Hd, Hm, H = self._shape, len(self.all_changes), len(self.all_sensors), self._count
         tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
         chain, initial = self._events
-        rows, lower = FIRST + n + tri + na, np.tril_indices(n)
+        rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if self.lag_variance else 0), np.tril_indices(n)
         steps = [one.increments(n) for one in self.all_changes]
         forgets = any(one.forgets for one in self.all_changes)
-        more = tri + 2 * n if forgets else 0
+        more = na + (tri + 2 * n if forgets else 0)
         places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
         places[forget.MEAN], places[forget.CAP] = theta0, np.inf
         if forgets:

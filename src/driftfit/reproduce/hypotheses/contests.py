@@ -102,9 +102,11 @@ class Contest(NamedTuple):
         return references(self.table)
 
 
-def bank(reduce: Reduction, *others: Sensor, transition: Any = None, changes: Any = CHANGES) -> Bank:
-    """A bank with known noise."""
-    return Bank(changes, (OK, *others), transition, reduce, p0=P0)
+def bank(
+    reduce: Reduction, *others: Sensor, transition: Any = None, changes: Any = CHANGES, uncertain: bool = False
+) -> Bank:
+    """A bank with known noise; the reference takes output lags that leaves predicted for certain."""
+    return Bank(changes, (OK, *others), transition, reduce, p0=P0, lag_variance=uncertain)
 
 
 def kalman(q: Any = (0.004, 0.004, 0.04), r: float = R) -> Entry:
@@ -226,7 +228,9 @@ def additive() -> dict[str, Entry]:
         "joint Decide d=2, literal (dirty regressor)": decide(2, SPIKE, literal=True),
         **{f"joint Decide d={d}, leaf-cleaned regressor": decide(d, SPIKE) for d in (2, 3, 4)},
         "GPB(2) joint, literal": gpb(2, SPIKE, literal=True), "GPB(2) joint, leaf-cleaned": gpb(2, SPIKE),
-        "Beam M=16 leaf-cleaned": beam(16, SPIKE),
+        "Beam M=16 leaf-cleaned": beam(16, SPIKE), "GPB(2) joint, uncertain lags": gpb(2, SPIKE, uncertain=True),
+        "Beam M=16, uncertain lags": beam(16, SPIKE, uncertain=True),
+        "IMM joint, uncertain lags": imm(SPIKE, uncertain=True),
     }  # fmt: skip
 
 
@@ -242,6 +246,9 @@ def frozen() -> dict[str, Entry]:
         "GPB(2) ok/frozen cleaned, Markov": gpb(2, FROZEN, transition=FREEZES),
         "Beam 9 ok/frozen cleaned, Markov": beam(9, FROZEN, transition=FREEZES),
         "IMM ok/frozen Markov": imm(FROZEN, transition=FREEZES),
+        "GPB(2) ok/frozen, uncertain lags": gpb(2, FROZEN, transition=FREEZES, uncertain=True),
+        "Beam 9 ok/frozen, uncertain lags": beam(9, FROZEN, transition=FREEZES, uncertain=True),
+        "IMM ok/frozen, uncertain lags": imm(FROZEN, transition=FREEZES, uncertain=True),
     }  # fmt: skip
 
 
