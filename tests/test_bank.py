@@ -165,6 +165,13 @@ def test_first_floor_with_prior_weights_is_one_kalman_filter():
     np.testing.assert_allclose(root[8 : 8 + N], kalman.theta[len(Y) - 1 - D], atol=1e-12)
 
 
+def test_first_floor_remembers_what_its_tree_says():
+    run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3), p0=2.0), Y, U)
+    p = told(run, "lag_prob")
+    np.testing.assert_allclose(p[3:].sum(axis=2), 1.0, atol=1e-12)
+    assert p[47, 1, 1:].sum() > 0.5  # the second jump, one sample later
+
+
 def test_offset_of_unknown_size_is_an_outlier():
     with pytest.warns(UserWarning, match="outlier of variance"):
         offset = Sensor.offset(std=2.0, r=R, prob=0.05)
@@ -185,7 +192,7 @@ def test_leaves_clean_their_own_lags():
         x[t] = (0.7 * x[t - 1] if t else 0.0) + u[t] + 0.3 * rng.standard_normal()
         y[t] = x[t] + (5.0 if t in (20, 40) else 0.0)
     sensors = [Sensor.nominal(R), Sensor.outlier(10.0, "additive", prob=0.05)]
-    bank = Bank(changes(), sensors, reduce=Beam(7), p0=2.0)
+    bank = Bank(changes(), sensors, reduce=Beam(7), p0=2.0, lag_variance=False)
     run = track(ARX(1, 1, nk=0, start="zero"), bank, y, u)
     P = np.tile(np.kron(PROBS, [0.95, 0.05]), (6, 1))
     table = [(R, 0.0, False), (100.0 * R, 0.0, True)]
@@ -193,3 +200,30 @@ def test_leaves_clean_their_own_lags():
     for t in range(T):
         twin.see(np.array([0.0, u[t]]), y[t])
         np.testing.assert_allclose(run.theta[t], twin.mean, atol=1e-10)
+
+
+def test_lags_that_were_predicted_are_uncertain():
+    """One history, told by prob=: every sample from 20 on is an additive outlier, or missing, for a while."""
+    rng = np.random.default_rng(3)
+    T, q = 60, 1e-3
+    u, y = rng.standard_normal(T), np.zeros(T)
+    for t in range(T):
+        y[t] = (1.2 * y[t - 1] - 0.5 * y[t - 2] if t > 1 else 0.0) + u[t] + 0.3 * rng.standard_normal()
+    y[[23, 45]] = np.nan
+    bad = np.isin(np.arange(T), [20, 21, 22, 24, 40])
+    sensors = [Sensor.nominal(R), Sensor.outlier(10.0, "additive", prob=0.05)]
+    run = track(ARX(2, 1, nk=0, start="zero"), Bank([Change(q)], sensors, reduce=GPB(2), p0=2.0), y, u,
+                prob=np.stack([~bad, bad], axis=1).astype(float))  # fmt: skip
+    m, C, V, lags = np.zeros(3), 2.0 * np.eye(3), np.zeros((2, 2)), np.zeros(2)
+    for t in range(T):
+        C = C + q * np.eye(3)
+        z, a, seen = np.r_[lags, u[t]], m[:2], np.isfinite(y[t])
+        x, wide, cross = z @ m, z @ C @ z + a @ V @ a, V @ a
+        assert run.innovation_std[t] ** 2 == pytest.approx(wide + R * (100.0 if bad[t] else 1.0), rel=1e-9), t
+        if seen:
+            s = wide + R * (100.0 if bad[t] else 1.0)
+            m, C = m + C @ z / s * (y[t] - x), C - np.outer(C @ z, C @ z) / s
+        own = bad[t] or not seen
+        lags = np.r_[x if own else y[t], lags[0]]
+        V = np.array([[wide + R, cross[0]], [cross[0], V[0, 0]]]) if own else np.diag([0.0, V[0, 0]])
+        np.testing.assert_allclose(run.theta[t], m, atol=1e-9)

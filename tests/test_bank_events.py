@@ -175,3 +175,18 @@ def test_an_operator_is_believed(bank):
     np.testing.assert_allclose(live.hypotheses.mixture().cov, live.cov, atol=1e-9)
     live.update(None, u[50])
     np.testing.assert_allclose(live.theta, [3.0, 4.0])
+
+
+@pytest.mark.parametrize("bank", [BANK, Bank()], ids=["known", "unknown noise"])
+def test_several_outputs_have_a_bank_each(bank):
+    y, u = record(60, 5, (40,))
+    both = np.stack([y, -2.0 * y[::-1]], axis=1)
+    run = track(Regression(N, ny=2), bank, both, u)
+    for k, name in enumerate(run.outputs):
+        alone = track(Regression(N), bank, both[:, k], u)
+        assert same(run.theta[:, k], alone.theta), name
+        assert same(run.std[:, k], alone.std), name
+    live = Live(Regression(N, ny=2), bank)
+    for t in range(60):
+        live.update(both[t], u[t])
+    assert same(live.theta, run.theta[-1])

@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 
 from driftfit.hypotheses.forecast import expect, expect_together
+from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
+from driftfit.hypotheses.forget import plain as walks
 from driftfit.hypotheses.grow import grow
+from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import (
     AGE,
     FIRST,
@@ -42,13 +45,14 @@ from driftfit.hypotheses.plan import (
     MERGE,
     PRIOR,
     REFILTER,
+    WAIT,
     beam,
     decide,
     hybrid,
     merge,
     number,
 )
-from driftfit.hypotheses.refilter import NOISE, TIME, Y, refilter
+from driftfit.hypotheses.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.kernel import Array, core, floats, kernel, outside, part, wholes
 
 LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
@@ -63,6 +67,8 @@ WAITING, READY = 0, -1
     SQUARES, TIMES, SIZE,
 ) = range(19)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out."""
+GROWTH = 1e8
+"""Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
@@ -92,20 +98,19 @@ def reduce(
         T, T2 = T2, T
     if full:
         many[STORED] -= 1
-        return int(
-            refilter(
-                root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
-                now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt,
-                X,
-            )
+        L = refilter(
+            root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
+            now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt, X,
         )  # fmt: skip
+        histories(A, L, int(knobs[DEPTH]), H, Hm, T)
+        return int(L)
     flip(many)
     if kind == INTERACT:
         return int(mix(B, L, prior, n, na, unknown, A, order, X[0], T, T2))
     G = many[GROUPS]
     if alone:
         pick(T, expanded, H, Hm, parent, event, order, G, T2)
-        kept = take(B, order, G, n, n * (n + 1) // 2 + na, unknown, bases, A)
+        kept = take(B, order, G, len(A), unknown, bases, A)
     else:
         kept = combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
     now[KEPT] = min(kept, 1.0)
@@ -122,11 +127,13 @@ def flip(many: Array) -> None:
 def plan(
     B: Array, many: Array, now: Array, knobs: Array, bases: Array, links: Array, group: Array, slots: Array,
     loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array, sensors: Array, phi: Array,
-    unknown: bool, na: int, stamps: Array, decided: Array, parts: Array, X: Array,
+    unknown: bool, na: int, stamps: Array, decided: Array, parts: Array, samples: Array, X: Array,
 ) -> None:  # fmt: skip
     """Which leaves go on."""
     L, kind, Hm = many[LEAVES], int(knobs[KIND]), len(sensors)
     if kind == CUT:
+        if knobs[WAIT] > 0.0:  # the regressor to come is like the last one that no event held has been seen with
+            phi = samples[max(many[STORED] - 1 - many[HELD], 0) % len(samples), TIME + 1 :]
         many[HELD] = decide(
             B, L, many[HELD], knobs, loss, P, row, same, Q, maps, theta0, sensors, phi, now[LAST], now[R], unknown, na,
             links[1], stamps, float(many[CLOCK]), decided, parts, group, X,
@@ -157,10 +164,12 @@ def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lags: Array, theta: Array, cov: Array,
+    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lag_prob: Array, theta: Array, cov: Array,
     na: int, unknown: bool, same: bool, plain: bool,
 ) -> None:  # fmt: skip
-    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite."""
+    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
+    The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`.
+    """
     n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
     tri = n * (n + 1) // 2
     kind, parent, event = int(knobs[KIND]), links[0], links[1]
@@ -174,6 +183,8 @@ def advance(
     for k in range(len(decided)):
         decided[k, 0] = -1.0
     increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
+    settings, maps = maps[: len(Q)], maps[len(Q) :]
+    for_interval(settings, now[IN_DT], maps)
 
     # forecast: every leaf with all that may happen to it
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
@@ -191,8 +202,12 @@ def advance(
         )
     if not plain or now[IN_OK] == 0.0:
         regressors(phi, B, L, min(L, 1), n, na, Z)
-        blur(B, L, n, prior, Hm, Qt, maps, theta0, alike, C, m, scratch[0])
+        if walks(maps):
+            blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
+        else:
+            average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
         spread(C, Z, m, L, g, expected)
+        widen_by_lags(B, L, L, n, na, m, h)
     if not plain:
         now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
 
@@ -203,7 +218,8 @@ def advance(
         )  # fmt: skip
         if kind == REFILTER:
             increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
-            store(samples[many[STORED]], now, phi)
+        if kind == REFILTER or knobs[WAIT] > 0.0:
+            store(samples[many[STORED] % len(samples)], now, phi)
             many[STORED] += 1
         T, T2 = (second_table, first_table) if many[FLIPPED] > 0 else (first_table, second_table)
         many[EXPANDED] = 0
@@ -225,26 +241,32 @@ def advance(
         many[PARENTS], many[LEAVES] = K, L
         if gone == gone:
             now[EVIDENCE] = gone - math.log(now[KEPT])
+            for i in range(n):
+                theta0[BEFORE, i] = phi[i]
             if many[HELD] < len(stamps):
                 stamps[many[HELD]] = float(many[CLOCK])
             many[HELD] += 1
         else:  # no leaf allows what was seen: go on as if it had not been
             many[IMPOSSIBLE] += 1
-            L = recover(A, K, B, FIRST + n + tri + na)
+            L = recover(A, K, B, len(A))
             many[LEAVES], many[EXPANDED] = L, 1
+            shift_covariance(B, L, B, slice(0, L), n, na, False, m, h, now[R], X[len(X) - na :])
             push(B, L, n, na, now[IN_Y], True, y_hat)
             if own:
                 priors(T, event, True, first, alike, K, P, row, prior)
             shift(T, L, prior, Hm)
         many[FLOORS] += 1
         plan(
-            B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0, sensors, phi,
-            unknown, na, stamps, decided, parts, X,
+            B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0[0], sensors, phi,
+            unknown, na, stamps, decided, parts, samples, X,
         )  # fmt: skip
     else:
-        push(B, L, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
+        seen = now[IN_SEEN] > 0.0
+        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, h, now[R], X[len(X) - na :])
+        push(B, L, n, na, now[IN_Y], seen, y_hat)
         if not still:
             for k in range(n):
+                theta0[BEFORE, k] = 0.0
                 for l in range(L):
                     B[FIRST + k, l] = m[k, l]
             for k in range(tri):
@@ -259,7 +281,7 @@ def advance(
             many[FLOORS] += 1
     many[CLOCK] += 1
     mixture(B, L, n, unknown, X, theta, cov)
-    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, parent, event, scratch[0], many[PARENTS], lags)
+    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, parent, event, scratch[0], many[PARENTS], lag_prob)
     if now[IN_SEEN] > 0.0:
         now[LAST] = now[IN_Y]
 
@@ -282,10 +304,10 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
 
 
 @core
-def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lags: Array, na: int) -> None:
+def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lag_prob: Array, na: int) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    n, H = len(theta), lags.shape[1]
-    lags[0, 0] = 1.0
+    n, H = len(theta), lag_prob.shape[1]
+    lag_prob[0, 0] = 1.0
     y_hat = B[WEIGHT, :1]
     y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
     push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
@@ -313,13 +335,21 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
     many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
+@core
+def trace(P: Array) -> float:
+    total = 0.0
+    for i in range(len(P)):
+        total += P[i, i]
+    return total
+
+
 @part
-def note(ring: Array, clock: int, window: float, lags: Array) -> None:
+def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
     row = (clock - 1) % len(ring)
     ring[row, 0] = window
-    for e in range(lags.shape[1]):
-        ring[row, 1 + e] = lags[len(lags) - 1, e]
+    for e in range(lag_prob.shape[1]):
+        ring[row, 1 + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 PACKED = (
@@ -366,6 +396,7 @@ def bank(table: int) -> None:
         root = packed(t, 23)
         for row in range(len(root)):
             root[row, 0] = packed(t, 1)[row, 0]
+        packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
         note(packed(t, 26), many[CLOCK], 0.0, packed(t, 27))
         return
@@ -373,7 +404,7 @@ def bank(table: int) -> None:
         packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
         whole(t, 7)[0], many, now, packed(t, 8),
         floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
-        packed(t, 12), packed(t, 13)[0], packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
+        packed(t, 12), packed(t, 13), packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
         packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
         packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
         floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0,

@@ -1,10 +1,16 @@
 """Change hypotheses: what may happen to theta between two samples.
 
-    theta <- (1 - reset) theta + reset theta0,      C <- C / forget + Q        (reset: C <- P0)
+    theta <- theta,       C <- C + Q                  random walk ("linear forgetting"); Q = 0: nothing
+    theta <- theta,       C <- C / forget + Q         exponential forgetting, and two other kinds of forgetting
+    theta <- theta0,      C <- Q                      reset: a new segment
 
 Q is `q` in squared units of theta, or free of scale, Q_ii = size^2 r / c_i: with r the noise variance and c_i the mean
 square of regressor i, a change of one standard deviation moves the output by `size` standard deviations of the noise.
-r / c_i is what a single sample tells of parameter i alone, so `size` counts in the parameters' own uncertainty.
+r / c_i is what a single sample tells of parameter i alone, so `size` counts in the parameters' own uncertainty. The
+formulas of forgetting are in `driftfit.hypotheses.forget`.
+
+With one change and one sensor the bank is the filter of that change: Change(q) is `Kalman`, Change(0) least squares,
+Change(forget=lam) is `RLS`, Change(forget=lam, kind="directional") `RLS` with directional forgetting.
 """
 
 from __future__ import annotations
@@ -14,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.hypotheses import forget
 from driftfit.kernel import Array
-from driftfit.settings import Settings, covariance, matrix, numbers, vector
+from driftfit.settings import Settings, covariance, matrix, numbers, one_of, vector
 
 
 @dataclass(frozen=True)
@@ -33,16 +40,23 @@ class Change(Settings):
     which : indices or None
         The parameters that move; None is all.
     forget : number in (0, 1]
-        Exponential forgetting: the covariance is divided by it.
+        Forgetting factor per nominal sample.
+    kind : "exponential", "directional" or "stabilised"
+        What is forgotten: everything alike; only what the last regressor brought news of; or everything, in favour of
+        N(theta0, anchor).
+    anchor : number, (n,), (n, n) or None
+        For "stabilised": the positive definite covariance that the parameters return to; it bounds theirs.
     reset : bool
-        A new segment: theta is forgotten, and its prior takes its place. q is then the covariance of that prior.
+        A new segment: the parameters that ``which`` lists are forgotten, and their prior takes its place, with mean
+        ``theta0`` of the bank and covariance q.
     name : str
         What tables and plots call it.
 
     Raises
     ------
     ValueError
-        If q is no covariance, prob no probability, forget outside (0, 1], or both q and size are given.
+        If q is no covariance, prob no probability, forget outside (0, 1], both q and size are given, or settings of
+        different kinds of change are mixed.
     """
 
     q: Any = None
@@ -50,6 +64,8 @@ class Change(Settings):
     which: Any = None
     size: Any = None
     forget: float = 1.0
+    kind: str = "exponential"
+    anchor: Any = None
     reset: bool = False
     name: str = ""
 
@@ -70,8 +86,48 @@ class Change(Settings):
         self._set("forget", numbers("Change", "forget", self.forget, ndim=0, low=0.0, strict=True))
         if self.forget > 1.0:
             raise ValueError(f"Change: forget must be in (0, 1]; got {self.forget!r}.")
+        self._check_forgetting()
         if self.reset and self.q is None:
             raise ValueError("Change: reset=True needs q=, the covariance of the prior of the new segment.")
+
+    def _check_forgetting(self) -> None:
+        kind = one_of("Change", "kind", self.kind, ("exponential", "directional", "stabilised"))
+        if (kind == "stabilised") != (self.anchor is not None):
+            raise ValueError(
+                f'Change: kind="stabilised" and anchor= belong together; got kind={kind!r}, anchor={self.anchor!r}.'
+            )
+        if self.anchor is not None:
+            self._set("anchor", covariance("Change", "anchor", self.anchor))
+            A = np.asarray(self.anchor)
+            if not (np.linalg.eigvalsh(A) if A.ndim == 2 else A).min() > 0.0:
+                raise ValueError(f"Change: anchor must be positive definite; got {self.anchor!r}.")
+        if self.reset and self.forget != 1.0:
+            raise ValueError(f"Change: give forget or reset, not both; got forget={self.forget!r}, reset=True.")
+
+    @property
+    def forgets(self) -> bool:
+        """Whether it is anything but a random walk."""
+        return self.reset or self.forget < 1.0
+
+    def mapping(self) -> tuple[float, float, float, float]:
+        """The row of `driftfit.hypotheses.forget` for this change."""
+        kinds = {
+            "exponential": forget.EXPONENTIAL, "directional": forget.DIRECTIONAL, "stabilised": forget.STABILISED,
+        }  # fmt: skip
+        kind = kinds[self.kind] if self.forget < 1.0 else forget.WALK
+        if self.reset and self.which is not None:
+            kind = forget.PARTIAL
+        keep = 0.0 if self.reset and self.which is None else 1.0 / self.forget
+        return keep, float(keep == 0.0), float(kind), float(np.log(self.forget))
+
+    def anchors(self, n: int, unit: float) -> Array:
+        """(n, n): what that module keeps of it; covariances are multiplied by ``unit``."""
+        rows = np.zeros((n, n))
+        if self.anchor is not None:
+            rows = forget.anchors_of(matrix("Change", "anchor", self.anchor, n) * unit)
+        elif self.reset and self.which is not None:
+            rows[0, list(self.which)] = 1.0
+        return rows
 
     def increments(self, n: int) -> tuple[Array, Array]:
         """(Q, squared sizes): the fixed increment (n, n), and (n,) in units of r / c_i."""

@@ -22,6 +22,8 @@ import numpy as np
 from driftfit.eights import WIDTH, fill, load, minus, over, plus, store, times
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE
 from driftfit.hypotheses.forecast import WIDTH as STUCK_WIDTH
+from driftfit.hypotheses.forget import apply
+from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.kernel import Array, core, log, part
 
@@ -32,8 +34,9 @@ FLOOR = 1e-12
 
 @part
 def develop(
-    A: Array, K: int, n: int, Q: Array, maps: Array, theta0: Array, own: bool, Hm: int, C: Array, m: Array
-) -> int:
+    A: Array, K: int, n: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array, m: Array, g: Array,
+    h: Array,
+) -> int:  # fmt: skip
     """Every leaf under every change: C and m of the columns c K + l. With ``own`` leaf l stands for the joint event l
     alone. Returns the number of columns.
     """
@@ -44,7 +47,9 @@ def develop(
             for k in range(Q.shape[1]):
                 C[k, l] = maps[c, 0] * A[first + k, l] + Q[c, k]
             for i in range(n):
-                m[i, l] = theta0[i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
+                m[i, l] = places[0, i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
+        for c in range(len(Q)):
+            apply(C, m, c * Hm, (c + 1) * Hm, c, maps, places, Q, g, h)
         return K
     for c in range(len(Q)):
         keep, reset = fill(maps[c, 0]), maps[c, 1] > 0.0
@@ -52,7 +57,8 @@ def develop(
             for k in range(Q.shape[1]):
                 store(C, k, c * K + l, plus(times(keep, load(A, first + k, l)), fill(Q[c, k])))
             for i in range(n):
-                store(m, i, c * K + l, fill(theta0[i]) if reset else load(A, FIRST + i, l))
+                store(m, i, c * K + l, fill(places[0, i]) if reset else load(A, FIRST + i, l))
+        apply(C, m, c * K, (c + 1) * K, c, maps, places, Q, g, h)
     return K * len(Q)
 
 
@@ -123,7 +129,7 @@ def frozen(nus: Array, scales: Array, y: float, last: float, width: float, r: fl
 @core
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
-    least: float, na: int, Q: Array, maps: Array, theta0: Array, sensors: Array, prior: Array, own: bool, alike: bool,
+    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, alike: bool,
     bases: Array, parent: Array, event: Array, X: Array,
 ) -> int:  # fmt: skip
     """The children of K leaves, with their weights not normalised; returns how many there are. ``alike`` says that the
@@ -134,9 +140,10 @@ def grow(
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
     expected, likely = X[tri + 3 * n : tri + 3 * n + 2], X[tri + 3 * n + 2]
     scratch = X[tri + 3 * n + 3 :]
-    columns = develop(A, K, n, Q, maps, theta0, own, Hm, C, m)
+    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, expected[0])
     regressors(phi, A, K, columns // K, n, na, Z)
     spread(C, Z, m, columns, g, expected)
+    widen_by_lags(A, K, columns, n, na, m, expected[0])
     for j in range(Hm):
         at = j * columns
         if unknown:
@@ -154,7 +161,10 @@ def grow(
             else:
                 gaussian(scratch[0], scratch[1], columns, likely)
         if na > 0:
-            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], sensors[j, CLEANS] > 0.0)
+            own_lags = sensors[j, CLEANS] > 0.0
+            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], own_lags)
+            block, spare = slice(at, at + columns), X[len(X) - na :]
+            shift_covariance(A, K, B, block, n, na, own_lags, m, expected[0], r, spare)
         weigh(A, K, B, at, columns, j, Hm, own, alike, prior, likely, parent, event)
         encode(A, K, B, at, columns, j, Hd, Hm, bases, event)
     return int(columns * Hm)

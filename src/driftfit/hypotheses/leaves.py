@@ -188,65 +188,22 @@ def spread(C: Array, Z: Array, m: Array, L: int, g: Array, expected: Array) -> N
 
 
 @core
-def blur(
-    B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, theta0: Array, same: bool, C: Array,
-    m: Array, chance: Array,
-) -> None:  # fmt: skip
-    """Mean and covariance of every leaf if any change may happen and no data come: C + sum p_i Q_i, to be exact for
-    walks; with forgetting and resets the first two moments.
-    """
-    at, Hd = FIRST + n, len(Q)
-    tri = n * (n + 1) // 2
-    for k in range(tri):
-        for l in range(L):
-            C[k, l] = 0.0
+def blur(B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, m: Array, chance: Array) -> None:
+    """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
+    at = FIRST + n
     for i in range(n):
         for l in range(L):
             m[i, l] = B[FIRST + i, l]
-    walks = True
-    for c in range(Hd):
-        walks = walks and maps[c, 0] == 1.0
-    if walks:  # exactly C, whatever the probabilities sum to in rounding
-        for k in range(tri):
-            for l in range(L):
-                C[k, l] = B[at + k, l]
-    mean = 0.0
-    for c in range(Hd):
+    for k in range(n * (n + 1) // 2):
+        for l in range(L):
+            C[k, l] = B[at + k, l]
+    for c in range(len(Q)):
         for l in range(L):
             chance[l] = 0.0
         for j in range(Hm):
             for l in range(L):
                 chance[l] += prior[c * Hm + j, l]
-        keep = 0.0 if walks else maps[c, 0]
-        for k in range(tri):
-            if keep != 0.0:
-                for l in range(L):
-                    C[k, l] += chance[l] * (keep * B[at + k, l] + Q[c, k])
-            elif Q[c, k] != 0.0:
+        for k in range(n * (n + 1) // 2):
+            if Q[c, k] != 0.0:
                 for l in range(L):
                     C[k, l] += chance[l] * Q[c, k]
-        mean = max(mean, maps[c, 1])
-    if mean > 0.0:
-        restart(B, L, n, prior, Hm, maps, theta0, C, m, chance)
-
-
-@core
-def restart(
-    B: Array, L: int, n: int, prior: Array, Hm: int, maps: Array, theta0: Array, C: Array, m: Array, chance: Array
-) -> None:
-    """The part of a reset in `blur`: the mean moves to theta0 with its probability, the covariance takes the spread."""
-    for l in range(L):
-        chance[l] = 0.0
-    for c in range(len(maps)):
-        for j in range(Hm):
-            for l in range(L):
-                chance[l] += maps[c, 1] * prior[c * Hm + j, l]
-    for l in range(L):
-        p = chance[l]
-        at = 0
-        for i in range(n):
-            away = B[FIRST + i, l] - theta0[i]
-            m[i, l] = B[FIRST + i, l] - p * away
-            for j in range(i + 1):
-                C[at, l] += p * (1.0 - p) * away * (B[FIRST + j, l] - theta0[j])
-                at += 1

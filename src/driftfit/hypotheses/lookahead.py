@@ -5,8 +5,9 @@
 
 A minimum of averages is at most the average of minima, so ER <= R*: waiting never costs information, only time. The
 integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union of
-them; the regressor is the present one, as the next input is not known. Cost: components x nodes; used only while a
-decision is open.
+them. The next regressor is not known; the last one before the events that are open stands for it. One that the leaves
+have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x nodes;
+used only while a decision is open.
 """
 
 from __future__ import annotations

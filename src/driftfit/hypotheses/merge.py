@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 
+from driftfit.hypotheses.lags import merge_covariance
 from driftfit.hypotheses.leaves import CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.hypotheses.past import average
 from driftfit.kernel import Array, core, kernel, part
@@ -69,7 +70,7 @@ def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array
     best = members[heaviest]
     for row in range(LOG, FIRST):
         A[row, to] = B[row, best]
-    for row in range(FIRST, C + tri + na):
+    for row in range(FIRST, len(A)):
         A[row, to] = 0.0
     for k in range(len(members)):
         l = members[k]
@@ -92,6 +93,7 @@ def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array
             for j in range(i + 1):
                 A[at, to] += share[k] * (B[at, l] + away * (B[FIRST + j, l] - A[FIRST + j, to]))
                 at += 1
+    merge_covariance(B, members, n, na, share, A, to)
     if unknown:
         A[NU, to] = freedom(t - math.log(g), B[NU, best])
         A[S, to] = A[NU, to] / g
@@ -135,7 +137,7 @@ def combine(
         for at in range(len(members)):
             part[at] = B[WEIGHT, members[at]] / mass
         if len(members) == 1:
-            for row in range(FIRST + n + n * (n + 1) // 2 + na):
+            for row in range(len(A)):
                 A[row, k] = B[row, members[0]]
         else:
             match(B, members, n, na, unknown, part, A, k)
@@ -145,9 +147,9 @@ def combine(
 
 
 @part
-def take(B: Array, order: Array, G: int, n: int, rest: int, unknown: bool, bases: Array, A: Array) -> float:
+def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
     """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
-    for row in range(FIRST + n + rest):
+    for row in range(rows):
         if used(row, unknown, bases):
             for k in range(G):
                 A[row, k] = B[row, order[k]]

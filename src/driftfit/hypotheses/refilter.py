@@ -20,11 +20,11 @@ Y, NOISE, TIME = 0, 1, 2
 @core
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
-    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, theta0: Array, sensors: Array,
+    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
     row: Array, bases: Array, parent: Array, event: Array, prior: Array, na: int, own: bool, Qt: Array, X: Array,
 ) -> int:  # fmt: skip
     """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
-    H, n = len(row), len(theta0)
+    H, n = len(row), places.shape[1]
     tri = n * (n + 1) // 2
     weight = X[0]
     top = float(H) ** (D - 1)
@@ -46,7 +46,7 @@ def refilter(
     root[LOG, 0] = 0.0
     L = min(D, 1)
     floor(
-        root, L, B, samples[0], r, unknown, fade, least, na, Qt, maps, theta0, sensors, prior, own, bases, parent,
+        root, L, B, samples[0], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
         event, X,
     )  # fmt: skip
     for k in range(len(root)):
@@ -59,7 +59,7 @@ def refilter(
                 prior[e, l] = row[e]
         increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
         L = floor(
-            A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, theta0, sensors, prior, own, bases, parent,
+            A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
             event, X,
         )  # fmt: skip
         normalise(B, L)
@@ -73,14 +73,29 @@ def refilter(
 
 
 @core
+def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
+    """The table of the past for the leaves of the new tree: what happened in the D - 1 floors that it has."""
+    block, width = H + 1, T.shape[1]
+    for l in range(L):
+        for at in range(width):
+            T[l, at] = 0.0
+        code, quiet = int(A[CODE, l]), 1.0
+        for k in range(min(D - 1, width // block)):
+            e = code % H
+            code //= H
+            quiet *= 1.0 if e < Hm else 0.0
+            T[l, k * block + e], T[l, k * block + H] = 1.0, quiet
+
+
+@core
 def floor(
     A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, na: int, Q: Array,
-    maps: Array, theta0: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,
+    maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,
     X: Array,
 ) -> int:  # fmt: skip
     return int(
         grow(
             A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, na, Q, maps,
-            theta0, sensors, prior, own, not own, bases, parent, event, X,
+            places, sensors, prior, own, not own, bases, parent, event, X,
         )
     )  # fmt: skip

@@ -192,10 +192,11 @@ class Hypotheses:
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, in order of time.
 
-        How far parameters moved at a change is said with the record's whole future in sight, by `smooth`.
+        How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
+        change forgets or resets there is nothing to smooth, and it is not said.
         """
         found = self._found(threshold)
-        if not any(event.kind == "change" for event in found):
+        if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
         smoothed = self.smooth(threshold)
         return [event.measured(smoothed) if event.kind == "change" and event.date else event for event in found]

@@ -72,6 +72,11 @@ class EventSmoothed:
 def problem_of(run: Track, events: list[Event]) -> Problem:
     """The walk behind a run of a bank, with the covariances of the events."""
     bank: Any = run.tracker
+    if any(change.forgets for change in bank.all_changes):
+        raise ValueError(
+            "smooth: a Change that forgets or resets is no random walk, which is what can be smoothed; give its q "
+            "instead, or cut the record at the changes with driftfit.smoothers.piecewise.piecewise(run)."
+        )
     seen = replay(run)
     ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
     T, n = phi.shape

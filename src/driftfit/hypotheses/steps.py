@@ -8,6 +8,7 @@ from driftfit.drivers import TrackerSteps
 from driftfit.hypotheses.advance import (
     ADDRESSES,
     BASE,
+    COUNT,
     FACTORS,
     GIVEN,
     IN_DT,
@@ -24,8 +25,10 @@ from driftfit.hypotheses.advance import (
     PLACES,
     READY,
     REPORT,
+    ROWS,
     S2,
     SETTLED,
+    SIZE,
     SQUARES,
     THETA,
     TIMES,
@@ -37,7 +40,7 @@ from driftfit.hypotheses.advance import C as AT_C
 from driftfit.hypotheses.advance import P as AT_P
 from driftfit.hypotheses.advance import R as NOISE
 from driftfit.hypotheses.grow import FLOOR
-from driftfit.kernel import Array, State, kernel, nothing
+from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.diffuse import enter, measurement, spanned_variance
 from driftfit.trackers.excitation import learn_scales
@@ -47,7 +50,7 @@ from driftfit.trackers.excitation import learn_scales
 def only_drift(s: State, l: int) -> None:
     """The first change, for the one filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
-    keep = s.keep0[l] if time > 0.0 else 1.0
+    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
     at = 0
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
@@ -71,12 +74,58 @@ def point(s: State) -> None:
 
 
 @kernel
-def run(s: State) -> None:
+def run(s: State, l: int) -> None:
     """The machine; addresses are no part of the state."""
-    point(s)
-    bank(s.table.ctypes.data)
-    for k in range(ADDRESSES):
-        s.table[PLACES + k, 0, 0] = 0
+    if s.theta.shape[1] > 1:
+        among(s, l)
+    else:
+        point(s)
+        bank(s.table.ctypes.data)
+        for k in range(ADDRESSES):
+            s.table[PLACES + k, 0, 0] = 0
+
+
+@kernel
+def among(s: State, l: int) -> None:
+    """The machine for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
+    n, N, R = s.theta.shape[0], s.memory.shape[0], s.report.shape[0]
+    memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
+    vectors = report + 8 * R
+    P = vectors + 24 * n
+    now = P + 8 * n * n
+    many = now + 8 * SIZE
+    at = many + 8 * COUNT
+    table = wholes(at, ROWS, 3)
+    for k in range(ROWS):
+        for i in range(3):
+            table[k, i] = s.table[k, i, l]
+    table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[AT_C, 0] = memory, report, vectors, vectors + 8 * n
+    table[THETA, 0], table[AT_P, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
+    for k in range(N):
+        floats(memory, 1, N)[0, k] = s.memory[k, l]
+    for i in range(n):
+        floats(vectors, 3, n)[0, i] = s.phi[i, l]
+        floats(vectors, 3, n)[1, i] = s.c[i, l]
+        floats(vectors, 3, n)[2, i] = s.theta[i, l]
+        for j in range(n):
+            floats(P, n, n)[i, j] = s.P[i, j, l]
+    for k in range(SIZE):
+        floats(now, 1, SIZE)[0, k] = s.now[k, l]
+    for k in range(COUNT):
+        wholes(many, 1, COUNT)[0, k] = s.many[k, l]
+    bank(at)
+    for k in range(N):
+        s.memory[k, l] = floats(memory, 1, N)[0, k]
+    for k in range(R):
+        s.report[k, l] = floats(report, 1, R)[0, k]
+    for i in range(n):
+        s.theta[i, l] = floats(vectors, 3, n)[2, i]
+        for j in range(n):
+            s.P[i, j, l] = floats(P, n, n)[i, j]
+    for k in range(SIZE):
+        s.now[k, l] = floats(now, 1, SIZE)[0, k]
+    for k in range(COUNT):
+        s.many[k, l] = wholes(many, 1, COUNT)[0, k]
 
 
 @kernel
@@ -92,7 +141,7 @@ def tell(s: State, l: int) -> None:
 def correct(s: State, l: int) -> None:
     if s.many[SETTLED, l] > 0:
         tell(s, l)
-        run(s)
+        run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
         learn_scales(s, l)
     else:
@@ -120,7 +169,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
     ready = s.rank[l] == s.theta.shape[0] and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
     s.many[SETTLED, l] = READY if ready else WAITING
-    run(s)
+    run(s, l)
     if ready:
         s.scale[l] = 1.0
 

@@ -57,8 +57,8 @@ def drifted(rng: np.random.Generator, theta: Array, size: float) -> Array:
             return moved
 
 
-def jumping(seed: int, T: int = 600, fault: str = "none", K: float = 10.0) -> Jumping:
-    """A record; ``fault`` is "none", "innovation", "additive", "frozen" or "regimes"."""
+def jumping(seed: int, T: int = 600, fault: str = "none", K: float = 10.0, sigma: float = SIGMA) -> Jumping:
+    """A record; ``fault`` is "none", "innovation", "additive", "frozen" or "regimes"; ``sigma`` is that of e."""
     rng = np.random.default_rng(seed)
     theta, u = draw(rng), rng.standard_normal(T)
     path, kinds, bad = np.empty((T, 3)), np.zeros(T, int), np.zeros(T, bool)
@@ -78,9 +78,9 @@ def jumping(seed: int, T: int = 600, fault: str = "none", K: float = 10.0) -> Ju
             theta = drifted(rng, theta, DRIFT)
         path[t], kinds[t] = theta, kind
         spike = fault in ("innovation", "additive") and rng.random() < 0.05
-        e = SIGMA * (K if spike and fault == "innovation" else 1.0) * rng.standard_normal()
+        e = sigma * (K if spike and fault == "innovation" else 1.0) * rng.standard_normal()
         x[t] = theta @ [x[t - 1] if t else 0.0, x[t - 2] if t > 1 else 0.0, u[t]] + e
-        y[t] = x[t] + (K * SIGMA * rng.standard_normal() if spike and fault == "additive" else 0.0)
+        y[t] = x[t] + (K * sigma * rng.standard_normal() if spike and fault == "additive" else 0.0)
         if fault == "frozen":
             if t > 40 and t > until and rng.random() < 0.004:
                 until = t + 14

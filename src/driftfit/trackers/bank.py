@@ -34,7 +34,7 @@ from driftfit.drivers import TrackerSteps
 from driftfit.eights import WIDTH
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
-from driftfit.hypotheses import plan
+from driftfit.hypotheses import forget, plan
 from driftfit.hypotheses import reduction as reductions
 from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
 from driftfit.hypotheses.change import Change
@@ -77,6 +77,9 @@ class Bank(Tracker):
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
         Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+    lag_variance : bool
+        Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
+        are; see `driftfit.hypotheses.lags`. False takes them for certain.
 
     Raises
     ------
@@ -91,6 +94,7 @@ class Bank(Tracker):
     theta0: Any = 0.0
     p0: Any = None
     initial: Any = None
+    lag_variance: bool = True
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
@@ -118,6 +122,10 @@ class Bank(Tracker):
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
         self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        if self.all_changes[0].reset:
+            raise ValueError("Bank: the first change is the ordinary course of things, and cannot be a reset.")
+        if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
+            raise ValueError("Bank: FirstFloor knows random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
         kinds = {other.kind for other in others}
         reduce = self.reduction
@@ -217,7 +225,11 @@ class Bank(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         cleans = any(one.cleans for one in self.all_sensors)
-        return self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        if len(model.outputs) == 1 or model.shared:
+            return state
+        sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
+        return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
         nominal = self.all_sensors[0]
@@ -234,13 +246,15 @@ class Bank(Tracker):
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
         return {
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            "q0": arrays["Q"][0], "size0": arrays["sizes"][0], "keep0": arrays["maps"][0, 0],
+            "q0": arrays["Q"][0], "size0": arrays["sizes"][0],
+            "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
             **packed(arrays, n, na, nominal.r is None, self._alike),
         }  # fmt: skip
 
@@ -249,24 +263,30 @@ class Bank(Tracker):
         shape, Hd, Hm, H = self._shape, len(self.all_changes), len(self.all_sensors), self._count
         tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
         chain, initial = self._events
-        rows, lower = FIRST + n + tri + na, np.tril_indices(n)
+        rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if self.lag_variance else 0), np.tril_indices(n)
         steps = [one.increments(n) for one in self.all_changes]
+        forgets = any(one.forgets for one in self.all_changes)
+        more = na + (tri + 2 * n if forgets else 0)
+        places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
+        places[forget.MEAN], places[forget.CAP] = theta0, np.inf
+        if forgets:
+            places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in self.all_changes])
         parents, children = _room(max(shape.parents, K // (Hd * Hm)), Hd, Hm)
         past = -(-W * (H + 1) // WIDTH) * WIDTH
         refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
         return {
             "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
-            "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm), children)),
+            "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
             "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
             "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
             "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
-            "factors": np.ones(Hd), "theta0": theta0,
-            "maps": np.array([[0.0 if c.reset else 1.0 / c.forget, float(c.reset)] for c in self.all_changes]),
+            "factors": np.ones(Hd), "theta0": places,
+            "maps": np.array([change.mapping() for change in self.all_changes] * 2),
             "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
             "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
             "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
             "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
-            "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters else 1, 3 + n)),
+            "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
             "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
         }  # fmt: skip
 
@@ -360,11 +380,11 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
         into.append(array.ravel().view(np.float64))
     table[core.THETA, 1] = n
     table[core.FLAGS] = na, unknown, alike
-    walks = (arrays["maps"] == (1.0, 0.0)).all()
+    walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
     table[core.PLAIN] = na == 0 and walks and noises
     memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table}
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:

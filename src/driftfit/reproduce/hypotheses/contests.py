@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
+from driftfit.hypotheses.results import Hypotheses
 from driftfit.hypotheses.sensor import Sensor
 from driftfit.kernel import Array
-from driftfit.reproduce.hypotheses import references
+from driftfit.reproduce.hypotheses.references import Row, references
+from driftfit.reproduce.hypotheses.rivals import rivals
 from driftfit.systems.jumps import Jumping
 from driftfit.trackers.bank import Bank
 from driftfit.trackers.base import Tracker
@@ -36,11 +39,37 @@ FREEZES_OR_OUTLIERS = (
 )
 
 
+Alarm = Callable[[Hypotheses], Array]
+"""(T,) bool: whether a bank calls a change after each sample."""
+
+
+def likeliest(lag: int) -> Alarm:
+    """While a change is likelier than none, seen from ``lag`` floors later."""
+
+    def on(told: Hypotheses) -> Array:
+        p = np.nan_to_num(told.lag_prob[:, lag]).reshape(len(told.run), -1, told.sensors).sum(axis=2)
+        return np.asarray(p.argmax(axis=1) > 0)
+
+    return on
+
+
+def decided(told: Hypotheses) -> Array:
+    """When a change is decided."""
+    on = np.zeros(len(told.run), bool)
+    on[[d.decided for d in told.decisions if d.event >= told.sensors]] = True
+    return on
+
+
+def window(threshold: float) -> Alarm:
+    """While the probability of a change in the window passes a threshold."""
+    return lambda told: np.asarray(told.window > threshold)
+
+
 class Entry(NamedTuple):
-    """A row of a table: a tracker, the lag at which its alarms are read, and how it sees the record."""
+    """A row of a table: a tracker, when it calls a change, and how it sees the record."""
 
     tracker: Tracker
-    lag: int = 0
+    alarm: Alarm | None = None
     literal: bool = False
     """Regressors of outputs as measured: no leaf cleans them."""
     told: Callable[[Jumping], Array] | None = None
@@ -56,13 +85,28 @@ class Contest(NamedTuple):
     runs: int
     T: int
     offset: int
-    entries: dict[str, Entry]
-    reference: dict[str, references.Row]
+    build: Callable[[], dict[str, Entry]]
+    table: str
+    """Its name among the reference values."""
+    against: int = 60
+    """Records behind the reference values."""
+
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """Its rows."""
+        return self.build()
+
+    @property
+    def reference(self) -> dict[str, Row]:
+        """The reference values of its rows."""
+        return references(self.table)
 
 
-def bank(reduce: Reduction, *others: Sensor, transition: Any = None, changes: Any = CHANGES) -> Bank:
-    """A bank with known noise."""
-    return Bank(changes, (OK, *others), transition, reduce, p0=P0)
+def bank(
+    reduce: Reduction, *others: Sensor, transition: Any = None, changes: Any = CHANGES, uncertain: bool = False
+) -> Bank:
+    """A bank with known noise; the reference takes output lags that leaves predicted for certain."""
+    return Bank(changes, (OK, *others), transition, reduce, p0=P0, lag_variance=uncertain)
 
 
 def kalman(q: Any = (0.004, 0.004, 0.04), r: float = R) -> Entry:
@@ -71,19 +115,23 @@ def kalman(q: Any = (0.004, 0.004, 0.04), r: float = R) -> Entry:
 
 def decide(d: int, *others: Sensor, literal: bool = False, **more: Any) -> Entry:
     loss = more.pop("loss", "map")
-    return Entry(bank(Decide(d, loss, force=True), *others, **more), d - 1, literal)
+    return Entry(bank(Decide(d, loss, force=True), *others, **more), decided, literal)
 
 
 def gpb(n: int, *others: Sensor, literal: bool = False, **more: Any) -> Entry:
-    return Entry(bank(GPB(n), *others, **more), n - 1, literal)
+    return Entry(bank(GPB(n), *others, **more), likeliest(n - 1), literal)
 
 
 def beam(M: int, *others: Sensor, **more: Any) -> Entry:
-    return Entry(bank(Beam(M), *others, **more), 3)
+    return Entry(bank(Beam(M), *others, **more), likeliest(3))
 
 
 def hybrid(M: int, *others: Sensor) -> Entry:
-    return Entry(bank(Hybrid(M), *others), 2)
+    return Entry(bank(Hybrid(M), *others), window(0.5))
+
+
+def imm(*others: Sensor, literal: bool = False, **more: Any) -> Entry:
+    return Entry(bank(IMM(), *others, **more), likeliest(0), literal)
 
 
 def oracle(*others: Sensor, changes: Any = CHANGES) -> Entry:
@@ -110,44 +158,86 @@ def joint_loss(miss: float) -> tuple[tuple[float, ...], ...]:
 
 
 def auto(tau: float, cost: float | None = None, loss: Any = "map") -> Entry:
-    return Entry(bank(Decide("auto", loss, max_depth=6, tau=tau, wait_cost=cost)), -1)
+    return Entry(bank(Decide("auto", loss, max_depth=6, tau=tau, wait_cost=cost)), decided)
 
 
 def contests() -> list[Contest]:
     """All tables."""
+    return [
+        Contest("Clean", "none", 10.0, 300, 600, 0, clean, "clean", 100),
+        Contest("5 % innovation outliers of ten sigma", "innovation", 10.0, 300, 600, 2000, outliers, "outliers"),
+        Contest("The same, merging and a beam", "innovation", 10.0, 300, 400, 2000, mixed, "hybrid", 50),
+        Contest("5 % additive outliers", "additive", 10.0, 300, 600, 3000, additive, "additive"),
+        Contest("Sensor frozen for 5 % of the time", "frozen", 10.0, 300, 600, 4000, frozen, "frozen"),
+        Contest("Regimes of fast drift that persist", "regimes", 10.0, 300, 600, 5000, persistent, "regimes"),
+        Contest("Variable depth", "none", 10.0, 300, 400, 0, variable, "variable", 50),
+        Contest("Alarms", "none", 10.0, 300, 600, 0, alarming, "alarms", 100),
+    ]  # fmt: skip
+
+
+def tuned(fault: str, offset: int) -> dict[str, Entry]:
+    """RLS and a Kalman filter, tuned for the error of all parameters on other records of the kind."""
+    return {name: Entry(tracker) for name, tracker in rivals(fault, offset).items()}
+
+
+@cache
+def clean() -> dict[str, Entry]:
     mean = np.einsum("i,ijk->jk", [0.99, 0.006, 0.004], [change.increments(3)[0] for change in CHANGES])
-    clean = {
+    return {
         "RLS-EF 0.75": Entry(RLS(0.75, p0=P0 / R)), "RLS-DF 0.4": Entry(RLS(0.4, p0=P0 / R, kind="directional")),
         "KF diag(.004,.004,.04)": kalman(), "KF Qbar=sum p_i Q_i (untuned)": kalman(mean),
         **{f"Decide d={d}": decide(d) for d in range(1, 7)},
-        "FirstFloor posterior d=2": Entry(bank(FirstFloor(2)), 1),
-        **{f"GPB({n})": gpb(n) for n in range(1, 5)}, "IMM": Entry(bank(IMM())),
+        "FirstFloor posterior d=2": Entry(bank(FirstFloor(2)), likeliest(1)),
+        **{f"GPB({n})": gpb(n) for n in range(1, 5)}, "IMM": imm(),
         **{f"Beam M={M}": beam(M) for M in (3, 5, 9)}, "oracle (events known)": oracle(),
-        "Bank(), nothing given": Entry(Bank(), 3),
+        "Bank(), nothing given": Entry(Bank(), likeliest(3)),
+        **{f"Decide d=2, a miss costs {miss:g}": decide(2, loss=loss_of(miss)) for miss in (3.0, 10.0, 30.0, 100.0)},
     }  # fmt: skip
-    outliers = {
+
+
+@cache
+def outliers() -> dict[str, Entry]:
+    return {
+        **tuned("innovation", 2500),
         "KF tuned Q, r": kalman((0.002, 0.002, 0.02), 4.0 * R), "Decide d=2, no sensor alternative": decide(2),
-        "GPB(2), no sensor alternative": gpb(2), "IMM joint": Entry(bank(IMM(), OUTLIER)),
+        "GPB(2), no sensor alternative": gpb(2), "IMM joint": imm(OUTLIER),
         **{f"joint Decide d={d}": decide(d, OUTLIER) for d in range(1, 5)},
         "joint Decide d=2 asym jump-miss=5": decide(2, OUTLIER, loss=joint_loss(5.0)),
         "GPB(2) joint": gpb(2, OUTLIER), "GPB(3) joint": gpb(3, OUTLIER),
         "joint Beam M=5": beam(5, OUTLIER), "joint Beam M=32": beam(32, OUTLIER), "oracle": oracle(OUTLIER),
     }  # fmt: skip
-    mixed = {
+
+
+@cache
+def mixed() -> dict[str, Entry]:
+    return {
+        **tuned("innovation", 2500),
         "GPB(2) joint": gpb(2, OUTLIER), "Beam 16": beam(16, OUTLIER),
-        "Hybrid M=9 sensor_events=1": hybrid(9, OUTLIER), "Hybrid M=16 sensor_events=1": hybrid(16, OUTLIER),
-        "joint Decide d=3": decide(3, OUTLIER), "GPB(3)": gpb(3, OUTLIER), "IMM": Entry(bank(IMM(), OUTLIER)),
+        "Hybrid M=9": hybrid(9, OUTLIER), "Hybrid M=16": hybrid(16, OUTLIER),
+        "joint Decide d=3": decide(3, OUTLIER), "GPB(3) joint": gpb(3, OUTLIER), "IMM joint": imm(OUTLIER),
         "oracle": oracle(OUTLIER),
     }  # fmt: skip
-    additive = {
+
+
+@cache
+def additive() -> dict[str, Entry]:
+    return {
+        **tuned("additive", 3500),
         "KF diag(.004,.004,.04)": kalman(), "KF Q/4, 12r": kalman((0.001, 0.001, 0.01), 12.0 * R),
-        "GPB(2), no sensor alternative": gpb(2),
+        "IMM joint, leaf-cleaned": imm(SPIKE), "GPB(2), no sensor alternative": gpb(2),
         "joint Decide d=2, literal (dirty regressor)": decide(2, SPIKE, literal=True),
         **{f"joint Decide d={d}, leaf-cleaned regressor": decide(d, SPIKE) for d in (2, 3, 4)},
         "GPB(2) joint, literal": gpb(2, SPIKE, literal=True), "GPB(2) joint, leaf-cleaned": gpb(2, SPIKE),
-        "Beam M=16 leaf-cleaned": beam(16, SPIKE),
+        "Beam M=16 leaf-cleaned": beam(16, SPIKE), "GPB(2) joint, uncertain lags": gpb(2, SPIKE, uncertain=True),
+        "Beam M=16, uncertain lags": beam(16, SPIKE, uncertain=True),
+        "IMM joint, uncertain lags": imm(SPIKE, uncertain=True),
     }  # fmt: skip
-    frozen = {
+
+
+@cache
+def frozen() -> dict[str, Entry]:
+    return {
+        **tuned("frozen", 4500),
         "KF diag(.004,.004,.04)": kalman(), "GPB(2), no sensor alternative": gpb(2),
         "Decide d=2 outlier sensor only": decide(2, SPIKE),
         "Decide d=2 ok/frozen literal (dirty regr.)": decide(2, FROZEN, transition=FREEZES, literal=True),
@@ -155,38 +245,43 @@ def contests() -> list[Contest]:
         "Decide d=2 ok/frozen cleaned, Markov": decide(2, FROZEN, transition=FREEZES),
         "GPB(2) ok/frozen cleaned, Markov": gpb(2, FROZEN, transition=FREEZES),
         "Beam 9 ok/frozen cleaned, Markov": beam(9, FROZEN, transition=FREEZES),
-        "IMM ok/frozen Markov": Entry(bank(IMM(), FROZEN, transition=FREEZES)),
+        "IMM ok/frozen Markov": imm(FROZEN, transition=FREEZES),
+        "GPB(2) ok/frozen, uncertain lags": gpb(2, FROZEN, transition=FREEZES, uncertain=True),
+        "Beam 9 ok/frozen, uncertain lags": beam(9, FROZEN, transition=FREEZES, uncertain=True),
+        "IMM ok/frozen, uncertain lags": imm(FROZEN, transition=FREEZES, uncertain=True),
     }  # fmt: skip
+
+
+@cache
+def persistent() -> dict[str, Entry]:
     moving = (Change(0.002**2, prob=1.0 - STATIONARY), Change(0.06**2, prob=STATIONARY, name="fast"))
-    persistent = {"KF tuned 0.001": kalman(0.001)}
+    rows = {**tuned("regimes", 5500), "KF tuned 0.001": kalman(0.001)}
     for name, transition in (("iid", None), ("Markov", REGIMES)):
         for d in (2, 7):
-            persistent[f"Decide d={d} {name}"] = decide(d, transition=transition, changes=moving)
+            rows[f"Decide d={d} {name}"] = decide(d, transition=transition, changes=moving)
         for n in (2,) if transition is None else (1, 2, 4):
-            persistent[f"GPB({n}) {name}"] = gpb(n, transition=transition, changes=moving)
-        persistent[f"IMM {name}"] = Entry(bank(IMM(), transition=transition, changes=moving))
-    persistent["Beam 16 Markov"] = beam(16, transition=REGIMES, changes=moving)
-    persistent["oracle (regime known)"] = oracle(changes=moving)
-    variable = {
+            rows[f"GPB({n}) {name}"] = gpb(n, transition=transition, changes=moving)
+        rows[f"IMM {name}"] = imm(transition=transition, changes=moving)
+    rows["Beam 16 Markov"] = beam(16, transition=REGIMES, changes=moving)
+    rows["oracle (regime known)"] = oracle(changes=moving)
+    return rows
+
+
+@cache
+def variable() -> dict[str, Entry]:
+    return {
+        **tuned("none", 1000), "IMM": imm(),
         "fixed d=5": decide(5), "fixed d=3": decide(3), "threshold tau=0.02 dmax=6": auto(0.02),
         "threshold tau=0.001 dmax=6": auto(0.001), "look-ahead c=0.005 dmax=6": auto(0.0, 0.005),
         "look-ahead c=.01 dmax=6 asym10": auto(0.0, 0.01, loss_of(10.0)),
     }  # fmt: skip
-    return [
-        Contest("Clean", "none", 10.0, 100, 600, 0, clean, references.CLEAN),
-        Contest(
-            "5 % innovation outliers, ten times the noise",
-            "innovation",
-            10.0,
-            60,
-            600,
-            2000,
-            outliers,
-            references.OUTLIERS,
-        ),
-        Contest("The same, merging and a beam", "innovation", 10.0, 50, 400, 2000, mixed, references.HYBRID),
-        Contest("5 % additive outliers", "additive", 10.0, 60, 600, 3000, additive, references.ADDITIVE),
-        Contest("Sensor frozen for 5 % of the time", "frozen", 10.0, 60, 600, 4000, frozen, references.FROZEN),
-        Contest("Regimes of fast drift that persist", "regimes", 10.0, 60, 600, 5000, persistent, references.REGIMES),
-        Contest("Variable depth", "none", 10.0, 50, 400, 0, variable, references.VARIABLE),
-    ]
+
+
+@cache
+def alarming() -> dict[str, Entry]:
+    short = bank(Beam(9, window=3))
+    return {
+        "Beam(9), MAP at lag 3": beam(9), "Beam(9), window 3 > .5": Entry(short, window(0.5)),
+        **{f"Beam(9), window 8 > .{p}": Entry(bank(Beam(9)), window(p / 10.0)) for p in (5, 9)},
+        "IMM, MAP": imm(),
+    }  # fmt: skip

@@ -1,102 +1,30 @@
-"""Reference values: RMSE, after a jump, steady, detection rate, mean delay, false alarms per 1000, mean log p(y),
-NEES/n and leaf updates per step, of an independent implementation on records of its own; None where it gives none.
-"""
+"""Reference values of the tables, of an independent implementation on records of its own; None where it gives none."""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Iterator
+from functools import cache
+from importlib.resources import files
+
 Row = tuple[float | None, ...]
 
-CLEAN: dict[str, Row] = {
-    "RLS-EF 0.75": (0.407, 0.851, 0.204, None, None, None, -1.202, 2.95, 1.0),
-    "RLS-DF 0.4": (0.508, 1.066, 0.214, None, None, None, -1.445, 7.72, 1.0),
-    "KF diag(.004,.004,.04)": (0.364, 0.735, 0.207, None, None, None, -0.856, 1.01, 1.0),
-    "KF Qbar=sum p_i Q_i (untuned)": (0.384, 0.83, 0.167, None, None, None, -0.914, 1.56, 1.0),
-    "Decide d=1": (0.313, 0.717, 0.065, 0.84, 1.65, 0.19, -0.427, 1.73, 3.0),
-    "Decide d=2": (0.299, 0.684, 0.062, 0.84, 2.17, 0.25, -0.408, 1.44, 9.0),
-    "Decide d=3": (0.294, 0.671, 0.067, 0.85, 2.86, 0.12, -0.399, 1.32, 26.9),
-    "Decide d=4": (0.289, 0.662, 0.059, 0.86, 3.67, 0.12, -0.393, 1.19, 80.7),
-    "Decide d=5": (0.287, 0.658, 0.062, 0.87, 4.56, 0.18, -0.39, 1.16, 241.6),
-    "Decide d=6": (0.286, 0.656, 0.061, 0.87, 5.39, 0.12, -0.388, 1.13, 723.5),
-    "FirstFloor posterior d=2": (0.319, 0.687, 0.141, 0.39, 2.15, 0.04, -0.486, 0.9, 12.0),
-    "GPB(1)": (0.314, 0.68, 0.135, 0.58, 1.06, 0.04, -0.487, 0.81, 3.0),
-    "GPB(2)": (0.301, 0.665, 0.112, 0.62, 2.1, 0.05, -0.436, 0.86, 9.0),
-    "GPB(3)": (0.294, 0.659, 0.096, 0.63, 2.67, 0.05, -0.412, 0.89, 26.9),
-    "GPB(4)": (0.291, 0.657, 0.085, 0.65, 3.47, 0.02, -0.4, 0.92, 80.7),
-    "IMM": (0.314, 0.68, 0.135, 0.58, 1.06, 0.04, -0.487, 0.81, 3.0),
-    "Beam M=3": (0.291, 0.667, 0.06, 0.79, 3.66, 0.11, -0.393, 1.24, 9.0),
-    "Beam M=5": (0.288, 0.661, 0.059, 0.75, 3.58, 0.0, -0.388, 1.18, 15.0),
-    "Beam M=9": (0.287, 0.659, 0.058, 0.72, 3.6, 0.0, -0.387, 1.11, 26.9),
-    "oracle (events known)": (0.266, 0.612, 0.05, None, None, None, -0.332, 1.0, 1.0),
-}
-OUTLIERS: dict[str, Row] = {
-    "KF tuned Q, r": (0.486, 0.953, 0.286, None, None, None, -1.449, 1.7, 1.0),
-    "Decide d=2, no sensor alternative": (0.89, 1.111, 0.79, 0.89, 2.63, 22.84, -1.22, 4.0, 9.0),
-    "GPB(2), no sensor alternative": (0.899, 1.125, 0.79, 0.75, 3.38, 20.61, -1.167, 3.43, 9.0),
-    "IMM joint": (0.45, 1.0, 0.158, 0.03, 3.5, 0.09, -0.798, 1.0, 6.0),
-    "joint Decide d=1": (1.456, 2.006, 1.151, 0.11, 8.74, 0.94, -2.447, 34.52, 6.0),
-    "joint Decide d=2": (0.437, 0.987, 0.11, 0.86, 3.65, 0.96, -0.713, 2.14, 35.9),
-    "joint Decide d=3": (0.384, 0.875, 0.086, 0.88, 3.97, 0.47, -0.661, 1.49, 215.3),
-    "joint Decide d=4": (0.368, 0.842, 0.076, 0.88, 4.24, 0.2, -0.64, 1.35, 1289.9),
-    "joint Decide d=2 asym jump-miss=5": (0.397, 0.857, 0.16, 0.88, 2.44, 3.48, -0.698, 1.71, 35.9),
-    "GPB(2) joint": (0.377, 0.836, 0.131, 0.31, 2.07, 0.23, -0.701, 0.96, 35.9),
-    "GPB(3) joint": (0.358, 0.805, 0.111, 0.42, 2.89, 0.12, -0.659, 0.98, 215.3),
-    "joint Beam M=5": (0.777, 1.315, 0.48, 0.58, 5.01, 0.53, -1.052, 8.81, 30.0),
-    "joint Beam M=32": (0.382, 0.864, 0.09, 0.68, 4.05, 0.15, -0.645, 1.64, 191.4),
-    "oracle": (0.253, 0.581, 0.048, None, None, None, -0.429, 0.99, 1.0),
-}
-HYBRID: dict[str, Row] = {
-    "GPB(2) joint": (0.373, 0.828, 0.127, 0.33, 3.84, 0.43, -0.716, 0.98, 35.9),
-    "Beam 16": (0.443, 0.978, 0.103, 0.67, 4.53, 0.32, -0.684, 7.87, 95.6),
-    "Hybrid M=9 sensor_events=1": (0.346, 0.789, 0.078, 0.83, 2.36, 1.73, -0.638, 1.2, 53.8),
-    "Hybrid M=16 sensor_events=1": (0.342, 0.78, 0.08, 0.83, 2.31, 1.84, -0.637, 1.16, 95.6),
-    "joint Decide d=3": (0.377, 0.861, 0.082, 0.84, 3.88, 0.49, -0.677, 1.66, 215.0),
-    "GPB(3)": (0.351, 0.789, 0.107, 0.44, 3.06, 0.11, -0.672, 0.99, 215.0),
-    "IMM": (0.448, 0.997, 0.153, 0.03, 1.2, 0.0, -0.817, 1.03, 6.0),
-    "oracle": (0.255, 0.585, 0.051, None, None, None, -0.439, 1.1, 1.0),
-}
-ADDITIVE: dict[str, Row] = {
-    "KF diag(.004,.004,.04)": (0.647, 0.857, 0.595, None, None, None, -2.547, 4.51, 1.0),
-    "KF Q/4, 12r": (0.557, 1.182, 0.29, None, None, None, -1.516, 2.39, 1.0),
-    "GPB(2), no sensor alternative": (0.967, 1.135, 0.894, 0.7, 3.99, 23.1, -1.297, 5.15, 9.0),
-    "joint Decide d=2, literal (dirty regressor)": (0.564, 1.05, 0.416, 0.83, 3.83, 13.65, -1.075, 3.62, 35.9),
-    "joint Decide d=2, leaf-cleaned regressor": (0.48, 1.101, 0.166, 0.85, 4.31, 2.05, -0.774, 2.82, 35.9),
-    "joint Decide d=3, leaf-cleaned regressor": (0.4, 0.959, 0.113, 0.84, 3.95, 1.11, -0.691, 1.81, 215.3),
-    "joint Decide d=4, leaf-cleaned regressor": (0.367, 0.88, 0.1, 0.86, 4.15, 0.85, -0.664, 1.48, 1289.9),
-    "GPB(2) joint, literal": (0.427, 0.862, 0.278, 0.33, 4.16, 3.74, -0.907, 1.23, 35.9),
-    "GPB(2) joint, leaf-cleaned": (0.373, 0.873, 0.147, 0.28, 3.09, 0.26, -0.722, 0.91, 35.9),
-    "Beam M=16 leaf-cleaned": (0.379, 0.928, 0.075, 0.73, 4.14, 0.32, -0.646, 1.54, 95.8),
-}
-FROZEN: dict[str, Row] = {
-    "KF diag(.004,.004,.04)": (0.591, 0.849, 0.523, None, None, None, -1.018, 5.2, 1.0),
-    "GPB(2), no sensor alternative": (0.574, 0.832, 0.503, 0.62, 2.3, 4.27, -0.499, 8.26, 9.0),
-    "Decide d=2 outlier sensor only": (0.655, 1.115, 0.503, 0.84, 4.14, 5.47, -0.599, 9.01, 35.9),
-    "Decide d=2 ok/frozen literal (dirty regr.)": (0.388, 0.83, 0.192, 0.85, 2.81, 1.75, -0.364, 2.31, 35.9),
-    "Decide d=2 ok/outl/frozen cleaned, Markov": (0.482, 1.089, 0.071, 0.84, 3.7, 0.47, -0.218, 2.67, 80.9),
-    "Decide d=2 ok/frozen cleaned, Markov": (0.363, 0.834, 0.075, 0.86, 2.86, 0.58, -0.159, 1.97, 35.9),
-    "GPB(2) ok/frozen cleaned, Markov": (0.361, 0.805, 0.127, 0.59, 2.13, 0.09, -0.182, 0.93, 35.9),
-    "Beam 9 ok/frozen cleaned, Markov": (0.346, 0.798, 0.067, 0.7, 4.03, 0.29, -0.133, 1.4, 53.9),
-    "IMM ok/frozen Markov": (0.37, 0.814, 0.145, 0.58, 1.31, 0.06, -0.23, 0.88, 6.0),
-}
-REGIMES: dict[str, Row] = {
-    "KF tuned 0.001": (0.171, None, 0.171, None, None, 0.0, -0.439, 1.03, 1.0),
-    "Decide d=2 iid": (0.207, None, 0.207, None, None, 20.7, -0.477, 3.09, 4.0),
-    "Decide d=7 iid": (0.181, None, 0.181, None, None, 21.29, -0.43, 1.3, 126.9),
-    "GPB(2) iid": (0.17, None, 0.17, None, None, 5.29, -0.433, 0.99, 4.0),
-    "IMM iid": (0.17, None, 0.17, None, None, 4.06, -0.435, 1.0, 2.0),
-    "Decide d=2 Markov": (0.208, None, 0.208, None, None, 1.64, -0.536, 7.6, 4.0),
-    "Decide d=7 Markov": (0.18, None, 0.18, None, None, 1.81, -0.465, 1.26, 126.9),
-    "GPB(1) Markov": (0.167, None, 0.167, None, None, 4.85, -0.42, 0.96, 2.0),
-    "GPB(2) Markov": (0.155, None, 0.155, None, None, 11.7, -0.387, 1.0, 4.0),
-    "GPB(4) Markov": (0.155, None, 0.155, None, None, 11.52, -0.387, 1.01, 15.9),
-    "IMM Markov": (0.155, None, 0.155, None, None, 11.26, -0.388, 0.99, 2.0),
-    "Beam 16 Markov": (0.16, None, 0.16, None, None, 7.69, -0.401, 1.3, 31.8),
-    "oracle (regime known)": (0.146, None, 0.146, None, None, 0.0, -0.362, 0.96, 1.0),
-}
-VARIABLE: dict[str, Row] = {
-    "fixed d=5": (0.292, 0.657, 0.074, 0.86, 4.8, 0.22, -0.391, 1.16, 240.9),
-    "fixed d=3": (0.298, 0.672, 0.066, 0.83, 3.08, 0.22, -0.402, 1.3, 26.9),
-    "threshold tau=0.02 dmax=6": (0.296, 0.669, 0.064, 0.85, 4.46, 0.16, -0.395, 1.49, 13.2),
-    "threshold tau=0.001 dmax=6": (0.29, 0.655, 0.066, 0.86, 5.52, 0.11, -0.389, 1.14, 394.1),
-    "look-ahead c=0.005 dmax=6": (0.3, 0.677, 0.065, 0.84, 3.44, 0.11, -0.4, 1.59, 5.4),
-    "look-ahead c=.01 dmax=6 asym10": (0.297, 0.663, 0.084, 0.86, 2.79, 0.7, -0.396, 1.39, 11.3),
-}
+
+def lines(name: str) -> Iterator[list[str]]:
+    """Lines of one of the package's tables, without its header."""
+    text = (files("driftfit") / "data" / name).read_text(encoding="utf-8")
+    return iter(list(csv.reader(text.splitlines()))[1:])
+
+
+@cache
+def references(table: str) -> dict[str, Row]:
+    """RMSE, after a jump, steady, detection rate, mean delay, false alarms per 1000, mean log p(y), NEES/n and leaf
+    updates per step of every row of a table.
+    """
+    found = (line[1:] for line in lines("bank_tables.csv") if line[0] == table)
+    return {row: tuple(float(cell) if cell else None for cell in cells) for row, *cells in found}
+
+
+def sensitivity() -> dict[str, Row]:
+    """RMSE of five reductions, and of the fourth-deepest decision when steady, for every wrong setting."""
+    return {row: tuple(map(float, cells)) for row, *cells in lines("bank_sensitivity.csv")}

@@ -16,7 +16,8 @@ from driftfit.trackers.bank import Bank
 
 REACH, QUIET = 20, 50
 """Samples after a jump that belong to it, and after which the path counts as steady."""
-HEADS = ("RMSE", "after", "steady", "det", "delay", "FA", "log p", "NEES/n", "leaves")
+HEADS = ("RMSE", "+-", "after", "steady", "det", "delay", "FA", "log p", "NEES/n", "leaves")
+"""+- is the standard error of the RMSE over records."""
 
 
 class Score(NamedTuple):
@@ -39,34 +40,43 @@ def run(entry: Entry, record: Jumping) -> Track:
     """Track a record."""
     prob = None if entry.told is None else entry.told(record)
     if not entry.literal:
-        return track(MODEL, entry.tracker, record.y, record.u, prob=prob)
+        return track(MODEL, entry.tracker, record.y, record.u, prob=prob, keep="cov")
     past = np.r_[0.0, 0.0, record.y]
     rows = np.stack([past[1:-1], past[:-2], record.u], axis=1)
-    return track(Regression(3), entry.tracker, record.y, rows, prob=prob)
+    return track(Regression(3), entry.tracker, record.y, rows, prob=prob, keep="cov")
 
 
 def alarms(entry: Entry, made: Track) -> Array:
-    """Samples after which a change was called."""
-    if not isinstance(entry.tracker, Bank) or entry.told is not None:
+    """Samples after which a change was called; what is called within `REACH` samples of an alarm belongs to it."""
+    if entry.alarm is None:
         return np.zeros(0, int)
-    told = made.hypotheses
-    if entry.lag < 0:
-        return np.array([d.decided for d in told.decisions if d.event > 0], int)
-    at = min(entry.lag, told.lag_prob.shape[1] - 1)
-    p = np.nan_to_num(told.lag_prob[:, at]).reshape(len(made), -1, told.sensors).sum(axis=2)
-    return np.flatnonzero(p.argmax(axis=1) > 0)
+    kept: list[int] = []
+    for t in np.flatnonzero(entry.alarm(made.hypotheses)).tolist():
+        if not kept or t >= kept[-1] + REACH:
+            kept.append(t)
+    return np.array(kept, int)
+
+
+def since_jump(record: Jumping) -> Array:
+    """Samples since the last jump, or very many."""
+    T = len(record.y)
+    since = np.full(T, T)
+    for jump in record.jumps:
+        since[jump:] = np.arange(T - jump)
+    return since
+
+
+def parts(record: Jumping) -> tuple[Array, Array, Array]:
+    """The samples that count: all, those after jumps, those long after."""
+    since, late = since_jump(record), np.arange(len(record.y)) >= START
+    return late, late & (since < REACH), late & (since > QUIET)
 
 
 def score(entry: Entry, record: Jumping) -> Score:
     """One record."""
     made = run(entry, record)
-    T = len(made)
-    since = np.full(T, T)
-    for jump in record.jumps:
-        since[jump:] = np.arange(T - jump)
-    late = np.arange(T) >= START
-    square = np.sum((made.theta - record.theta) ** 2, axis=1)
-    parts = (late, late & (since < REACH), late & (since > QUIET))
+    error = made.theta - record.theta
+    square, masks = np.sum(error**2, axis=1), parts(record)
     called = alarms(entry, made)
     firsts = [called[(called >= jump) & (called < jump + REACH)] for jump in record.jumps]
     hits = [found[0] - jump for found, jump in zip(firsts, record.jumps, strict=True) if len(found)]
@@ -74,39 +84,50 @@ def score(entry: Entry, record: Jumping) -> Score:
     e, s = made.innovation, made.innovation_std
     log_p = made.hypotheses.evidence if is_bank else -0.5 * (np.log(2.0 * np.pi * s**2) + (e / s) ** 2)
     return Score(
-        np.array([square[part].sum() for part in parts]), np.array([part.sum() for part in parts]), len(hits),
-        len(record.jumps), float(np.sum(hits)), int(np.sum(since[called] >= REACH)), float(log_p[late].mean()),
-        nees(entry, record), float(made.hypotheses.leaves.mean()) if is_bank else 1.0,
+        np.array([square[part].sum() for part in masks]), np.array([part.sum() for part in masks]), len(hits),
+        len(record.jumps), float(np.sum(hits)), int(np.sum(since_jump(record)[called] >= REACH)),
+        float(log_p[masks[0]].mean()), nees(error[START:], made._written("P")[START:]),
+        float(made.hypotheses.leaves.mean()) if is_bank else 1.0,
     )  # fmt: skip
 
 
-def nees(entry: Entry, record: Jumping) -> float:
+def nees(e: Array, P: Array) -> float:
     """Mean of e' P^-1 e / n."""
-    prob = None if entry.told is None else entry.told(record)
-    if entry.literal:
-        made = run(entry, record)
-        return float(np.mean(((made.theta - record.theta) / made.std)[START:] ** 2))
-    made = track(MODEL, entry.tracker, record.y, record.u, prob=prob, keep="cov")
-    e = (made.theta - record.theta)[START:]
-    P = made._written("P")[START:]
     return float(np.mean(np.einsum("ti,ti->t", e, np.linalg.solve(P, e[:, :, None])[:, :, 0])) / e.shape[1])
 
 
-def measure(contest: Contest, name: str, runs: int) -> tuple[float, ...]:
+def pooled(squares: Array, counts: Array) -> tuple[Array, float]:
+    """Root mean squares of the columns, and the standard error of the first over records."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt(squares.sum(axis=0) / counts.sum(axis=0))
+    each = squares[:, 0] / counts[:, 0]
+    return rms, float(np.std(each) / np.sqrt(max(len(each) - 1, 1)) / (2.0 * rms[0]))
+
+
+class Measured(NamedTuple):
+    """A row of a table."""
+
+    values: tuple[float, ...]
+    """What `HEADS` says."""
+    each: Array
+    """(runs,): RMSE of every record."""
+
+
+def measure(contest: Contest, name: str, runs: int) -> Measured:
     """The row of a table."""
     entry = contest.entries[name]
     seeds = range(contest.offset, contest.offset + runs)
     scores = [score(entry, jumping(seed, contest.T, contest.fault, contest.K)) for seed in seeds]
-    squares, counts = (np.sum([getattr(s, field) for s in scores], axis=0) for field in ("squares", "counts"))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rms = np.sqrt(squares / counts)
+    squares, counts = np.array([s.squares for s in scores]), np.array([s.counts for s in scores])
+    rms, error = pooled(squares, counts)
     found, jumps = sum(s.found for s in scores), sum(s.jumps for s in scores)
-    calls = isinstance(entry.tracker, Bank) and entry.told is None
-    none = float("nan")
-    return (
-        *rms.tolist(), found / jumps if jumps and calls else none,
+    calls, none = entry.alarm is not None, float("nan")
+    values = (
+        float(rms[0]), error, float(rms[1]), float(rms[2]),
+        found / jumps if jumps and calls else none,
         sum(s.delay for s in scores) / found if found else none,
-        1000.0 * sum(s.false for s in scores) / (runs * contest.T) if calls and jumps else none,
+        1000.0 * sum(s.false for s in scores) / (runs * contest.T) if calls else none,
         float(np.mean([s.log_p for s in scores])), float(np.mean([s.nees for s in scores])),
         float(np.mean([s.leaves for s in scores])),
     )  # fmt: skip
+    return Measured(values, np.sqrt(squares[:, 0] / counts[:, 0]))
