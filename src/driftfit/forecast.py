@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from driftfit.result import Track
 
 
+STANDING = ("interval", "noise", "drift", "each")
+"""Fields that hold what is known of one sample."""
+
+
 class Forecast(NamedTuple):
     """The h samples after a record."""
 
@@ -82,8 +86,9 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
 
 
 def final_state(run: Track) -> Array:
-    """The state after the last sample, as a tile of one lane."""
+    """The state after the last sample, as a tile of one lane; what was known of that sample alone is left behind."""
     tile = make_tile(run.model.n, run.model.m, run.model.memory(), [run.tracker.state_for(run.model)])
     for name in storage.fields(tile):
-        tile[name][0, ..., 0] = run._tile[name][0, ..., run._lane]
+        if name not in STANDING:
+            tile[name][0, ..., 0] = run._tile[name][0, ..., run._lane]
     return tile

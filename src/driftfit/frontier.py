@@ -67,6 +67,7 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, **known: An
 
 def _movement(path: Smoothed) -> float:
     """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
-    drift = path.walk.drift[1:, None]
+    walk = path.walk
     steps = np.diff(path.theta, axis=0) ** 2
-    return float(np.sum(np.divide(steps, drift, out=np.zeros_like(steps), where=drift > 0.0)))
+    factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
+    return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))

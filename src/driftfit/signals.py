@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.settings import missing_settings
-from driftfit.trackers.base import Tracker
+
+if TYPE_CHECKING:
+    from driftfit.trackers.base import Tracker
 
 
 def check_ready(tracker: Tracker) -> Tracker:

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.drivers import known_factors
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.records import one_series
 from driftfit.settings import one_of, whole
-from driftfit.signals import as_inputs, as_output, factor, intervals, noise_of
+from driftfit.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tuning.intervals import intervals_of
 from driftfit.tuning.knobs import find_knobs
@@ -170,7 +170,7 @@ def tune(
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
-    record = _record(model, y, u, time, dt, weights, drift)
+    record = _record(model, tracker, y, u, time, dt, weights, drift)
     if order_by is not None:
         record = along(record, tracker, order_by)
     knobs = find_knobs(record, tracker, groups, bounds)
@@ -209,10 +209,8 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _record(model: Model, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record:
-    output = as_output(y)
-    T = len(output)
-    inputs = as_inputs(u, T)
-    gaps = 1.0 if time is None else intervals(time, dt, T)[1]
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
-    return Record(model.bind(inputs.shape[1]), output, inputs, known)
+def _record(model: Model, tracker: Tracker, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record:
+    records = one_series(y, u, time, dt, weights, drift)
+    bound = model.bind(records.u.shape[1])
+    records = with_drifts(bound, [tracker], records)
+    return Record(bound, records.y, records.u, records.known)

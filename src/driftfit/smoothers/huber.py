@@ -105,7 +105,7 @@ def certificate(walk: Walk, theta: Array, delta: float) -> float:
     residual = walk.residual(theta)
     psi = np.nan_to_num(np.clip(root * residual, -delta, delta) / root)
     pull = walk.pull(psi)
-    moved = np.diff(theta, axis=0) - walk.drift[1:, None] * (pull[1:] @ walk.q)
+    moved = np.diff(theta, axis=0) - walk.moves(pull)
     whole_pull = np.sum(np.abs(walk.phi) * (walk.weight * np.abs(walk.y))[:, None], axis=0)
     first = np.max(np.abs(pull[0]) / np.maximum(whole_pull, 1e-300)) if walk.p0 is None else 0.0
     return float(max(first, np.max(np.abs(moved), initial=0.0) / max(np.abs(theta).max(), 1e-300)))
