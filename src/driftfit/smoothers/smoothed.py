@@ -98,6 +98,21 @@ class Smoothed:
     def std(self) -> Array:
         return np.sqrt(self.r * self._path.var)
 
+    @property
+    def slope(self) -> Array:
+        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        return self._of_slopes(self._path.slope)
+
+    @cached_property
+    def slope_std(self) -> Array:
+        """Standard deviation of the slope, (T, n)."""
+        return np.sqrt(self.r * self._of_slopes(self._path.slope_var))
+
+    def _of_slopes(self, values: Array) -> Array:
+        if not len(self.walk.trend):
+            raise ValueError("slope: theta itself walks at random here; FLS(mu, differences=2) gives it a slope.")
+        return values
+
     @cached_property
     def leverage(self) -> Array:
         leverage: Array = 1.0 - self._path.c**2
@@ -162,7 +177,8 @@ def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
         return exact.smooth(walk, keep)
     arranged, order = ordered(walk, order_by)
     path, back = exact.smooth(arranged, keep), np.argsort(order)
-    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank")}
+    slopes = ("slope", "slope_var") if len(walk.trend) else ()
+    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank", *slopes)}
     cov = path.cov[back] if len(path.cov) else path.cov
     nowhere = ~np.isfinite(np.asarray(order_by, float))
     in_time["theta"][nowhere] = in_time["var"][nowhere] = np.nan

@@ -73,7 +73,12 @@ class Walk(NamedTuple):
         return forces
 
     def moves(self, pull: Array) -> Array:
-        """theta_{t+1} - theta_t under forces (T, n) as `pull` gives them: drift_{t+1} E q E pull_{t+1}, (T - 1, n)."""
+        """theta_{t+1} - theta_t under forces (T, n) as `pull` gives them: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
+
+        Where theta has a slope, slope_{t+1} - slope_t, with sum over i > t of trend_i pull_i in the place of pull.
+        """
+        if len(self.trend):
+            pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
         each = self.each[1:] if len(self.each) else 1.0
         moves: Array = self.drift[1:, None] * each * ((each * pull[1:]) @ self.q)
         return moves
