@@ -4,7 +4,8 @@ import naive_smoother as naive
 import numpy as np
 import pytest
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, track
+from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
+from driftfit.models.basis import Polynomial
 from driftfit.smoothers import exact
 from driftfit.smoothers.walk import Walk
 
@@ -352,3 +353,24 @@ def test_what_the_record_does_not_determine_is_as_asked():
         run.smooth(undetermined="raise")
     with pytest.raises(ValueError, match="undetermined"):
         run.smooth(undetermined="zero")
+
+
+def test_noise_that_the_model_adds_is_the_noise_of_the_smoother():
+    """Measurement noise that comes in through a curve, beside the user's weights: the last point is the filter's."""
+    s = linear_record()
+    weights = np.random.default_rng(2).uniform(0.3, 2.0, len(s[0]))
+    model = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2), output_noise=0.05)
+    run = track(model, Kalman(q=1e-5, r=0.02, p0=1.0), *s, weights=weights)
+    path = run.smooth("cov")
+    np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(path.cov(-1), run.cov(-1), rtol=1e-8)
+    used = path.walk.weight > 0.0
+    assert np.ptp(path.walk.weight[used] / weights[used]) > 0.1
+
+
+def linear_record():
+    rng = np.random.default_rng(1)
+    u, y = rng.uniform(-1.0, 1.0, 150), np.zeros(150)
+    for t in range(1, 150):
+        y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.02 * rng.standard_normal()
+    return y + 0.05 * rng.standard_normal(150), u
