@@ -23,6 +23,8 @@ from driftfit.settings import one_of
 
 if TYPE_CHECKING:
     from driftfit.fleet import Fleet
+    from driftfit.outputs import Outputs
+    from driftfit.shared_outputs import Shared
 
 ENDINGS = (".csv", ".parquet", ".npz")
 _OWN = ("prediction", "innovation", "innovation_std", "ok")
@@ -50,7 +52,7 @@ def _runs(result: Track | Fleet) -> tuple[list[Track], list[Any]]:
     return ([result], []) if isinstance(result, Track) else (list(result.values()), list(result))
 
 
-def _time_name(run: Track) -> str:
+def _time_name(run: Track | Outputs | Shared) -> str:
     return run.labels.time or ("sample" if run._time is None else "time")
 
 
@@ -80,6 +82,22 @@ def units_of(result: Track | Fleet) -> dict[str, str]:
     for name, unit in zip(run.names, run.units, strict=True):
         units |= {f"theta_{name}": unit, f"std_{name}": unit} if unit else {}
     return units
+
+
+def outputs_table(run: Outputs | Shared, kind: str = "polars") -> Any:
+    """A record of several outputs: each result with its output in brackets, parameters under their names."""
+    one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
+    columns: dict[str, Any] = {_time_name(run): run.time}
+    for j, output in enumerate(run.outputs):
+        columns[_free(output)] = run.y[:, j]
+        columns |= {f"{name}[{output}]": getattr(run, name)[:, j] for name in _OWN}
+    shared = run.model.shared
+    for j, names in enumerate([run.names] if shared else run.names):
+        theta, std = (run.theta, run.std) if shared else (run.theta[:, j], run.std[:, j])
+        for i, name in enumerate(names):
+            columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
+    table = pl.DataFrame(columns)
+    return table if kind == "polars" else table.to_pandas() if kind == "pandas" else table.to_arrow()
 
 
 def to_table(result: Track | Fleet, kind: str = "polars") -> Any:

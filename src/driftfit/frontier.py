@@ -59,6 +59,8 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     ValueError
         If a mu is not positive, or what `track` refuses.
     """
+    if len(model.outputs) > 1 and not model.shared:
+        raise ValueError("frontier: of one output at a time: take run[name], and frontier(run[name].model, .y, .u).")
     if mu is None:
         steady = track(model, FLS(1.0), y, u, **known).smooth()
         used = steady.walk.weight > 0.0

@@ -128,7 +128,8 @@ def track(
     Returns
     -------
     Track, or a Fleet (from key to Track) for several series or several trackers. A model with several outputs (``ny``)
-    takes y (T, ny) and gives `driftfit.outputs.Outputs`, or `driftfit.outputs.Shared` where they share one theta.
+    takes y (T, ny), or as many names, and gives `driftfit.outputs.Outputs`, or `driftfit.shared_outputs.Shared` where
+    they share one theta; ``tracker`` may then map the name of each output to its own, and weights may be (T, ny).
 
     Raises
     ------
@@ -137,8 +138,12 @@ def track(
         there, cells that are not numbers, files that cannot be read. Missing and non-finite data never raise.
     """
     if len(model.outputs) > 1:
-        other = (data, by, units, warm_start)
-        return cast("Track", _several_outputs(model, tracker, y, u, time, dt, weights, drift, keep, other))
+        if prob is not None:
+            raise ValueError("track: prob= is for one series and one tracker.")
+        from driftfit.track_outputs import track_outputs
+
+        run = track_outputs(model, tracker, y, u, data, time, by, dt, weights, drift, units, keep, warm_start)
+        return cast("Track", run)
     one_of("track", "keep", keep, ("std", "cov"))
     records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
     bound = model.bind(records.labels.u or records.u.shape[1])
@@ -156,20 +161,6 @@ def track(
         _checked(one, keep)
     records = with_drifts(bound, trackers, records)
     return run_fleet(bound, trackers, records, keep, failed, warm_start, dt)
-
-
-def _several_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any, keep: str, other: Any
-) -> Any:
-    """A record with several outputs, of one tracker."""
-    from driftfit.outputs import track_outputs
-
-    if any(value is not None for value in other) or not isinstance(tracker, Tracker):
-        raise ValueError(
-            "track: several outputs are followed by one tracker on arrays, y (T, ny); data=, by=, units= and "
-            "warm_start= are for single outputs."
-        )
-    return track_outputs(model, tracker, y, u, time, dt, weights, drift, keep)
 
 
 def _records(

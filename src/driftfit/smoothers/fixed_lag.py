@@ -37,6 +37,11 @@ class Window:
     """The last ``lag`` + 1 samples of a stream, and what is known from before them."""
 
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
+        if getattr(model, "output_noise", None) is not None:
+            raise ValueError(
+                "Live: lag= does not know what the measurement noise of the model adds to each sample; smooth the "
+                "record, or leave output_noise out."
+            )
         prior = tracker.random_walk(model)
         n, r = model.n, 1.0 if prior.r is None else prior.r
         p0 = None if prior.p0 is None else prior.p0 / r
@@ -69,8 +74,8 @@ class Window:
         walk = self.walk._replace(**{name: getattr(self.walk, name)[:count] for name in SAMPLES})
         return slopes.expanded(walk) if len(self.walk.trend) else walk
 
-    def push(self, tile: Array, known: tuple[float, float, float]) -> None:
-        """Take in the sample that the tile has just seen; ``known`` as the tile was given it."""
+    def push(self, tile: Array, known: tuple[float, float, float], lane: int = 0) -> None:
+        """Take in the sample that a lane of the tile has just seen; ``known`` as the lane was given it."""
         s, walk = tile[0], self.walk
         if self.count == len(walk.y):
             self._filter(1, np.zeros((0, len(self.G))), np.zeros(0))
@@ -78,33 +83,33 @@ class Window:
                 values = getattr(walk, name)
                 values[:-1] = values[1:]
             self.count -= 1
-        k, dt = self.count, float(s["dt"][0])
+        k, dt = self.count, float(s["dt"][lane])
         _, noise, factor = known
-        walk.phi[k], walk.y[k] = s["phi"][:, 0], s["y"][0]
-        walk.weight[k] = s["ok"][0] / noise
+        walk.phi[k], walk.y[k] = s["phi"][:, lane], s["y"][lane]
+        walk.weight[k] = s["ok"][lane] / noise
         walk.drift[k] = dt * factor if self.drifts else 0.0
-        walk.each[k] = s["each"][:, 0] if "each" in fields(tile) else 1.0
+        walk.each[k] = s["each"][:, lane] if "each" in fields(tile) else 1.0
         walk.trend[k : k + 1] = dt if self.drifts else 0.0
         self.drifts = self.drifts or dt > 0.0
         self.count += 1
 
-    def smooth(self, tile: Array) -> FixedLag:
-        """Smooth the window; the tile says which directions have been seen, and the noise variance."""
+    def smooth(self, tile: Array, lane: int = 0) -> FixedLag:
+        """Smooth the window; a lane of the tile says which directions have been seen, and the noise variance."""
         N, walk = len(self.G), self._first(self.count)
         rows, values = self.before["S"][0, ..., 0], self.before["d"][0, :, 0]
         hidden = np.zeros(N, bool)
-        rank = int(tile["known" if len(walk.trend) else "rank"][0, 0])
+        rank = int(tile["known" if len(walk.trend) else "rank"][0, lane])
         if rank < N:
-            unseen = two_filters.unspanned(tile["V"][0, :rank, :, 0], np.ones(N))
+            unseen = two_filters.unspanned(tile["V"][0, :rank, :, lane], np.ones(N))
             values = np.append(values, unseen @ walk.theta0)
             hidden = two_filters.undetermined(unseen)
             if len(walk.trend):
-                time = float(tile["tau"][0, 0]) + np.cumsum(walk.trend) - walk.trend.sum()
+                time = float(tile["tau"][0, lane]) + np.cumsum(walk.trend) - walk.trend.sum()
                 hidden = slopes.undetermined(unseen, time)
                 unseen = slopes.moved(unseen, float(time[0]))
             rows = np.vstack([rows, unseen])
         path, _ = two_filters.meeting(walk, self.G, rows, values)
-        r, n = float(tile["scale"][0, 0]) if walk.r is None else walk.r, self.walk.phi.shape[1]
+        r, n = float(tile["scale"][0, lane]) if walk.r is None else walk.r, self.walk.phi.shape[1]
         var = np.where(hidden, np.inf, path.var)
         return FixedLag(path.theta[:, :n], np.sqrt(r * var[:, :n]))
 

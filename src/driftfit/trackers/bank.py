@@ -91,6 +91,7 @@ class Bank(Tracker):
     initial: Any = None
 
     width: ClassVar[int] = 1
+    alone: ClassVar[bool] = True
     outputs: ClassVar[tuple[str, ...]] = ("report",)
 
     def __post_init__(self) -> None:

@@ -49,6 +49,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    alone: ClassVar[bool] = False
+    """Whether the state works in single lanes only, so that several outputs cannot share a tile."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
     output_error: ClassVar[bool] = False
