@@ -35,6 +35,8 @@ class Smoothed:
         is shrunk by 1 - leverage. NaN where there is no sample; loo also where a sample alone determines a direction.
     leverage : (T,)
         Share of a sample in its own fit, in [0, 1].
+    press, alone : float, int
+        Weighted mean square of ``loo``, and how many samples it leaves out because they alone determine a direction.
     cost, measurement_cost, dynamic_cost : float
         The least J, and its two parts: weighted squared residuals, and the rest.
     r : float
@@ -126,6 +128,15 @@ class Smoothed:
     def loo(self) -> Array:
         c = np.where(self._path.c > ALONE, self._path.c, np.nan)
         return self._scaled(self._path.rho / c)
+
+    @cached_property
+    def press(self) -> float:
+        terms = self.walk.weight * self.loo**2
+        return float(np.nanmean(terms)) if np.isfinite(terms).any() else float("nan")
+
+    @cached_property
+    def alone(self) -> int:
+        return int(np.count_nonzero((self.walk.weight > 0.0) & np.isnan(self.loo)))
 
     def _scaled(self, values: Array) -> Array:
         """Values in units of y; NaN where there is no sample."""
