@@ -17,11 +17,11 @@ def record(L=30, seed=0):
 
 
 def bent(seed, L, walk, noise=0.3):
-    """A parameter whose slope walks at random, seen through a white regressor."""
+    """Two parameters whose slopes walk at random, seen through white regressors."""
     rng = np.random.default_rng(seed)
-    theta = np.cumsum(np.cumsum(walk * rng.standard_normal(L)))
-    phi = rng.standard_normal(L)
-    return phi * theta + noise * rng.standard_normal(L), phi, theta
+    theta = np.cumsum(np.cumsum(walk * rng.standard_normal((L, 2)), axis=0), axis=0)
+    phi = rng.standard_normal((L, 2))
+    return np.sum(phi * theta, axis=1) + noise * rng.standard_normal(L), phi, theta
 
 
 def known(L=30, seed=1):
@@ -117,7 +117,7 @@ def test_straight_lines_cost_nothing():
 
 def test_what_two_samples_a_direction_do_not_say_stays_where_theta0_put_it():
     y, phi, _ = bent(0, 20, 0.1)
-    idle = np.column_stack([phi, np.zeros(20)])
+    idle = phi * [1.0, 0.0]
     run = track(TWO, FLS(1.0, theta0=[0.0, 4.0], differences=2), y, idle)
     path = run.smooth()
     assert path.rank[-1] == 2
@@ -150,11 +150,9 @@ def test_mu_is_found_and_the_path_is_better_than_with_first_differences():
     found, better = [], []
     for seed in range(8):
         y, phi, theta = bent(seed, 300, 0.01)
-        smooth, walk = (tune(Regression(1), FLS(differences=d), y, phi).tracker for d in (2, 1))
+        smooth, walk = (tune(TWO, FLS(differences=d), y, phi).tracker for d in (2, 1))
         found.append(smooth.mu)
-        errors = [
-            np.mean((track(Regression(1), one, y, phi).smooth().theta[:, 0] - theta) ** 2) for one in (smooth, walk)
-        ]
+        errors = [np.mean((track(TWO, one, y, phi).smooth().theta - theta) ** 2) for one in (smooth, walk)]
         better.append(errors[0] / errors[1])
     assert np.median(found) == pytest.approx(900.0, rel=0.4)
     assert np.median(better) < 0.5
@@ -164,29 +162,29 @@ def test_bands_cover_when_the_slope_walks():
     hits = []
     for seed in range(20):
         y, phi, theta = bent(seed, 200, 0.02)
-        low, high = track(Regression(1), FLS((0.3 / 0.02) ** 2, differences=2), y, phi).smooth().band()
-        hits.append((low[:, 0] <= theta) & (theta <= high[:, 0]))
+        low, high = track(TWO, FLS((0.3 / 0.02) ** 2, differences=2), y, phi).smooth().band()
+        hits.append((low <= theta) & (theta <= high))
     assert 0.92 <= np.mean(hits) <= 0.98
 
 
 def test_order_frontier_huber_files_and_lags(tmp_path):
     y, phi, _ = bent(3, 80, 0.05)
-    run = track(Regression(1), FLS(40.0, differences=2), y, phi)
+    run = track(TWO, FLS(40.0, differences=2), y, phi)
     base, order = run.smooth(), np.random.default_rng(0).permutation(80)
-    mixed = track(Regression(1), FLS(40.0, differences=2), y[order], phi[order]).smooth(order_by=order.astype(float))
+    mixed = track(TWO, FLS(40.0, differences=2), y[order], phi[order]).smooth(order_by=order.astype(float))
     np.testing.assert_allclose(mixed.theta, base.theta[order], rtol=1e-9)
     np.testing.assert_allclose(mixed.slope, base.slope[order], rtol=1e-7, atol=1e-9)
-    pair = frontier(Regression(1), y, phi, mu=[40.02, 39.98], differences=2)
+    pair = frontier(TWO, y, phi, mu=[40.02, 39.98], differences=2)
     assert np.diff(pair.measurement) / np.diff(pair.dynamic) == pytest.approx(-40.0, rel=1e-3)
     spoiled = y.copy()
     spoiled[::9] += 4.0
-    robust = huber(track(Regression(1), FLS(40.0, differences=2), spoiled, phi), 0.5, tol=0.0)
+    robust = huber(track(TWO, FLS(40.0, differences=2), spoiled, phi), 0.5, tol=0.0)
     assert robust.certificate < 1e-6
     assert (np.diff(robust.costs) <= 1e-12 * robust.costs[0]).all()
     run.save(tmp_path / "run")
     np.testing.assert_array_equal(Track.load(tmp_path / "run").smooth().theta, base.theta)
-    rest = track(Regression(1), FLS(40.0, differences=2), y[40:], phi[40:], warm_start=track(
-        Regression(1), FLS(40.0, differences=2), y[:40], phi[:40]))  # fmt: skip
+    rest = track(TWO, FLS(40.0, differences=2), y[40:], phi[40:], warm_start=track(
+        TWO, FLS(40.0, differences=2), y[:40], phi[:40]))  # fmt: skip
     np.testing.assert_array_equal(rest.theta, run.theta[40:])
     u = np.random.default_rng(1).standard_normal(60)
     lagged = track(ARX(1, 1), FLS(1e3, differences=2), y[:60], u).smooth()
@@ -197,7 +195,7 @@ def test_order_frontier_huber_files_and_lags(tmp_path):
 def test_a_long_record_without_excitation_stays_finite():
     y, phi, _ = bent(5, 20_000, 1e-4)
     phi[5000:15_000] = 0.0
-    run = track(Regression(1), FLS(1e5, differences=2), y, phi)
+    run = track(TWO, FLS(1e5, differences=2), y, phi)
     assert np.isfinite(run.theta).all()
     assert (run.std[10:] > 0.0).all()
     path = run.smooth()
