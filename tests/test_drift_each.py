@@ -4,9 +4,12 @@ import naive_smoother as naive
 import numpy as np
 import polars as pl
 import pytest
+from contract_table import model_of, ready
+from support import arx_record
 
 from driftfit import ARX, FLS, RLS, Kalman, Live, Regression, Track, frontier, track, tune
 from driftfit.smoothers.huber import huber
+from driftfit.trackers import found
 
 TWO = Regression(2)
 
@@ -82,6 +85,18 @@ def test_kalman_takes_it_for_variances_and_for_a_matrix(form, p0):
         np.testing.assert_allclose(run.cov(-1), P, rtol=1e-6)
         np.testing.assert_allclose(run.smooth("cov").theta[-1], run.theta[-1], rtol=1e-9)
         np.testing.assert_allclose(run.smooth("cov").cov(-1), run.cov(-1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("tracker", [ready(kind) for kind in found().values() if kind.drift_each], ids=repr)
+def test_every_tracker_that_takes_columns_knows_one_column_for_all(tracker):
+    y, u = arx_record(120, 3)
+    model, d = model_of(tracker, ARX(2, 2)), np.random.default_rng(3).uniform(0.0, 9.0, 120)
+    names = tracker.names_for(model)
+    plain, ones = track(model, tracker, y, u), track(model, tracker, y, u, drift=np.ones((120, len(names))))
+    np.testing.assert_array_equal(ones.theta, plain.theta)
+    a, b = (track(model, tracker, y, u, drift=given) for given in (d, np.repeat(d[:, None], len(names), axis=1)))
+    np.testing.assert_allclose(a.theta, b.theta, rtol=1e-7, atol=1e-9)
+    assert np.abs(a.theta - plain.theta).max() > 1e-6
 
 
 def test_one_column_for_all_is_the_ordinary_factor():

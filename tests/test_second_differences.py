@@ -210,5 +210,8 @@ def test_settings():
     with pytest.raises(ValueError, match="p0 says nothing of the slope"):
         FLS(1.0, p0=1.0, differences=2)
     phi, y = record()
+    bent_run = track(TWO, FLS(1.0, differences=2), y, phi)
+    with pytest.raises(ValueError, match=r"run\.forecast follows it"):
+        bent_run.ahead(2)
     with pytest.raises(ValueError, match="theta itself walks at random here"):
         _ = track(TWO, FLS(1.0), y, phi).smooth().slope
