@@ -71,6 +71,8 @@ def track_outputs(
         return OutputsFleet({k: run_one(model, one, found[0], keep, before, dt) for k, one in enumerate(tracker)}, {})
     if isinstance(tracker, Sequence):
         raise ValueError("track: a grid of trackers over several outputs is for one record; leave by= out.")
+    if before is not None and not isinstance(before, Mapping):
+        raise ValueError(f"warm_start: with by= it is what such a run gave, from key to record; got {before!r}.")
     starts = before or {}
     runs = {key: run_one(model, tracker, one, keep, starts.get(key), dt) for key, one in found.items()}
     return OutputsFleet(runs, failed)
