@@ -50,7 +50,8 @@ def as_output(y: Any) -> Array:
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
     if array.ndim != 1:
-        raise ValueError(f"y must have one axis, (T,); got shape {array.shape}.")
+        hint = " Several outputs are for a model with ny=; elsewhere take one column." if array.ndim == 2 else ""
+        raise ValueError(f"y must have one axis, (T,); got shape {array.shape}.{hint}")
     if len(array) == 0:
         raise ValueError("y is empty: there is nothing to track.")
     return array
