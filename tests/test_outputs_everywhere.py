@@ -81,8 +81,15 @@ def test_tables_units_rows_and_grids():
     same(stacked[1], track(joint, TRACKER, 2 * y, 2 * u))
     grid = track(joint, [TRACKER, FLS(5.0)], y, u)
     same(grid[1], track(joint, FLS(5.0), y, u))
-    warm = track(joint, TRACKER, ["level", "flow"], "u", data=data, by="unit", time="t", warm_start=None)
-    assert set(warm) == {"p", "q"}
+    both = {"y": ["level", "flow"], "u": "u", "by": "unit", "time": "t", "weights": "w"}
+    first, second = data.filter(pl.col("t") < 50), data.filter(pl.col("t") >= 50)
+    warm = track(joint, TRACKER, data=second, **both, warm_start=track(joint, TRACKER, data=first, **both))
+    same(warm["q"], alone, slice(50, None))
+    rest = warm.to_table()
+    assert rest["unit"].to_list() == ["p"] * 30 + ["q"] * 30
+    assert rest["theta_b1[flow<-u]"].to_numpy()[-1] == alone.theta[-1, 1, 2]
+    with pytest.raises(ValueError, match="what such a run gave"):
+        track(joint, TRACKER, data=second, **both, warm_start=alone)
     table = alone.to_table()
     assert table["prediction[flow]"].to_numpy()[50] == alone.prediction[50, 1]
     assert table["theta_a1[flow<-level]"].to_numpy()[-1] == alone.theta[-1, 1, 0]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from driftfit.fleet import Fleet
     from driftfit.outputs import Outputs
     from driftfit.shared_outputs import Shared
+    from driftfit.track_outputs import OutputsFleet
 
 ENDINGS = (".csv", ".parquet", ".npz")
 _OWN = ("prediction", "innovation", "innovation_std", "ok")
@@ -84,9 +85,21 @@ def units_of(result: Track | Fleet) -> dict[str, str]:
     return units
 
 
-def outputs_table(run: Outputs | Shared, kind: str = "polars") -> Any:
-    """A record of several outputs: each result with its output in brackets, parameters under their names."""
+def outputs_table(runs: Outputs | Shared | OutputsFleet, kind: str = "polars") -> Any:
+    """Records of several outputs: each result with its output in brackets, parameters under their names."""
     one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
+    if isinstance(runs, dict):
+        parts = []
+        for key, run in runs.items():
+            keys = zip(runs.by, key if isinstance(key, tuple) else (key,), strict=True)
+            parts.append(_of_outputs(run).select([*(pl.lit(k).alias(name) for name, k in keys), pl.all()]))
+        table = pl.concat(parts)
+    else:
+        table = _of_outputs(runs)
+    return table if kind == "polars" else table.to_pandas() if kind == "pandas" else table.to_arrow()
+
+
+def _of_outputs(run: Outputs | Shared) -> pl.DataFrame:
     columns: dict[str, Any] = {_time_name(run): run.time}
     for j, output in enumerate(run.outputs):
         columns[_free(output)] = run.y[:, j]
@@ -96,8 +109,7 @@ def outputs_table(run: Outputs | Shared, kind: str = "polars") -> Any:
         theta, std = (run.theta, run.std) if shared else (run.theta[:, j], run.std[:, j])
         for i, name in enumerate(names):
             columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
-    table = pl.DataFrame(columns)
-    return table if kind == "polars" else table.to_pandas() if kind == "pandas" else table.to_arrow()
+    return pl.DataFrame(columns)
 
 
 def to_table(result: Track | Fleet, kind: str = "polars") -> Any:

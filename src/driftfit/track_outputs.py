@@ -40,12 +40,20 @@ class Signals(NamedTuple):
 class OutputsFleet(dict[Hashable, Any]):
     """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result."""
 
-    def __init__(self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str]) -> None:
+    def __init__(
+        self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str], by: Sequence[str] = ("series",)
+    ) -> None:
         super().__init__(runs)
-        self.failed = dict(failed)
+        self.failed, self.by = dict(failed), tuple(by)
 
     def __repr__(self) -> str:
         return f"Records of several outputs: {', '.join(map(repr, self))}"
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """All results as one table, the keys first."""
+        from driftfit.export import outputs_table
+
+        return outputs_table(self, kind)
 
 
 def track_outputs(
@@ -75,7 +83,7 @@ def track_outputs(
         raise ValueError(f"warm_start: with by= it is what such a run gave, from key to record; got {before!r}.")
     starts = before or {}
     runs = {key: run_one(model, tracker, one, keep, starts.get(key), dt) for key, one in found.items()}
-    return OutputsFleet(runs, failed)
+    return OutputsFleet(runs, failed, ("series",) if by == "row" else (by,) if isinstance(by, str) else by)
 
 
 def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None, dt: Any) -> Outputs | Shared:
