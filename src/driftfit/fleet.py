@@ -324,7 +324,7 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     """Run one tile over its first ``stop`` samples, block by block."""
     L = len(job.series)
     first, length = records.first[job.series], records.length[job.series]
-    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)))
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)), records.known.shape[1])
     finals: dict[int, Array] = {}
     bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
@@ -337,9 +337,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
         _words(job.tile, L)[:, lane] = words
 
 
-def _block(L: int, m: int, factors: int) -> tuple[Array, Array, Array]:
+def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
     """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
-    shapes = (BLOCK, L), (BLOCK, m, L), (factors, 3, L)
+    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
     if getattr(_thread, "shapes", None) != shapes:
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block
@@ -372,6 +372,6 @@ def _gather(
             for l in range(L):
                 to_u[t, j, l] = u[start[l] + t, j] if there[l] else np.nan
     for t in range(b - a if changing else 1):
-        for j in range(3):
+        for j in range(known.shape[1]):
             for l in range(L):
                 to_known[t, j, l] = known[(start[l] + t) * changing, j] if there[l] else 1.0 * (j > 0)

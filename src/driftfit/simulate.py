@@ -54,10 +54,14 @@ def ahead(run: Track, k: int) -> Prediction:
     Raises
     ------
     ValueError
-        If k is below 1, or the model is neither ARX nor Regression.
+        If k is below 1, the model is neither ARX nor Regression, or theta moves along a slope.
     """
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     whole("ahead", "k", k, 1)
+    if getattr(run.tracker, "differences", 1) > 1:
+        raise ValueError(
+            "ahead: predictions over a record hold theta, which moves along its slope here; run.forecast follows it."
+        )
     T, theta, cov = len(run), run.theta, covariances(run)
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
     a = theta[:, :na]
@@ -167,11 +171,13 @@ def _known(values: Array) -> Array:
 
 
 def _drift(run: Track, r: Array) -> Array:
-    """q per sample, (1, n, n) or (T, n, n); zero where the tracker does not describe a random walk."""
+    """q per sample, (1, n, n) or (T, n, n); zero where theta itself does not walk at random."""
     n = len(run.names)
     try:
         walk = run.tracker.random_walk(run.model)
     except ValueError:
+        return np.zeros((1, n, n))
+    if walk.slopes:
         return np.zeros((1, n, n))
     scale = np.ones(1) if walk.r is not None else np.where(np.isfinite(r), r, 0.0)
     return np.asarray(walk.q * scale[:, None, None])

@@ -18,7 +18,7 @@ from driftfit.models.base import Model
 from driftfit.signals import interval_of
 from driftfit.trackers.base import Tracker
 
-_LEFT = ("interval", "noise", "drift", "F")
+_LEFT = ("interval", "noise", "drift", "each", "F")
 """Fields that stay behind: what an operator set for the stream, and the diffuse likelihood of the run before."""
 
 

@@ -97,6 +97,7 @@ class Bank(Tracker):
     lag_variance: bool = True
 
     width: ClassVar[int] = 1
+    alone: ClassVar[bool] = True
     outputs: ClassVar[tuple[str, ...]] = ("report",)
 
     def __post_init__(self) -> None:
@@ -290,7 +291,7 @@ class Bank(Tracker):
             "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
         }  # fmt: skip
 
-    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
@@ -320,8 +321,8 @@ class Bank(Tracker):
             raise ValueError(f"Bank: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
         return p
 
-    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
-        columns, Hd = self.beside(1, prob, drift)[0], len(self.all_changes)
+    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+        columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
         for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
             start = lane["table"][PACKED.index(name), 0] // 8
             lane["memory"][start : start + len(values)] = values

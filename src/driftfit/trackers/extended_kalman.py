@@ -34,6 +34,7 @@ from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.hammerstein_wiener_steps import MINIMAL
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.each import told
 from driftfit.trackers.kalman import drift, drift_matrix
 
 
@@ -136,7 +137,7 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
         s.e[l] = e
         s.s[l] = v
 
-    return TrackerSteps(drift_matrix if together else drift, correct)
+    return TrackerSteps(drift_matrix if together else drift, correct, told=told)
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,7 @@ class ExtendedKalman(Tracker):
     inflation: float = 0.0
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.q is not None:
@@ -194,6 +196,7 @@ class ExtendedKalman(Tracker):
             "r": self.r,
             "inflation": self.inflation,
             "g": np.zeros(n),
+            "each": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
         }
