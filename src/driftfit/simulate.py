@@ -61,24 +61,24 @@ def ahead(run: Track, k: int) -> Prediction:
     T, theta, cov = len(run), run.theta, covariances(run)
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
     a = theta[:, :na]
-    lags = [_moved(y, i) for i in range(na)]
+    lags = [moved(y, i) for i in range(na)]
     slopes = [np.zeros_like(theta) for _ in range(na)]
     psi, energy, r = [np.ones(T)], np.zeros(T), np.full(T, np.nan)
     for j in range(1, k + 1):
-        phi = np.column_stack([*lags, _moved(U, -j)])
+        phi = np.column_stack([*lags, moved(U, -j)])
         y_hat = np.einsum("ti,ti->t", phi, theta)
         S = phi + sum((a[:, i, None] * slopes[i] for i in range(na)), np.zeros_like(theta))
         q = _drift(run, r)
         of_theta = np.einsum("ti,tij,tj->t", S, cov, S) + j * np.einsum("ti,tij,tj->t", S, q, S)
         if j == 1:
-            r = _filled(np.maximum(_moved(_known(run.innovation_std) ** 2, -1) - of_theta, 0.0))
+            r = _filled(np.maximum(moved(_known(run.innovation_std) ** 2, -1) - of_theta, 0.0))
         energy = energy + psi[-1] ** 2
         psi.append(sum((a[:, i] * psi[-1 - i] for i in range(min(na, len(psi)))), np.zeros(T)))
         lags, slopes = [y_hat, *lags][:na], [S, *slopes][:na]
     whole_time = _unbroken(run, na, k)
     with np.errstate(invalid="ignore"):
         found = (y_hat, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
-    return Prediction(*(np.where(whole_time, _moved(part, k), np.nan) for part in found))
+    return Prediction(*(np.where(whole_time, moved(part, k), np.nan) for part in found))
 
 
 def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
@@ -146,11 +146,11 @@ def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int,
         return 0, np.hstack([u, *one])
     if not isinstance(model, ARX) or len(model.outputs) > 1:
         raise ValueError(f"predictions over a record are for ARX and Regression with one output; got {model!r}.")
-    columns = [_moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
+    columns = [moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
     return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
 
 
-def _moved(values: Array, by: int, rest: float = np.nan) -> Array:
+def moved(values: Array, by: int, rest: float = np.nan) -> Array:
     """Values (T, ..) so many samples later (earlier where negative)."""
     out = np.full(values.shape, rest)
     T = len(values)
