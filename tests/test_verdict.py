@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 from support import THETA, arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
@@ -76,17 +76,35 @@ def test_error_rate(noise):
     assert abs(np.mean(said) - 0.2) < 3.0 * np.sqrt(0.16 / 50)
 
 
-def test_correlated_noise_needs_lags():
-    def p(seed, lags):
-        rng = np.random.default_rng(seed)
-        phi, e = np.ones((400, 1)), rng.normal(size=400)
-        for t in range(1, 400):
-            e[t] += 0.5 * e[t - 1]
-        return constancy(phi, 1.0 + e, lags).p_joint
+def correlated(seed, T=300, rho=0.6, jump=0.0):
+    """A regression whose inputs and noise are autoregressions."""
+    rng = np.random.default_rng(seed)
+    slow = signal.lfilter([1.0], [1.0, -0.8], rng.normal(size=T))
+    e = signal.lfilter([np.sqrt(1.0 - rho * rho)], [1.0, -rho], rng.normal(size=T))
+    phi = np.column_stack([slow, np.ones(T)])
+    return phi, phi @ [1.0, 2.0] + jump * slow * (np.arange(T) >= T // 2) + e
 
-    plain, allowed = (np.mean([p(seed, lags) < 0.05 for seed in range(60)]) for lags in (0, 10))
-    assert plain > 0.2
+
+def test_correlated_noise_does_not_pass_for_drift():
+    """Without lags constants in correlated noise are rejected half of the time; lags are found, and drift still is."""
+    plain, allowed, found = (
+        np.mean([constancy(*correlated(seed, jump=jump), lags).p_joint < 0.05 for seed in range(40)])
+        for jump, lags in ((0.0, 0), (0.0, None), (0.8, None))
+    )
+    assert plain > 0.3
     assert allowed < 0.15
+    assert found > 0.6
+
+
+def test_white_scores_need_no_lags_and_drift_does_not_pass_for_correlation():
+    """Noise that is white, steady or not, and a jump that makes the residuals of constants correlated."""
+    for noise in ("steady", "changing"):
+        lags = [constancy(*record(300, seed, noise)).lags for seed in range(12)]
+        assert np.median(lags) == 0
+    phi, y = record(400, 3)
+    jumped = y + 3.0 * phi[:, 1] * (np.arange(400) >= 200)
+    assert constancy(phi, jumped).lags <= 2
+    assert constancy(*correlated(1)).lags >= 3
 
 
 def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():

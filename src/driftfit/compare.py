@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.judges.seen import constant_least_squares
+from driftfit.judges.regressors import constant_least_squares
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.result import Track, root_mean_square

@@ -32,8 +32,8 @@ from driftfit.compare import errors
 from driftfit.drivers import LARGEST
 from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.excitation import INDEX, Excitation, excitation
+from driftfit.judges.regressors import Rows, regressors
 from driftfit.judges.scale import core
-from driftfit.judges.seen import Seen, regressors
 from driftfit.judges.whiteness import Whiteness, crossing, whiteness
 from driftfit.kernel import Array
 from driftfit.result import Track, root_mean_square
@@ -85,7 +85,7 @@ class Diagnosis:
     white: Whiteness = field(repr=False, compare=False)
     excited: Excitation = field(repr=False, compare=False)
     constant: Constancy = field(repr=False, compare=False)
-    seen: Seen = field(repr=False, compare=False)
+    rows: Rows = field(repr=False, compare=False)
 
     @property
     def ok(self) -> bool:
@@ -127,10 +127,10 @@ def diagnose(run: Track) -> Diagnosis:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = run.innovation / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
-    seen = regressors(run)
+    rows = regressors(run)
     # without a covariance there is no scale, but correlation needs none
     white = whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
-    excited, constant = excitation(seen.phi), constancy(seen.phi, seen.y)
+    excited, constant = excitation(rows.phi), constancy(rows.phi, rows.y)
     checks = (
         _whiteness(white),
         *_inputs(run, z),
@@ -139,7 +139,7 @@ def diagnose(run: Track) -> Diagnosis:
         _excitation(run, excited),
         _constancy(run, constant),
     )
-    return Diagnosis(checks, run, z, white, excited, constant, seen)
+    return Diagnosis(checks, run, z, white, excited, constant, rows)
 
 
 def _whiteness(white: Whiteness) -> Check:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Judged:
     """Questions to a run. Each is a module of its own, imported when it is asked."""
 
-    def verdict(self, level: float = 0.05, lags: int = 0) -> Verdict:
+    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
         """Is the time variation real, which parameters move, and does following them pay? See `driftfit.verdict`."""
         from driftfit.verdict import verdict
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from driftfit.result import Track
 
 
-class Seen(NamedTuple):
+class Rows(NamedTuple):
     """The N samples that can be used, scaled to the noise variance of weight 1."""
 
     at: Array
@@ -41,10 +41,10 @@ def constant_least_squares(model: Model, y: Array, u: Array, known: Array) -> Ar
     return out
 
 
-def regressors(run: Track) -> Seen:
+def regressors(run: Track) -> Rows:
     """The samples of a regression that a record makes for the model of a run."""
     out = constant_least_squares(run.model, run.y, run.u, run._known)
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run._known[:, 1] if len(run._known) == 1 else run._known[at, 1]
     root = 1.0 / np.sqrt(noise)
-    return Seen(at, out["phi"][at, :, 0] * np.reshape(root, (-1, 1)), out["y"][at, 0] * root)
+    return Rows(at, out["phi"][at, :, 0] * np.reshape(root, (-1, 1)), out["y"][at, 0] * root)
