@@ -3,9 +3,9 @@
 The level is 5 %. Regression on three inputs, and ARX(2, 2); noise that is steady, has outliers (5 % are ten times as
 large), is heavy-tailed (Student's t, 3 degrees of freedom), or changes its variance (four times the deviation in the
 last 30 %); and inputs that become three times as large half-way; or noise that is an autoregression with 0.5, beside
-inputs that are autoregressions with 0.8. "no lags" is the joint test that takes scores to be white. "joint" is the share of records whose parameters are
-said to move, "named" the share in which at least one is named, "Hansen" what the joint statistic without lags and the
-published table would say.
+inputs that are autoregressions with 0.8. "joint" is the share of records whose parameters are said to move, "named" the
+share in which at least one is named, "no lags" the joint test that takes scores to be white, "Hansen" what its
+statistic and the published table would say.
 
 Run: python benchmarks/verdict_error_rate.py [records a cell, 1000 by default]
 """

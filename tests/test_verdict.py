@@ -8,6 +8,7 @@ from support import THETA, arx_record, damaged
 from driftfit import ARX, RLS, Kalman, Regression, track
 from driftfit.judges.attribute import attribute, holm
 from driftfit.judges.constancy import constancy, robust_fit
+from driftfit.judges.constants import constant_least_squares
 from driftfit.judges.paired import newey_west, paired
 from driftfit.judges.quadratic import quantile, tail
 from driftfit.judges.whiteness import crossing, whiteness
@@ -237,3 +238,16 @@ def test_whiteness_does_not_mistake_changing_variance_for_correlation():
     assert whiteness(z[1:] + 0.5 * z[:-1]).p < 1e-4
     assert crossing(z[1:], z[:-1]).p > 0.001
     assert crossing(z[1:] + 0.5 * z[:-1], z[1:]).p < 1e-6
+
+
+def test_constants_are_those_of_rls_from_a_diffuse_start():
+    """Also with gaps that are filled, samples of other weights, and a regressor that starts late."""
+    y, u = damaged(*arx_record(300, 7))
+    u[:40] = 0.0
+    weights = np.where(np.arange(300) % 3 == 0, 0.2, 1.0)
+    steady = track(ARX(2, 2), RLS(1.0), y, u, weights=weights)
+    got = constant_least_squares(steady.model, y, steady.u, steady._known)
+    later = slice(60, None)
+    assert got["theta"][later, :, 0] == pytest.approx(steady.theta[later], rel=1e-6, abs=1e-9)
+    assert got["e"][later, 0] == pytest.approx(steady.innovation[later], rel=1e-6, abs=1e-8, nan_ok=True)
+    assert np.isfinite(got["theta"]).all()

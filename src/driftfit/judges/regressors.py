@@ -1,4 +1,4 @@
-"""The regression behind a run, and constant least squares on it, sample by sample."""
+"""The regression behind a run."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from driftfit.drivers import drivers, output_type
+from driftfit.judges.constants import constant_least_squares
 from driftfit.kernel import Array
-from driftfit.models.base import Model
-from driftfit.smoothers.walk import COLLECTED, collect
-from driftfit.trackers.rls import RLS
-from driftfit.warm import fresh_tile
 
 if TYPE_CHECKING:
     from driftfit.result import Track
@@ -26,19 +22,6 @@ class Rows(NamedTuple):
     """(N, n)"""
     y: Array
     """(N,)"""
-
-
-def constant_least_squares(model: Model, y: Array, u: Array, known: Array) -> Array:
-    """RLS(1) over a record, y (T,), u (T, m), known (T, 3): (T,) records of phi, y, dt, valid, e, s, ok and more.
-
-    Lags that are missing are filled by these constants.
-    """
-    steady = RLS(1.0)
-    tile = fresh_tile(model, steady)
-    out = np.empty(len(y), output_type(tile, COLLECTED))
-    steps = steady.steps._replace(store=collect)
-    drivers(model.steps, steps).run(tile, y[:, None], u[:, :, None], known[:, :3, None], out)
-    return out
 
 
 def regressors(run: Track) -> Rows:
