@@ -244,7 +244,7 @@ def _constancy(run: Track, test: Constancy) -> Check:
         f"Constants are not rejected, and predict better ({steady:.4g} against {own:.4g}): the drift is set too high. "
         "Lower q or raise the memory; tune() finds it."
     )
-    return Check("constancy (p)", test.p_joint, -np.inf, 0.05 if own > 1.01 * steady else np.inf, advice)
+    return Check("constancy (p)", test.p_joint, -np.inf, 0.05 if own > 1.03 * steady else np.inf, advice)
 
 
 def holds_constant(run: Track) -> bool:

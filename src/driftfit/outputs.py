@@ -13,7 +13,7 @@ used, with everything that a Track can do.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from io import StringIO
@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from driftfit.drivers import drivers, known_factors, make_tile, output_type
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -36,10 +37,15 @@ from driftfit.summary import WIDTH, table_of
 from driftfit.trackers.base import Tracker
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from matplotlib.figure import Figure
 
+    from driftfit.diagnose import Diagnosis
+    from driftfit.verdict import Verdict
 
-class Outputs:
+
+class Outputs(JudgedMany):
     """A record with several outputs, each with a theta of its own.
 
     Attributes
@@ -141,6 +147,9 @@ class Outputs:
     def __iter__(self) -> Iterator[Track]:
         return (self[name] for name in self.outputs)
 
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(zip(self.outputs, self, strict=True))
+
     def smooth(self, keep: str = "std") -> dict[str, Smoothed]:
         """The smoothed path of each output, by name."""
         return {name: self[name].smooth(keep) for name in self.outputs}
@@ -214,6 +223,18 @@ class Shared:
     def smooth(self, keep: str = "std") -> Smoothed:
         """The smoothed path of the rows; take every ny-th of them, between rows of one instant theta does not move."""
         return self.rows.smooth(keep)
+
+    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
+        """Do the shared parameters move? The verdict of the rows; see `driftfit.verdict`."""
+        return self.rows.verdict(level, lags)
+
+    def diagnose(self) -> Diagnosis:
+        """What `Track.diagnose` says of the rows."""
+        return self.rows.diagnose()
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """The page of the rows; see `driftfit.report`."""
+        self.rows.report(path, title)
 
     def summary(self) -> str:
         """Parameters now, and the one-step error of each output."""
