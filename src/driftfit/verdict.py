@@ -212,7 +212,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None) -> Verdict
     rows = regressors(run)
     test = constancy(rows.phi, rows.y, lags)
     drifts = bool(test.p_joint < level)
-    steps = attribute(rows.phi, rows.y, test, level) if drifts else None
+    steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
     parameters = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
     own, *others, scored = errors(run)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))

@@ -59,8 +59,8 @@ def holm(p: Array, level: float) -> Array:
     return rejected
 
 
-def attribute(phi: Array, y: Array, test: Constancy, level: float) -> Attribution:
-    """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y)`, whose lags are kept."""
+def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
+    """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
     steps: list[Step] = []
     p, now = test.p_own.copy(), test
@@ -70,7 +70,7 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float) -> Attributio
             break
         p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
         steps.append(step)
-        later = constancy(_with(phi, steps), y, test.lags)
+        later = constancy(_with(phi, steps), y, lags)
         if np.isnan(later.p_joint):
             steps.pop()
             break

@@ -110,7 +110,7 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     fit = robust_fit(X, y)
     if not fit.scale > 1e-10 * np.sqrt(np.mean(y * y)):
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
-    lags = automatic(X, _piecewise(X, y)) if lags is None else lags
+    lags = automatic(X, fit.psi, _piecewise(X, y)) if lags is None else lags
     scores = X * fit.psi[:, None]
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
