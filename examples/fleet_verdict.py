@@ -40,6 +40,6 @@ if __name__ == "__main__":
         ARX(1, 1), Kalman(q=1e-5, r=0.01), y="flow", u="pressure", data=pl.DataFrame(table()), time="t", by="pump"
     )
     print(fleet.verdict())
-    print(fleet.diagnose())
     if len(sys.argv) > 1:
+        print(fleet.diagnose())
         fleet.report(sys.argv[1], "Thirty pumps")
