@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.drivers import drivers, make_tile, output_type, repeat_tile
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import Records
@@ -62,7 +63,7 @@ class Place(NamedTuple):
     lane: int
 
 
-class Fleet:
+class Fleet(JudgedMany):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
@@ -121,6 +122,9 @@ class Fleet:
     def items(self) -> Iterator[tuple[Hashable, Track]]:
         """Keys and results."""
         return ((key, self._track(k)) for key, k in self._index.items())
+
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(self.items())
 
     def __iter__(self) -> Iterator[Hashable]:
         return iter(self._index)

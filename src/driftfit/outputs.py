@@ -10,7 +10,7 @@ the joint run used, with everything that a Track can do.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Self
@@ -20,6 +20,7 @@ import numpy as np
 from driftfit import storage
 from driftfit.drivers import output_type
 from driftfit.joint import Starts, drive, end_of, joint_tile, shown
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from driftfit.forecast import Forecast
 
 
-class Outputs:
+class Outputs(JudgedMany):
     """A record with several outputs, each with a theta of its own.
 
     Attributes
@@ -158,6 +159,9 @@ class Outputs:
 
     def __iter__(self) -> Iterator[Track]:
         return iter(self._tracks)
+
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(zip(self.outputs, self, strict=True))
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
         """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""

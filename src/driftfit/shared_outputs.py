@@ -30,7 +30,9 @@ from driftfit.warm import End
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.diagnose import Diagnosis
     from driftfit.forecast import Forecast
+    from driftfit.verdict import Verdict
 
 
 class Shared:
@@ -129,6 +131,18 @@ class Shared:
         """Where the run ended, for another one to begin (`warm_start`)."""
         rows = self.rows
         return end_of(rows.model, (rows.tracker,), rows._tile, None if self._time is None else self._time[-1])
+
+    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
+        """Do the shared parameters move? The verdict of the rows; see `driftfit.verdict`."""
+        return self.rows.verdict(level, lags)
+
+    def diagnose(self) -> Diagnosis:
+        """What `Track.diagnose` says of the rows."""
+        return self.rows.diagnose()
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """The page of the rows; see `driftfit.report`."""
+        self.rows.report(path, title)
 
     def summary(self) -> str:
         """Parameters now, and the one-step error of each output."""

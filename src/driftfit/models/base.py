@@ -77,3 +77,31 @@ class Model(Settings, ABC):
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
         response: Array = np.eye(1, h)[0]
         return response
+
+    @property
+    def reach(self) -> int:
+        """How many past samples the regressors of a sample hold; a model that can be run forward says so."""
+        return 0
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back among the lags.
+
+        Parameters
+        ----------
+        theta : (D, n)
+            A system a row.
+        y : (D, p)
+            Outputs before, p at least `reach`.
+        u : (D or 1, p + h, m)
+            Inputs before, and at the h samples that are asked for.
+        noise : (D, h)
+            Noises of the equation.
+        span : (low, high), a number or (D,) each
+            Outputs that were seen, for a model that has to be inverted.
+
+        ValueError for a model that does not say how.
+        """
+        raise ValueError(
+            f"{type(self).__name__} does not say how it runs forward, so nothing can be simulated; a model of your own "
+            "does with the methods `reach` and `play` (driftfit.models.base)."
+        )

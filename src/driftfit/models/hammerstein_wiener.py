@@ -149,6 +149,15 @@ class HammersteinWiener(Model):
         adaptive = self.into.adaptive
         return steps.build(self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive)
 
+    @property
+    def reach(self) -> int:
+        return max(self.na, self.nb + self.nk - 1)
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        from driftfit.models.hammerstein_wiener_forward import play
+
+        return play(self, theta, y, u, noise, span)
+
     def touched(self, t: int, signal: str) -> range:
         """The samples that cannot be used when "y" or "u" is missing at t."""
         if signal == "y":

@@ -63,6 +63,9 @@ class JointARX(ARX):
                 response[k] += lags[:, :, i] @ response[k - 1 - i]
         return response
 
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
+
     def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
         raise ValueError("polynomials: A(z) of several outputs is a matrix; take it from run.theta by run.names.")
 
