@@ -122,7 +122,7 @@ def core(function: Callable[..., Any]) -> Any:
 
 
 class Outside(types.ExternalFunction):
-    """A machine that steps call by its symbol, with the address of a table: compiled once for all drivers.
+    """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
     What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
     compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
@@ -138,7 +138,7 @@ class Outside(types.ExternalFunction):
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
             dispatcher = _OUTSIDE[self.symbol]
-            dispatcher.compile((types.intp,))
+            dispatcher.compile(self.sig.args)
             owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
             _LOADED[self.symbol] = owner  # of the code, which would go with it
             add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
@@ -155,11 +155,13 @@ def _machine(symbol: str) -> Outside:
 
 
 def outside(function: Callable[..., Any]) -> Outside:
-    """Make a machine of a function of one address."""
+    """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
     dispatcher = _identified(njit(error_model="numpy", nogil=True, cache=True)(function))
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
-    machine = Outside(symbol, types.void(types.intp))
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
+    machine = Outside(symbol, types.void(*kinds))
     machine.identity = dispatcher.identity
     _OUTSIDE[symbol] = dispatcher
     _MACHINES[symbol] = machine

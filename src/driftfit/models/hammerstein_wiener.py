@@ -36,10 +36,11 @@ import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
 from driftfit.kernel import Array
-from driftfit.models import hammerstein_wiener_steps as steps
 from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
+from driftfit.models.block_memory import Places, memory, places_of
 from driftfit.models.block_products import Structure
+from driftfit.models.hammerstein_wiener_steps import build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -140,14 +141,18 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return steps.memory(
-            self.structure, self.nk, self.into.parameters, self.out.parameters, self.out.limits, self.output_noise
-        )
+        bases = self.into.parameters, self.out.parameters
+        return {"blocks": memory(self.structure, self.nk, *bases, self.out.limits, self.output_noise)}
+
+    @property
+    def places(self) -> Places:
+        """Where everything stands in the memory of the steps."""
+        bases = self.into.parameters, self.out.parameters
+        return places_of(self.structure, self.nk, *bases, self.linear, self.into.adaptive)
 
     @property
     def steps(self) -> ModelSteps:
-        adaptive = self.into.adaptive
-        return steps.build(self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive)
+        return build(self.into.evaluate, self.out.evaluate, self.places)
 
     def touched(self, t: int, signal: str) -> range:
         """The samples that cannot be used when "y" or "u" is missing at t."""

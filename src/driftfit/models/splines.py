@@ -14,7 +14,7 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.models import curve_kernels
-from driftfit.models.curves import Basis, fill
+from driftfit.models.curves import Basis, values_and_slopes
 from driftfit.settings import numbers, whole
 
 
@@ -89,9 +89,8 @@ class BSpline(Basis):
     def own_numbers(self) -> Array:
         ends = np.pad(self.knots, self.degree, mode="edge")
         p = np.concatenate([[self.degree, len(ends)], ends, np.zeros(self.degree + 1 + self.n)])
-        at_anchor = np.empty((1, self.n))
-        fill(curve_kernels.splines)(np.array([self.anchor]), p.copy(), at_anchor)
-        p[-self.n :] = at_anchor[0]
+        coded = np.concatenate([[float(self.code)], p])
+        p[-self.n :] = values_and_slopes(self.evaluate, np.array([self.anchor]), coded, self.n)[0][0]
         return p
 
     @property
