@@ -74,6 +74,8 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
         return str(value.__name__)
     if isinstance(value, bool | int | float | str | type(None) | np.generic):
         return repr(value)
+    if isinstance(value, np.ndarray):  # a constant to the compiler
+        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
     if hasattr(value, "identity"):
         return str(value.identity)
     raise TypeError(
@@ -119,6 +121,20 @@ def core(function: Callable[..., Any]) -> Any:
     assert isinstance(function, FunctionType)
     options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
     return _identified(njit(cache=True, _nrt=False, **options)(function))
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides."""
+    assert isinstance(function, FunctionType)
+    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    return _identified(njit(cache=True, forceinline=True, _nrt=False, **options)(function))
+
+
+def named(function: Any, *parts: Any) -> Any:
+    """A function whose place on disk is its own: closures of one name would share an index."""
+    text = "\n".join(str(getattr(one, "identity", one)) for one in parts)
+    function.__qualname__ += "_" + hashlib.sha256(text.encode()).hexdigest()[:12]
+    return function
 
 
 class Outside(types.ExternalFunction):

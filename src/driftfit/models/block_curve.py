@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.kernel import Array, core, kernel
+from driftfit.kernel import Array, core, named, part
 from driftfit.models.block_memory import (
     BEFORE,
     BEND,
@@ -62,7 +62,7 @@ WIDE = 10.0
 """Times as wide as needed: a grid that was laid for an absurd first output is laid anew."""
 
 
-@kernel
+@part
 def believe(m: Array, y: float) -> None:
     """Take an output into the range of those seen."""
     one, other = m[BEFORE, 0], m[EARLIER, 0]
@@ -77,7 +77,7 @@ def believe(m: Array, y: float) -> None:
     m[LOWEST, 0], m[HIGHEST, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y)
 
 
-@kernel
+@part
 def level(m: Array, p: Places, at: int, i: int) -> Any:
     """sum_k d_k times row i of the table at ``at``: the level (CURVE) or its slope (BEND) at a point of the grid."""
     n_out, d = p[N_OUT], p[D_NOW]
@@ -88,7 +88,7 @@ def level(m: Array, p: Places, at: int, i: int) -> Any:
     return total
 
 
-@kernel
+@part
 def beneath(m: Array, p: Places, at: int, apart: int, right: float) -> int:
     """How many of the levels 1 to 7, so many points apart, are not above ``right``, where levels rise.
 
@@ -156,7 +156,7 @@ def on_envelope(m: Array, p: Places, right: float) -> float:
     return float(m[LOW, 0] + m[STEP, 0] * (below + (right - before) / (after - before)))
 
 
-@kernel
+@part
 def rises(m: Array, p: Places) -> bool:
     """Whether the output block with the present d increases along the grid."""
     d, seen, reach = p[D_NOW], p[D_SEEN], p[REACH]
@@ -168,7 +168,7 @@ def rises(m: Array, p: Places) -> bool:
     return bool(m[RISING, 0] > 0.0)
 
 
-@kernel
+@part
 def cubic(share: float, mean: float, first: float, last: float) -> float:
     """Where in a cell, 0 to 1, a share of its rise is reached: mean slope, and slopes at both ends."""
     one = min(mean / first, 3.0) if first > 0.0 else 3.0
@@ -181,7 +181,6 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
 def inverse_of(values: Any) -> Any:
     """A kernel (m, p, right) that inverts the output block, from one that fills trial and trial_bend."""
 
-    @kernel
     def invert(m: Array, p: Places, right: float) -> Any:
         step, start = m[STEP, 0], m[LOW, 0]
         if not (step > 0.0 and abs(right) < LARGEST):
@@ -218,14 +217,13 @@ def inverse_of(values: Any) -> Any:
                 break
         return y
 
-    return invert
+    return part(named(invert, values))
 
 
 @lru_cache
 def laying(values: Any) -> Any:
     """A kernel (m, p) that lays the grid anew where the outputs believed need another."""
 
-    @kernel
     def lay(m: Array, p: Places) -> None:
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
         start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
@@ -249,4 +247,4 @@ def laying(values: Any) -> Any:
                     m[bend + i * n_out + k, 0] = m[h + k, 0]
             m[p[REACH], 0] = np.inf
 
-    return lay
+    return part(named(lay, values))

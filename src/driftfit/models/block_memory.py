@@ -41,7 +41,8 @@ where the arrays begin.
 """
 
 
-Places = tuple[int, ...]
+Places = Array
+"""Whole numbers (26,), a constant to the compiler."""
 
 
 def _arrays(structure: Structure, nk: int, into: Array, out: Array) -> dict[int, Array]:
@@ -58,7 +59,9 @@ def _arrays(structure: Structure, nk: int, into: Array, out: Array) -> dict[int,
     }  # fmt: skip
 
 
-def places_of(structure: Structure, nk: int, into: Array, out: Array, identity: bool, adaptive: bool) -> Places:
+def places_of(
+    structure: Structure, nk: int, into: Array, out: Array, identity: bool, adaptive: bool
+) -> tuple[int, ...]:
     """Orders and beginnings; ``into`` and ``out`` are the numbers of the bases."""
     arrays = _arrays(structure, nk, into, out)
     ends = np.cumsum([HEAD, *(array.size for array in arrays.values())])

@@ -38,7 +38,7 @@ from driftfit.drivers import LARGEST, ModelSteps
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
-from driftfit.models.block_memory import Places, memory, places_of
+from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
 from driftfit.models.hammerstein_wiener_steps import build
 from driftfit.settings import numbers, whole
@@ -145,7 +145,7 @@ class HammersteinWiener(Model):
         return {"blocks": memory(self.structure, self.nk, *bases, self.out.limits, self.output_noise)}
 
     @property
-    def places(self) -> Places:
+    def places(self) -> tuple[int, ...]:
         """Where everything stands in the memory of the steps."""
         bases = self.into.parameters, self.out.parameters
         return places_of(self.structure, self.nk, *bases, self.linear, self.into.adaptive)

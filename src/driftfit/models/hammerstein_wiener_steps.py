@@ -13,13 +13,12 @@ driver. With orders at run time one machine would do for all models, but took th
 from __future__ import annotations
 
 from functools import lru_cache
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, core, floats, kernel, outside
+from driftfit.kernel import Array, State, core, floats, kernel, named, outside, part
 from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverse_of, laying
 from driftfit.models.block_memory import (
@@ -72,8 +71,7 @@ FLOOR = 1e-4
 def values_of(evaluate: Any, numbers: int, following: int, count: int, at: int, slopes: int) -> Any:
     """A kernel (m, p, x) that fills two arrays of the memory with the functions of a block at x, and their slopes."""
 
-    @kernel
-    def values(m: Array, p: Places, x: float) -> None:
+    def fill_values(m: Array, p: Places, x: float) -> None:
         own, L = p[numbers], m.shape[1]
         base, size = m.ctypes.data, 8 * L
         evaluate(
@@ -81,10 +79,10 @@ def values_of(evaluate: Any, numbers: int, following: int, count: int, at: int, 
             p[count], L,
         )  # fmt: skip
 
+    values = part(named(fill_values, evaluate, at))
     if evaluate is not built_in:
         return values
 
-    @kernel
     def powers_first(m: Array, p: Places, x: float) -> None:
         if m[p[numbers], 0] != POWERS:
             values(m, p, x)
@@ -96,7 +94,7 @@ def values_of(evaluate: Any, numbers: int, following: int, count: int, at: int, 
                 power = power * x
                 m[out + i, 0] = power
 
-    return powers_first
+    return part(named(powers_first, evaluate, at))
 
 
 def input_values(evaluate: Any) -> Any:
@@ -114,7 +112,7 @@ def trial_values(evaluate: Any) -> Any:
     return values_of(evaluate, OUT, CURVE, N_OUT, TRIAL, TRIAL_BEND)
 
 
-@kernel
+@part
 def push_in(m: Array, at: int, count: int, x: float) -> None:
     """A number before those of an array, whose last one is dropped."""
     for i in range(at, at + count):
@@ -123,7 +121,7 @@ def push_in(m: Array, at: int, count: int, x: float) -> None:
         x = after
 
 
-@kernel
+@part
 def past(m: Array, p: Places, theta: Array, phi: Array) -> float:
     """-(phi' theta) without the columns of the present output; also fills d_now."""
     at_d, n, others, d = p[NA] + p[NB], p[N], p[N_OUT] - 1, p[D_NOW]
@@ -190,7 +188,7 @@ def forget(m: Array, p: Places) -> None:
         m[i, 0] = np.nan
 
 
-@kernel
+@part
 def fill(m: Array, p: Places, phi: Array) -> None:
     """phi from the lags, but for the columns of the present output."""
     na, nb, nk, n_in, n_out = p[NA], p[NB], p[NK], p[N_IN], p[N_OUT]
@@ -239,21 +237,13 @@ def thresholds(m: Array, p: Places, theta: Array) -> None:
             m[into + 1 + k, 0] = min(max(threshold, bottom), top)
 
 
-def named(function: Any, *parts: Any) -> Any:
-    """A machine whose place on disk is its own: closures of one name would share an index."""
-    text = "\n".join(str(getattr(part, "identity", part)) for part in parts)
-    function.__qualname__ += "_" + sha256(text.encode()).hexdigest()[:12]
-    return outside(function)
-
-
 @lru_cache
-def _regress(into: Any, out: Any, p: Places, lanes: bool) -> Any:
-    """The machine of ``regress`` for the functions of both bases."""
+def _regress_work(into: Any, out: Any) -> Any:
+    """What ``regress`` does, for the functions of both bases."""
     input_at, output_at = input_values(into), output_values(out)
     invert = inverse_of(trial_values(out))
 
-    @kernel
-    def work(m: Array, p: Places, theta: Array, phi: Array) -> None:
+    def regress_work(m: Array, p: Places, theta: Array, phi: Array) -> None:
         n_in, n_out, depth = p[N_IN], p[N_OUT], p[NB] + p[NK]
         f_lag, f_now, u_past = p[F_LAG], p[F_NOW], p[U_PAST]
         if m[DT, 0] > GAP:
@@ -293,20 +283,27 @@ def _regress(into: Any, out: Any, p: Places, lanes: bool) -> Any:
         m[Y, 0] = -m[g, 0] if seen else np.nan
         m[DT, 0] = m[DT, 0] if m[STARTED, 0] > 0.0 else 0.0
 
-    def machine_regress(blocks: int, theta: int, phi: int, L: int) -> None:
-        stride = L if lanes else 1  # which the compiler knows
-        work(floats(blocks, 1, stride), p, floats(theta, 1, stride), floats(phi, 1, stride))
-
-    return named(machine_regress, lanes, p, into, out)
+    return part(named(regress_work, into, out))
 
 
 @lru_cache
-def _push(out: Any, p: Places, lanes: bool) -> Any:
-    """The machine of ``push``: the present output among the lags (missing stays missing), thresholds, the grid."""
+def _regress(into: Any, out: Any, p: tuple[int, ...], lanes: bool) -> Any:
+    """The machine of ``regress``."""
+    work, orders = _regress_work(into, out), np.array(p)
+
+    def machine_regress(blocks: int, theta: int, phi: int, L: int) -> None:
+        stride = L if lanes else 1  # which the compiler knows
+        work(floats(blocks, 1, stride), orders, floats(theta, 1, stride), floats(phi, 1, stride))
+
+    return outside(named(machine_regress, lanes, p, into, out))
+
+
+@lru_cache
+def _push_work(out: Any) -> Any:
+    """What ``push`` does: the present output among the lags (missing stays missing), thresholds, the grid."""
     lay = laying(trial_values(out))
 
-    @kernel
-    def work(m: Array, p: Places, theta: Array) -> None:
+    def push_work(m: Array, p: Places, theta: Array) -> None:
         lags, n_out, now, late = max(p[NA], 1), p[N_OUT], p[G_NOW], p[G_LAG]
         seen = m[SEEN, 0] > 0.0
         for k in range(n_out):
@@ -320,15 +317,23 @@ def _push(out: Any, p: Places, lanes: bool) -> Any:
         if p[IDENTITY] == 0:
             lay(m, p)
 
-    def machine_push(blocks: int, theta: int, L: int) -> None:
-        stride = L if lanes else 1
-        work(floats(blocks, 1, stride), p, floats(theta, 1, stride))
-
-    return named(machine_push, lanes, p, out)
+    return part(named(push_work, out))
 
 
 @lru_cache
-def build(into: Any, out: Any, p: Places) -> ModelSteps:
+def _push(out: Any, p: tuple[int, ...], lanes: bool) -> Any:
+    """The machine of ``push``."""
+    work, orders = _push_work(out), np.array(p)
+
+    def machine_push(blocks: int, theta: int, L: int) -> None:
+        stride = L if lanes else 1
+        work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
+
+    return outside(named(machine_push, lanes, p, out))
+
+
+@lru_cache
+def build(into: Any, out: Any, p: tuple[int, ...]) -> ModelSteps:
     """The steps for the machines of two bases."""
     regress_one, push_one = _regress(into, out, p, False), _push(out, p, False)
     regress_lane, push_lane = _regress(into, out, p, True), _push(out, p, True)

@@ -57,7 +57,7 @@ def _steps(machine: Any) -> TrackerSteps:
         machine(
             s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data,
             s.w.ctypes.data, s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
-            s.theta.shape[0],
+            s.theta.shape[0], s.phi.shape[0],
         )  # fmt: skip
         s.valid[l], s.seen[l], s.ok[l] = s.own[VALID, l], s.own[SEEN, l], s.own[OK, l]
         s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.kernel import Array, core, floats
+from driftfit.kernel import Array, core, floats, named, outside
 from driftfit.models.block_curve import inverse_of, level, rises
 from driftfit.models.block_memory import (
     CURVE,
@@ -38,7 +38,7 @@ from driftfit.models.block_memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.hammerstein_wiener_steps import named, trial_values
+from driftfit.models.hammerstein_wiener_steps import trial_values
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -183,22 +183,17 @@ def hold(m: Array, p: Places, w: Array) -> None:
 
 
 @lru_cache
-def output_error(out: Any, p: Places) -> Any:
-    """The machine for the functions of an output basis and the places of a model."""
+def _work(out: Any) -> Any:
+    """One sample, for the functions of an output basis."""
     trial = trial_values(out)
     invert = inverse_of(trial)
 
-    def machine_output_error(
-        blocks: int, at_theta: int, at_phi: int, at_q: int, at_w: int, at_S: int, scratch: int,
-        numbers: int, at_P: int, n_x: int,
+    def output_error_work(
+        m: Array, p: Places, own: Array, theta: Array, phi: Array, q: Array, w: Array, S: Array, P: Array, row: Array,
+        moved: Array,
     ) -> None:  # fmt: skip
-        m, own = floats(blocks, 1, 1), floats(numbers, 1, SIZE)[0]
         na, nb, n_in, n_out, d = p[NA], p[NB], p[N_IN], p[N_OUT], p[D_NOW]
-        n_w = max(na, 1)
-        N = n_w + n_x
-        theta, phi, q = floats(at_theta, 1, n_x)[0], floats(at_phi, 1, 1)[0], floats(at_q, n_x, n_x)
-        w, S, P = floats(at_w, 1, n_w)[0], floats(at_S, N, N), floats(at_P, n_x, n_x)
-        row, moved = floats(scratch, 2, N)[0], floats(scratch, 2, N)[1]
+        n_w, n_x = len(w), len(theta)
         for i in range(n_x):
             for j in range(n_x):
                 S[n_w + i, n_w + j] += q[i, j] * own[TIME]
@@ -230,4 +225,23 @@ def output_error(out: Any, p: Places) -> Any:
             for j in range(i + 1):
                 P[i, j] = S[n_w + i, n_w + j]
 
-    return named(machine_output_error, p, out)
+    return core(named(output_error_work, out))
+
+
+@lru_cache
+def output_error(out: Any, p: tuple[int, ...]) -> Any:
+    """The machine for the functions of an output basis and the places of a model."""
+    work, orders = _work(out), np.array(p)
+
+    def machine_output_error(
+        blocks: int, theta: int, phi: int, q: int, w: int, S: int, scratch: int, own: int, P: int, n_x: int, n: int,
+    ) -> None:  # fmt: skip
+        n_w = max(orders[NA], 1)
+        N = n_w + n_x
+        work(
+            floats(blocks, 1, 1), orders, floats(own, 1, SIZE)[0], floats(theta, 1, n_x)[0], floats(phi, 1, n)[0],
+            floats(q, n_x, n_x), floats(w, 1, n_w)[0], floats(S, N, N), floats(P, n_x, n_x), floats(scratch, 2, N)[0],
+            floats(scratch, 2, N)[1],
+        )  # fmt: skip
+
+    return outside(named(machine_output_error, p, out))
