@@ -178,8 +178,8 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
 
 
 @lru_cache
-def inverse_of(values: Any) -> Any:
-    """A kernel (m, p, right) that inverts the output block, from one that fills trial and trial_bend."""
+def inverse_of(level_at: Any) -> Any:
+    """A part (m, p, right) that inverts the output block, from one that says level and slope at a y."""
 
     def invert(m: Array, p: Places, right: float) -> Any:
         step, start = m[STEP, 0], m[LOW, 0]
@@ -202,13 +202,8 @@ def inverse_of(values: Any) -> Any:
         first, final = level(m, p, bends, below), level(m, p, bends, below + 1)
         left = start + below * step
         y = left + step * cubic((right - before) / rise, rise / step, first, final)
-        n_out, d, g, h = p[N_OUT], p[D_NOW], p[TRIAL], p[TRIAL_BEND]
         for _ in range(STEPS):
-            values(m, p, y)
-            value, slope = m[g, 0], m[h, 0]
-            for k in range(1, n_out):
-                value += m[d + k, 0] * m[g + k, 0]
-                slope += m[d + k, 0] * m[h + k, 0]
+            value, slope = level_at(m, p, y)
             if not slope > 0.0:
                 break
             change = (right - value) / slope
@@ -217,12 +212,12 @@ def inverse_of(values: Any) -> Any:
                 break
         return y
 
-    return part(named(invert, values))
+    return part(named(invert, level_at))
 
 
 @lru_cache
 def laying(values: Any) -> Any:
-    """A kernel (m, p) that lays the grid anew where the outputs believed need another."""
+    """A part (m, p) that lays the grid anew where the outputs believed need another."""
 
     def lay(m: Array, p: Places) -> None:
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
@@ -241,7 +236,7 @@ def laying(values: Any) -> Any:
             start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])
             m[LOW, 0], m[STEP, 0] = start, (end - start) / (GRID - 1)
             for i in range(GRID):
-                values(m, p, min(start + i * m[STEP, 0], end))
+                values(m, p, min(start + i * m[STEP, 0], end), g, h)
                 for k in range(n_out):
                     m[curve + i * n_out + k, 0] = m[g + k, 0]
                     m[bend + i * n_out + k, 0] = m[h + k, 0]

@@ -4,10 +4,10 @@ The field ``blocks`` (size, L) begins with the numbers named below. `places_of` 
 begin. The machines behind the steps get the address of ``blocks`` for one lane, element i of which stands L numbers
 after element i - 1; the places are constants to them, so that their loops unroll.
 
-    f_lag   (n_in, nb + nk)   functions of the inputs t, t - 1, ..; the inputs themselves in u_past (nb + nk)
-    g_lag   (n_out, na)       functions of the outputs t - 1, ..; their slopes in h_lag
-    f_now, g_now, h_now       of the present sample, and slopes; d_now, coefficients (1, d_2 ..) before the sample
-    trial, trial_bend         of a y that is tried
+    f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, ..; the inputs themselves in u_past (nb + nk)
+    g_past  (1 + na, n_out)   functions of the outputs t, t - 1, ..; their slopes in h_past
+    d_now   (n_out)           coefficients (1, d_2 ..) before the sample
+    trial, trial_bend         functions and slopes at a y that is tried; spare, slopes that nobody needs
     into, out                 the numbers of the bases
     curve, bend (GRID, n_out) functions of the output block, and slopes, on the grid; level (GRID)
     d_seen, reach (n_out)     coefficients for which the grid was found to rise, and how far it is safe to be from them
@@ -33,27 +33,26 @@ range of medians of three, and what steps tell the machine and hear from it; HEA
 """
 
 (
-    NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, F_LAG, U_PAST, G_LAG, H_LAG, F_NOW, SPARE, G_NOW, H_NOW, D_NOW,
-    TRIAL, TRIAL_BEND, INTO, OUT, CURVE, BEND, LEVEL, D_SEEN, REACH,
-) = range(26)  # fmt: skip
+    NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, F_PAST, U_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
+    TRIAL_BEND, INTO, OUT, CURVE, BEND, LEVEL, D_SEEN, REACH,
+) = range(23)  # fmt: skip
 """Places: orders, whether the output block is the identity and the input basis depends on its own coefficients, and
 where the arrays begin.
 """
 
 
 Places = Array
-"""Whole numbers (26,), a constant to the compiler."""
+"""Whole numbers (23,), a constant to the compiler."""
 
 
 def _arrays(structure: Structure, nk: int, into: Array, out: Array) -> dict[int, Array]:
     """The arrays before the first sample, in their order."""
     na, nb, n_in, n_out, _ = structure
-    lags = max(na, 1)
+    outputs = np.full((1 + max(na, 1)) * n_out, np.nan)
     return {
-        F_LAG: np.full(n_in * (nb + nk), np.nan), U_PAST: np.full(nb + nk, np.nan),
-        G_LAG: np.full(n_out * lags, np.nan), H_LAG: np.full(n_out * lags, np.nan),
-        F_NOW: np.zeros(n_in), SPARE: np.zeros(n_in), G_NOW: np.zeros(n_out), H_NOW: np.zeros(n_out),
-        D_NOW: np.eye(1, n_out)[0], TRIAL: np.zeros(n_out), TRIAL_BEND: np.zeros(n_out), INTO: into, OUT: out,
+        F_PAST: np.full(n_in * (nb + nk), np.nan), U_PAST: np.full(nb + nk, np.nan), G_PAST: outputs, H_PAST: outputs,
+        SPARE: np.zeros(n_in), D_NOW: np.eye(1, n_out)[0], TRIAL: np.zeros(n_out), TRIAL_BEND: np.zeros(n_out),
+        INTO: into, OUT: out,
         CURVE: np.zeros(GRID * n_out), BEND: np.zeros(GRID * n_out), LEVEL: np.zeros(GRID), D_SEEN: np.zeros(n_out),
         REACH: np.full(n_out, np.inf),
     }  # fmt: skip

@@ -186,9 +186,11 @@ class HammersteinWiener(Model):
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
         for what, basis, data in (("u", self.into, u[:, 0]), ("y", self.out, y)):
-            seen = data[np.abs(data) < LARGEST]
+            if basis.n == 1 and not np.isfinite(basis.expected).any():
+                continue
+            seen = data if abs(data.sum()) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
             low, high = basis.expected
-            outside = int(np.sum((seen < low) | (seen > high)))
+            outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
                 warnings.warn(
@@ -197,7 +199,7 @@ class HammersteinWiener(Model):
                     UserWarning,
                     stacklevel=4,
                 )
-            size = float(np.sqrt(np.mean(seen * seen))) if seen.size else 0.0
+            size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
                 warnings.warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "

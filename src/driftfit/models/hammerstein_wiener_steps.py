@@ -26,14 +26,11 @@ from driftfit.models.block_memory import (
     CURVE,
     D_NOW,
     DT,
-    F_LAG,
-    F_NOW,
+    F_PAST,
     FACTOR,
-    G_LAG,
-    G_NOW,
+    G_PAST,
     GIVEN,
-    H_LAG,
-    H_NOW,
+    H_PAST,
     IDENTITY,
     INTO,
     MINIMAL,
@@ -68,57 +65,77 @@ FLOOR = 1e-4
 
 
 @lru_cache
-def values_of(evaluate: Any, numbers: int, following: int, count: int, at: int, slopes: int) -> Any:
-    """A kernel (m, p, x) that fills two arrays of the memory with the functions of a block at x, and their slopes."""
+def values_of(evaluate: Any, numbers: int, following: int, count: int) -> Any:
+    """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes."""
 
-    def fill_values(m: Array, p: Places, x: float) -> None:
+    def values(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
         own, L = p[numbers], m.shape[1]
         base, size = m.ctypes.data, 8 * L
-        evaluate(
-            x, base + size * own, p[following] - own, base + size * p[at], base + size * p[slopes],
-            p[count], L,
-        )  # fmt: skip
+        evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
 
-    values = part(named(fill_values, evaluate, at))
+    found = part(named(values, evaluate, numbers))
     if evaluate is not built_in:
-        return values
+        return found
 
-    def powers_first(m: Array, p: Places, x: float) -> None:
+    def powers_first(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
         if m[p[numbers], 0] != POWERS:
-            values(m, p, x)
+            found(m, p, x, at, slopes)
         else:
-            out, bend, power, k = p[at], p[slopes], 1.0, 0.0
+            power, k = 1.0, 0.0
             for i in range(p[count]):
                 k += 1.0
-                m[bend + i, 0] = k * power
+                m[slopes + i, 0] = k * power
                 power = power * x
-                m[out + i, 0] = power
+                m[at + i, 0] = power
 
-    return part(named(powers_first, evaluate, at))
+    return part(named(powers_first, evaluate, numbers))
 
 
 def input_values(evaluate: Any) -> Any:
-    """f_now at an input."""
-    return values_of(evaluate, INTO, OUT, N_IN, F_NOW, SPARE)
+    """Those of the input block."""
+    return values_of(evaluate, INTO, OUT, N_IN)
 
 
 def output_values(evaluate: Any) -> Any:
-    """g_now and h_now at an output."""
-    return values_of(evaluate, OUT, CURVE, N_OUT, G_NOW, H_NOW)
+    """Those of the output block."""
+    return values_of(evaluate, OUT, CURVE, N_OUT)
 
 
-def trial_values(evaluate: Any) -> Any:
-    """trial and trial_bend at an output."""
-    return values_of(evaluate, OUT, CURVE, N_OUT, TRIAL, TRIAL_BEND)
+@lru_cache
+def level_of(evaluate: Any) -> Any:
+    """A part (m, p, y) that says the level of the output block at y, and its slope; it fills trial and trial_bend."""
+    fill_trial = output_values(evaluate)
+
+    def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:
+        n_out, d, g, h = p[N_OUT], p[D_NOW], p[TRIAL], p[TRIAL_BEND]
+        fill_trial(m, p, y, g, h)
+        value, slope = m[g, 0], m[h, 0]
+        for k in range(1, n_out):
+            value += m[d + k, 0] * m[g + k, 0]
+            slope += m[d + k, 0] * m[h + k, 0]
+        return value, slope
+
+    found = part(named(at_output, evaluate))
+    if evaluate is not built_in:
+        return found
+
+    def horner_first(m: Array, p: Places, y: float) -> tuple[float, float]:
+        if m[p[OUT], 0] != POWERS:
+            return found(m, p, y)  # type: ignore[no-any-return]
+        value, slope = 0.0, 0.0
+        for k in range(p[N_OUT] - 1, -1, -1):
+            slope = slope * y + value
+            value = value * y + (m[p[D_NOW] + k, 0] if k > 0 else 1.0)
+        return value * y, slope * y + value
+
+    return part(named(horner_first, evaluate))
 
 
 @part
-def push_in(m: Array, at: int, count: int, x: float) -> None:
-    """A number before those of an array, whose last one is dropped."""
-    for i in range(at, at + count):
-        after = m[i, 0]
-        m[i, 0] = x
-        x = after
+def shift(m: Array, at: int, width: int, rows: int) -> None:
+    """Every row of an array to the place of the next."""
+    for i in range(at + width * rows - 1, at + width - 1, -1):
+        m[i, 0] = m[i - width, 0]
 
 
 @part
@@ -168,13 +185,12 @@ def minimal_past(m: Array, p: Places, theta: Array, phi: Array) -> float:
 @core
 def noise_factor(m: Array, p: Places, theta: Array) -> float:
     """sigma^2 sum_i a_i^2 F'(y_(t-i))^2 + floor, a_0 = 1, from the estimates before the sample."""
-    na, n_out, d, now, late = p[NA], p[N_OUT], p[D_NOW], p[H_NOW], p[H_LAG]
-    lags = max(na, 1)
+    n_out, d = p[N_OUT], p[D_NOW]
     total = 0.0
-    for i in range(na + 1):
+    for i in range(p[NA] + 1):
         slope = 0.0
         for k in range(n_out):
-            slope += m[d + k, 0] * (m[now + k, 0] if i == 0 else m[late + k * lags + i - 1, 0])
+            slope += m[d + k, 0] * m[p[H_PAST] + i * n_out + k, 0]
         weight = 1.0 if i == 0 else theta[i - 1, 0]
         total += weight * weight * slope * slope
     factor = m[VARIANCE, 0] * total + FLOOR
@@ -184,29 +200,24 @@ def noise_factor(m: Array, p: Places, theta: Array) -> float:
 @core
 def forget(m: Array, p: Places) -> None:
     """All lags are missing."""
-    for i in range(p[F_LAG], p[F_NOW]):
+    for i in range(p[F_PAST], p[SPARE]):
         m[i, 0] = np.nan
 
 
 @part
 def fill(m: Array, p: Places, phi: Array) -> None:
     """phi from the lags, but for the columns of the present output."""
-    na, nb, nk, n_in, n_out = p[NA], p[NB], p[NK], p[N_IN], p[N_OUT]
-    depth, lags, g = nb + nk, max(na, 1), p[G_LAG]
-    f, at = p[F_LAG] + nk, na
+    na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
+    f, g, at = p[F_PAST] + p[NK] * n_in, p[G_PAST] + n_out, na
     for k in range(n_in):
         for j in range(nb):
-            phi[at + j, 0] = -m[f + j, 0]
+            phi[at + j, 0] = -m[f + j * n_in + k, 0]
         at = at + nb + n_out - 1 if k == 0 else at + nb
-        f += depth
-    for i in range(na):
-        phi[i, 0] = m[g + i, 0]
-    for _ in range(n_out - 1):
-        g += lags
+    for k in range(n_out):
+        start = 0 if k == 0 else at + (k - 1) * na
         for i in range(na):
-            phi[at + i, 0] = m[g + i, 0]
-        at += na
-    for i in range(at, p[N]):
+            phi[start + i, 0] = m[g + i * n_out + k, 0]
+    for i in range(at + (n_out - 1) * na, p[N]):
         phi[i, 0] = 1.0
 
 
@@ -241,31 +252,29 @@ def thresholds(m: Array, p: Places, theta: Array) -> None:
 def _regress_work(into: Any, out: Any) -> Any:
     """What ``regress`` does, for the functions of both bases."""
     input_at, output_at = input_values(into), output_values(out)
-    invert = inverse_of(trial_values(out))
+    invert = inverse_of(level_of(out))
 
     def regress_work(m: Array, p: Places, theta: Array, phi: Array) -> None:
         n_in, n_out, depth = p[N_IN], p[N_OUT], p[NB] + p[NK]
-        f_lag, f_now, u_past = p[F_LAG], p[F_NOW], p[U_PAST]
+        f, g, h, spare, u_past = p[F_PAST], p[G_PAST], p[H_PAST], p[SPARE], p[U_PAST]
         if m[DT, 0] > GAP:
             forget(m, p)
         if p[ADAPTIVE] > 0:
-            push_in(m, u_past, depth, m[U, 0])
+            shift(m, u_past, 1, depth)
+            m[u_past, 0] = m[U, 0]
             for j in range(depth):
-                input_at(m, p, m[u_past + j, 0])
-                for k in range(n_in):
-                    m[f_lag + k * depth + j, 0] = m[f_now + k, 0]
+                input_at(m, p, m[u_past + j, 0], f + j * n_in, spare)
         else:
-            input_at(m, p, m[U, 0])
-            for k in range(n_in):
-                push_in(m, f_lag + k * depth, depth, m[f_now + k, 0])
+            shift(m, f, n_in, depth)
+            input_at(m, p, m[U, 0], f, spare)
         fill(m, p, phi)
         if m[STARTED, 0] == 0.0 and complete(p, phi):
             m[STARTED, 0] = 1.0
         right = minimal_past(m, p, theta, phi) if m[MINIMAL, 0] > 0.0 else past(m, p, theta, phi)
-        y, g, at_d = m[Y, 0], p[G_NOW], p[NA] + p[NB]
+        y, at_d = m[Y, 0], p[NA] + p[NB]
         seen = abs(y) < LARGEST
         if seen:  # before the prediction, which nothing waits for then
-            output_at(m, p, y)
+            output_at(m, p, y, g, h)
             for k in range(n_out):
                 seen = seen and abs(m[g + k, 0]) < LARGEST
                 if k > 0:
@@ -276,7 +285,7 @@ def _regress_work(into: Any, out: Any) -> Any:
         predicted = right if p[IDENTITY] > 0 else invert(m, p, right)
         m[PREDICTED, 0] = predicted
         if not abs(y) < LARGEST:
-            output_at(m, p, predicted)
+            output_at(m, p, predicted, g, h)
             for k in range(1, n_out):
                 phi[at_d + k - 1, 0] = m[g + k, 0]
         m[FACTOR, 0] = noise_factor(m, p, theta) if m[VARIANCE, 0] > 0.0 else 1.0
@@ -301,17 +310,16 @@ def _regress(into: Any, out: Any, p: tuple[int, ...], lanes: bool) -> Any:
 @lru_cache
 def _push_work(out: Any) -> Any:
     """What ``push`` does: the present output among the lags (missing stays missing), thresholds, the grid."""
-    lay = laying(trial_values(out))
+    lay = laying(output_values(out))
 
     def push_work(m: Array, p: Places, theta: Array) -> None:
-        lags, n_out, now, late = max(p[NA], 1), p[N_OUT], p[G_NOW], p[G_LAG]
-        seen = m[SEEN, 0] > 0.0
-        for k in range(n_out):
-            push_in(m, late + k * lags, lags, m[now + k, 0] if seen else np.nan)
-        if m[VARIANCE, 0] > 0.0:
-            now, late = p[H_NOW], p[H_LAG]
+        rows, n_out, g = 1 + max(p[NA], 1), p[N_OUT], p[G_PAST]
+        if not m[SEEN, 0] > 0.0:
             for k in range(n_out):
-                push_in(m, late + k * lags, lags, m[now + k, 0])
+                m[g + k, 0] = np.nan
+        shift(m, g, n_out, rows)
+        if m[VARIANCE, 0] > 0.0:
+            shift(m, p[H_PAST], n_out, rows)
         if p[ADAPTIVE] > 0 and m[OK, 0] > 0.0:
             thresholds(m, p, theta)
         if p[IDENTITY] == 0:

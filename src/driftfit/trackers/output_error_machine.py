@@ -18,8 +18,8 @@ from driftfit.models.block_curve import inverse_of, level, rises
 from driftfit.models.block_memory import (
     CURVE,
     D_NOW,
-    F_LAG,
-    G_LAG,
+    F_PAST,
+    G_PAST,
     GIVEN,
     GRID,
     HIGHEST,
@@ -38,7 +38,7 @@ from driftfit.models.block_memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.hammerstein_wiener_steps import trial_values
+from driftfit.models.hammerstein_wiener_steps import level_of, output_values
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -56,12 +56,11 @@ TIME, R, Q_W, P_W, V_POWER, BEGUN, VALID, SEEN, OK, E, S2, SIZE = range(12)
 @core
 def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
     """w = F(y) at the last outputs, each of variance p_w."""
-    na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_LAG]
-    lags = max(na, 1)
+    na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_PAST]
     for i in range(na):
-        total = m[g + i, 0]
+        total = m[g + (i + 1) * n_out, 0]
         for k in range(1, n_out):
-            total += m[d + k, 0] * m[g + k * lags + i, 0]
+            total += m[d + k, 0] * m[g + (i + 1) * n_out + k, 0]
         w[i] = total if total == total else 0.0
         S[i, i] = p_w
 
@@ -151,21 +150,21 @@ def absorb(
 @core
 def inputs_known(m: Array, p: Places) -> bool:
     """Whether all inputs that the linear block needs are there."""
-    nb, nk = p[NB], p[NK]
+    nb, nk, n_in = p[NB], p[NK], p[N_IN]
     missing = 0
-    for k in range(p[N_IN]):
+    for k in range(n_in):
         for j in range(nb):
-            missing += 0 if abs(m[p[F_LAG] + k * (nb + nk) + nk + j, 0]) < LARGEST else 1
+            missing += 0 if abs(m[p[F_PAST] + (nk + j) * n_in + k, 0]) < LARGEST else 1
     return missing == 0
 
 
 @core
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     """The usual power of v, which stands for inputs that are missing."""
-    na, nb, depth = p[NA], p[NB], p[NB] + p[NK]
-    v = m[p[F_LAG], 0]
+    na, nb, f = p[NA], p[NB], p[F_PAST]
+    v = m[f, 0]
     for k in range(1, p[N_IN]):
-        v += theta[na + nb + k - 1] * m[p[F_LAG] + k * depth, 0]
+        v += theta[na + nb + k - 1] * m[f + k, 0]
     own[V_POWER] += 0.01 * (v * v - own[V_POWER]) if abs(v) < 1e6 else 0.0
 
 
@@ -185,8 +184,7 @@ def hold(m: Array, p: Places, w: Array) -> None:
 @lru_cache
 def _work(out: Any) -> Any:
     """One sample, for the functions of an output basis."""
-    trial = trial_values(out)
-    invert = inverse_of(trial)
+    fill_trial, invert = output_values(out), inverse_of(level_of(out))
 
     def output_error_work(
         m: Array, p: Places, own: Array, theta: Array, phi: Array, q: Array, w: Array, S: Array, P: Array, row: Array,
@@ -209,7 +207,7 @@ def _work(out: Any) -> Any:
         hold(m, p, w)
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
-        trial(m, p, y_hat if able else 0.0)
+        fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])
         slope = 0.0
         for k in range(n_out):
             slope += m[d + k, 0] * m[p[TRIAL_BEND] + k, 0]
