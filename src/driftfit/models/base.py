@@ -77,3 +77,15 @@ class Model(Settings, ABC):
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
         response: Array = np.eye(1, h)[0]
         return response
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """Slope against y of what the model is fitted to, at outputs y (...): what turns its errors into those of y."""
+        return np.ones(np.shape(y))
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """By what the noise variance of a tracker is multiplied at an output."""
+        return 1.0
+
+    def follows(self, other: Model) -> bool:
+        """Whether the memory of the other model is that of this one, so that a run can go on from it."""
+        return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)

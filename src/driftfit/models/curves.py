@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
@@ -98,6 +98,14 @@ class Basis(Settings, ABC):
         out, slopes = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
         shape = (*points.shape, self.n)
         return out.reshape(shape), slopes.reshape(shape)
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        """The basis from its numbers one after the other, as on the command line."""
+        try:
+            return cls(*words)
+        except TypeError:
+            raise ValueError(f"{cls.__name__}: {len(words)} numbers were given, {words!r}; that is too many.") from None
 
     def plain(self) -> dict[str, Any]:
         """The basis as plain data; see `basis_of`."""

@@ -40,7 +40,7 @@ from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
 from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
-from driftfit.models.hammerstein_wiener_steps import build
+from driftfit.models.hammerstein_wiener_steps import FLOOR, build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -182,6 +182,29 @@ class HammersteinWiener(Model):
         with np.errstate(invalid="ignore"):
             found: Array = np.log(np.maximum(self.slope(theta, y), FLATTEST))
         return found
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of w to one equation error: that of 1 / A(z)."""
+        response: Array = np.eye(1, h)[0]
+        for t in range(1, h):
+            lags = response[max(t - self.na, 0) : t][::-1]
+            response[t] = -theta[: len(lags)] @ lags
+        return response
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """F'(y), at least 1e-3: an equation error moves y by its reciprocal."""
+        found: Array = np.maximum(self.slope(theta, y), FLATTEST)
+        return found
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """1, or sigma^2 (1 + sum_i a_i^2) F'(y)^2 + 1e-4 under ``output_noise``."""
+        if self.output_noise is None:
+            return 1.0
+        energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + FLOOR)
+
+    def follows(self, other: Model) -> bool:
+        return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""

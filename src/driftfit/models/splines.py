@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -36,6 +36,10 @@ class PiecewiseLinear(Basis):
     knots: Any
 
     code: ClassVar[int] = curve_kernels.HINGES
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words)
 
     def __post_init__(self) -> None:
         self._set("knots", knots_of("PiecewiseLinear", self.knots, 1))
@@ -65,6 +69,10 @@ class BSpline(Basis):
     anchor: float = 0.0
 
     code: ClassVar[int] = curve_kernels.SPLINES
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words[0], words[1:])
 
     def __post_init__(self) -> None:
         self._set("degree", whole("BSpline", "degree", self.degree, 1))
