@@ -51,6 +51,11 @@ def late(error: Array) -> Errors:
     return Errors(float(np.median(error[-LAST:])), float(np.sqrt(np.mean(error[BURN:] ** 2))))
 
 
+def rms(error: Array) -> float:
+    """Root mean square of the last four thousand samples."""
+    return float(np.sqrt(np.nanmean(error[-4000:] ** 2)))
+
+
 def separated(run: Track, method: str) -> Array:
     """xi by a method, without the warnings that a user gets."""
     with warnings.catch_warnings():
@@ -92,8 +97,8 @@ def first_example(seed: int) -> dict[str, Errors | float]:
     found["structured"] = late(off(structured(s), s))
     found["ekf"] = late(off(track(s.model, FAST, s.y, s.u).theta, s))
     found["printed"] = late(off(printed(run.theta), s))
-    found["one-step"] = float(np.sqrt(np.nanmean((s.y - run.prediction)[-4000:] ** 2)))
-    found["free run"] = float(np.sqrt(np.nanmean((s.y - free_run(run).y)[-4000:] ** 2)))
+    found["one-step"] = rms(s.y - run.prediction)
+    found["free run"] = rms(s.y - free_run(run, "gls").y)
     return found
 
 
@@ -127,11 +132,11 @@ def third_example(seed: int) -> dict[str, Errors | float]:
     run = track(s.model, PAPER, s.y, s.u)
     found |= {f"noisy {m}": late(off(separated(run, m), s)) for m in ("average", "svd-joint")}
     found["noisy start"] = late(off(np.repeat(s.xi[:1], len(s.y), axis=0), s))
-    found["noisy one-step"] = float(np.sqrt(np.nanmean((s.y - run.prediction)[-4000:] ** 2)))
+    found["noisy one-step"] = rms(s.y0 - run.prediction)
     slow = track(s.model, Kalman(q=1e-3, r=1.0, p0=1e8, theta0=0.01), s.y, s.u)
     found["slow svd-joint"] = late(off(separated(slow, "svd-joint"), s))
-    found["slow one-step"] = float(np.sqrt(np.nanmean((s.y - slow.prediction)[-4000:] ** 2)))
-    found["slow free run"] = float(np.sqrt(np.nanmean((s.y0 - free_run(slow).y)[-4000:] ** 2)))
+    found["slow one-step"] = rms(s.y0 - slow.prediction)
+    found["slow free run"] = rms(s.y0 - free_run(slow).y)
     aware = replace(CUBIC, output_noise=s.sigma)
     stage = Kalman(q=4e-6, r=1.0, p0=1e4, theta0=0.01)
     found["aware gls"] = late(off(separated(track(aware, stage, s.y, s.u), "gls"), s))

@@ -41,7 +41,7 @@ ROWS: tuple[tuple[str, str, str, float | None, str], ...] = (
     ("1", "ekf", "EKF on minimal parameters", 0.0150, "0.0235"),
     ("1", "printed", "SVD as printed, no scale", 2.4, ""),
     ("1", "one-step", "one-step rms", 0.016, ""),
-    ("1", "free run", "free run rms", 0.014, ""),
+    ("1", "free run", 'free run rms, "gls"', 0.014, ""),
     ("3", "clean svd-joint", 'noise-free, "svd-joint"', 0.012, ""),
     ("3", "clean ekf", "noise-free, EKF", 0.009, ""),
     ("3", "noisy average", '20 dB, Q = 10, "average"', 0.55, "238"),
@@ -52,9 +52,9 @@ ROWS: tuple[tuple[str, str, str, float | None, str], ...] = (
     ("3", "aware ekf", "20 dB, noise-aware, EKF", 0.075, ""),
     ("3", "output error", "20 dB, output-error EKF from 300", 0.056, "0.074"),
     ("3", "nis", "20 dB, its mean NIS", 0.98, ""),
-    ("3", "noisy one-step", "20 dB, one-step rms, Q/R = 1e3", 0.60, ""),
-    ("3", "slow one-step", "20 dB, one-step rms, Q/R = 1e-3", 0.076, ""),
-    ("3", "slow free run", "20 dB, free run rms against the clean output", 0.060, ""),
+    ("3", "noisy one-step", "20 dB, one-step rms, clean output, Q/R = 1e3", 0.60, ""),
+    ("3", "slow one-step", "20 dB, one-step rms, clean output, Q/R = 1e-3", 0.076, ""),
+    ("3", "slow free run", "20 dB, free run rms, clean output", 0.060, ""),
 )
 """(example, key, what, reference of the median, reference of the worst seed)."""
 ARRIVALS = {
@@ -108,6 +108,11 @@ def end(paths: list[Array], last: int = 1000) -> float:
     return float(np.median([np.median(path[-last:]) for path in paths]))
 
 
+def total(paths: list[FurnaceRun]) -> float:
+    """Er of (67) over the last two thousand samples: it falls all the time, and the window matters."""
+    return end([run.a + run.b + run.p for run in paths], 2000)
+
+
 def gains(found: Found) -> list[float]:
     """Median local gain over the true one near samples 500, 1500, 3000 and 4800."""
     at = (500, 1500, 3000, 4800)
@@ -135,8 +140,7 @@ def table(found: Found) -> Table:
         shown.add_row("", f"batch least squares, {name}", f"{found.bias[name]:.3g}", f"{reference_bias:g}", "", "")
     shown.add_section()
     for q, paths in found.raw.items():
-        shown.add_row("4", f'raw powers, "average", Er, q = {q}', f"{end([r.a + r.b + r.p for r in paths]):.3g}",
-                      f"{RAW[q]:g}", "", "")  # fmt: skip
+        shown.add_row("4", f'raw powers, "average", Er, q = {q}', f"{total(paths):.3g}", f"{RAW[q]:g}", "", "")
     for name, reference in (("a", "7e-5"), ("p", "6e-4")):
         ends: list[Array] = [getattr(run, name) for run in found.legendre]
         what = f'Legendre q = 4, "svd", squared error of {name}'
