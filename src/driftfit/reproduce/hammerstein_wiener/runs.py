@@ -15,6 +15,7 @@ import numpy as np
 from driftfit.blocks.free_run import free_run
 from driftfit.blocks.hand_off import hand_off
 from driftfit.blocks.paths import split
+from driftfit.blocks.product_drift import track_products
 from driftfit.kernel import Array
 from driftfit.models.basis import DeadZone, Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -63,22 +64,6 @@ def separated(run: Track, method: str) -> Array:
         return run.blocks(method).xi
 
 
-def structured(s: Simulated, piece: int = 100) -> Array:
-    """xi by "gls" under Q = J Q_xi J' + eps I, J at the separated xi of the samples before, renewed piece by piece.
-
-    A drift of the products that has the right shape, from one number.
-    """
-    xi, parts, run = s.xi[0], [], None
-    for first in range(0, len(s.y), piece):
-        J = s.model.structure.jacobian(xi)
-        tracker = Kalman(q=WALK**2 * (J @ J.T + 1e-3 * np.eye(len(J))), r=1e-6, p0=1e8, theta0=0.01)
-        part = slice(first, first + piece)
-        run = track(s.model, tracker, s.y[part], s.u[part], keep="cov", warm_start=run)
-        parts.append(separated(run, "gls"))
-        xi = parts[-1][-1]
-    return np.concatenate(parts)
-
-
 def printed(theta: Array) -> Array:
     """The separation as the paper prints it: left and right vectors as they come, without a scale."""
     U, S, Vt = np.linalg.svd(np.stack([theta[:, 6:8], theta[:, 8:10]], axis=2))
@@ -94,7 +79,7 @@ def first_example(seed: int) -> dict[str, Errors | float]:
     run = track(s.model, PAPER, s.y, s.u)
     methods = ("average", "svd", "svd-joint", "gls")
     found: dict[str, Errors | float] = {m: late(off(separated(run, m), s)) for m in methods}
-    found["structured"] = late(off(structured(s), s))
+    found["structured"] = late(off(track_products(s.model, s.y, s.u, q=WALK**2, r=1e-6, start=s.xi[0]).xi, s))
     found["ekf"] = late(off(track(s.model, FAST, s.y, s.u).theta, s))
     found["printed"] = late(off(printed(run.theta), s))
     found["one-step"] = rms(s.y - run.prediction)
