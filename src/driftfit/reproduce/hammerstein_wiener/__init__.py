@@ -27,9 +27,8 @@ def main(
     found = tables.measure(count, quick)
     out.print(tables.table(found))
     ratio, where = tables.worst_ratio(found)
-    out.print(
-        f"{count} seed{'' if count == 1 else 's'}; largest deviation of a median from its reference {100 * ratio:.0f} % ({where})\n"
-    )
+    told = "1 seed" if count == 1 else f"{count} seeds"
+    out.print(f"{told}; largest deviation of a median from its reference {100 * ratio:.0f} % ({where})\n")
     times = cost.measure(500, cost.ORDERS[:1]) if quick else cost.measure()
     out.print(cost.table(times))
     claims.show(out, claims.all_claims(found, times))
