@@ -43,14 +43,14 @@ def made_up(scale=1.0):
     furnace = runs.FurnaceRun(path, path, path, path, path)
     return tables.Found(
         [pair | plain], [dict.fromkeys(tables.ARRIVALS, 14.0)], [pair | plain], {4: [furnace]}, [furnace],
-        dict(tables.BIAS),
+        dict(tables.BIAS), dict(tables.FIXES), dict.fromkeys(tables.CHOICES, 1.0),
     )  # fmt: skip
 
 
 def test_tables_and_claims_read_what_was_measured():
     assert tables.worst_ratio(made_up())[0] == 0.0
     assert tables.worst_ratio(made_up(1.3))[0] > 0.15
-    assert tables.table(made_up()).row_count == len(tables.ROWS) + len(tables.ARRIVALS) + len(tables.BIAS) + 4
+    assert tables.table(made_up()).row_count == len(tables.ROWS) + len(tables.ARRIVALS) + len(tables.BIAS) + 10
     found = made_up()
     assert claims.start(found).verdict.startswith("holds")
     assert "0.41" in claims.noise(found).measured

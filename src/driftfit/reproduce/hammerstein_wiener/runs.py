@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.blocks.constant import fit_constant
 from driftfit.blocks.free_run import free_run
 from driftfit.blocks.hand_off import hand_off
 from driftfit.blocks.paths import split
 from driftfit.blocks.product_drift import track_products
+from driftfit.blocks.ratios import track_ratios
 from driftfit.kernel import Array
 from driftfit.models.basis import DeadZone, Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -176,3 +178,25 @@ def bias(snr_db: float | None, equation_noise: float, seed: int, T: int = 5000) 
     run = track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
     a, b, c, d, _ = split(CUBIC, run.theta[-1:], "svd-joint")
     return float(np.linalg.norm(CUBIC.structure.minimal(a, b, c, d) - s.xi[-1:]))
+
+
+FIXES = ("least squares", "instruments", "instruments, unbiased basis")
+
+
+def fixes(seed: int, T: int = 20_000) -> dict[str, float]:
+    """|xi_hat - xi| on a constant system at 20 dB, by what takes the bias away."""
+    from driftfit.systems.hammerstein_wiener import START, simulate
+
+    groups = (START[name] for name in "abcd")
+    s = simulate(CUBIC, *groups, T=T, rng=np.random.default_rng(seed), snr_db=20.0)
+    fits = (
+        fit_constant(CUBIC, s.y, s.u, rounds=0), fit_constant(CUBIC, s.y, s.u),
+        fit_constant(CUBIC, s.y, s.u, sigma=s.sigma),
+    )  # fmt: skip
+    return {name: float(np.linalg.norm(fit.xi - s.xi[0])) for name, fit in zip(FIXES, fits, strict=True)}
+
+
+def choice(name: str, seed: int, T: int = 2000) -> float:
+    """The ratio q / r that the likelihood of y prefers at the end of a record: without noise, at 30 or 20 dB."""
+    s = example(1, seed, T=T) if name == "noise-free" else example(3, seed, T=T, snr_db=float(name.split()[0]))
+    return float(track_ratios(s.model, s.y, s.u).rho[-1])

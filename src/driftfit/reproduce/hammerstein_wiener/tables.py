@@ -30,6 +30,8 @@ class Found:
     raw: dict[int, list[FurnaceRun]]
     legendre: list[FurnaceRun]
     bias: dict[str, float]
+    fixes: dict[str, float]
+    choices: dict[str, float]
 
 
 ROWS: tuple[tuple[str, str, str, float | None, str], ...] = (
@@ -63,6 +65,8 @@ ARRIVALS = {
     ("inflated", 0.01): "67", ("inflated", 10.0): "139", ("inflated", 1000.0): "370 (83 % of runs)",
 }  # fmt: skip
 BIAS = {"40 dB": 0.002, "30 dB": 0.018, "20 dB": 0.167, "10 dB": 0.82, "equation 0.05": 0.005, "equation 0.2": 0.089}
+FIXES = {"least squares": 0.18, "instruments": 0.008, "instruments, unbiased basis": 0.006}
+CHOICES = {"noise-free": "10", "30 dB": "0.01", "20 dB": "0.001"}
 RAW = {4: 0.36, 5: 0.43, 6: 0.47}
 
 
@@ -78,7 +82,15 @@ def measure(seeds: int, quick: bool = False) -> Found:
         {q: [runs.fourth_example(f, q, True, "average") for f in furnaces] for q in orders},
         [runs.fourth_example(f, 4, False, "svd") for f in furnaces],
         _bias(seeds),
+        _fixes(min(seeds, 8), 4000 if quick else 20_000),
+        {name: float(np.median([runs.choice(name, s) for s in range(min(seeds, 3))])) for name in CHOICES},
     )
+
+
+def _fixes(seeds: int, T: int) -> dict[str, float]:
+    """Median over the seeds of the error by each way of fitting a constant system."""
+    rows = [runs.fixes(s, T) for s in progress(range(seeds), "constant systems", transient=True)]
+    return {name: float(np.median([row[name] for row in rows])) for name in FIXES}
 
 
 def _bias(seeds: int) -> dict[str, float]:
@@ -138,6 +150,11 @@ def table(found: Found) -> Table:
     shown.add_section()
     for name, reference_bias in BIAS.items():
         shown.add_row("", f"batch least squares, {name}", f"{found.bias[name]:.3g}", f"{reference_bias:g}", "", "")
+    for name, fixed in FIXES.items():
+        what = f"constant system, 20 dB, 20,000 samples, {name}"
+        shown.add_row("", what, f"{found.fixes[name]:.3g}", f"{fixed:g}", "", "")
+    for name, wanted in CHOICES.items():
+        shown.add_row("", f"Q/R of the largest likelihood, {name}", f"{found.choices[name]:g}", wanted, "", "")
     shown.add_section()
     for q, paths in found.raw.items():
         both = " ".join(f"{total(paths, last):.2f}" for last in (2000, 1000))
