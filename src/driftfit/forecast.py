@@ -6,7 +6,8 @@
 where an output lag that is not known yet is its own forecast, and psi is the response of y to one noise: 1 for models
 without output lags, the response of 1 / A(z) for ARX. Parameter and noise errors are added as if independent, and the
 product of the two is neglected, so bands of an ARX forecast are approximate beyond the first step. With several outputs
-psi is a matrix, and the noises of the outputs are taken to be independent.
+psi is a matrix, and the noises of the outputs are taken to be independent. A Hammerstein-Wiener model is fitted to
+w = F(y): its errors are those of w, psi the response of 1 / A(z), divided by the slope F'(y_hat).
 """
 
 from __future__ import annotations
@@ -83,10 +84,12 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
         tile["noise"] = 1.0
         result.theta[k], result.std[k] = tile["theta"][0, :, 0], np.sqrt(tile["var"][0, :, 0])
         result.y_hat[k], result.y_std[k] = y_hat, s
+    if run.tracker.output_error:  # its innovation is that of y, whose noise is never fed back
+        return result._replace(y_std=np.sqrt(result.y_std))
     response = model.noise_response(run.theta[-1], h)
     noise = tile["r"][0, 0] * tile["scale"][0, 0] if "r" in storage.fields(tile) else np.nan
-    later = noise * (np.cumsum(response**2) - response[0] ** 2)
-    return result._replace(y_std=np.sqrt(result.y_std + later))
+    later = noise * model.noise_factor(run.theta[-1], result.y_hat[0]) * (np.cumsum(response**2) - response[0] ** 2)
+    return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(run.theta[-1], result.y_hat))
 
 
 def forecast_outputs(run: Outputs | Shared, h: int, u: Any = None) -> Forecast:

@@ -74,6 +74,8 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
         return str(value.__name__)
     if isinstance(value, bool | int | float | str | type(None) | np.generic):
         return repr(value)
+    if isinstance(value, np.ndarray):  # a constant to the compiler
+        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
     if hasattr(value, "identity"):
         return str(value.identity)
     raise TypeError(
@@ -136,8 +138,22 @@ def part(function: Callable[..., Any]) -> Any:
     return _compiled(function, cache=True, forceinline=True, **_PLAIN)
 
 
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides."""
+    assert isinstance(function, FunctionType)
+    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+    return _identified(njit(cache=True, forceinline=True, _nrt=False, **options)(function))
+
+
+def named(function: Any, *parts: Any) -> Any:
+    """A function whose place on disk is its own: closures of one name would share an index."""
+    text = "\n".join(str(getattr(one, "identity", one)) for one in parts)
+    function.__qualname__ += "_" + hashlib.sha256(text.encode()).hexdigest()[:12]
+    return function
+
+
 class Outside(types.ExternalFunction):
-    """A machine that steps call by its symbol, with the address of a table: compiled once for all drivers.
+    """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
     What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
     compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
@@ -153,7 +169,7 @@ class Outside(types.ExternalFunction):
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
             dispatcher = _OUTSIDE[self.symbol]
-            dispatcher.compile((types.intp,))
+            dispatcher.compile(self.sig.args)
             owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
             _LOADED[self.symbol] = owner  # of the code, which would go with it
             add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
@@ -170,11 +186,13 @@ def _machine(symbol: str) -> Outside:
 
 
 def outside(function: Callable[..., Any]) -> Outside:
-    """Make a machine of a function of one address."""
+    """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
     dispatcher = _compiled(function, cache=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
-    machine = Outside(symbol, types.void(types.intp))
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
+    machine = Outside(symbol, types.void(*kinds))
     machine.identity = dispatcher.identity
     _OUTSIDE[symbol] = dispatcher
     _MACHINES[symbol] = machine

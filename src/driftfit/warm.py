@@ -54,7 +54,7 @@ def carried(run: Run, model: Model, tracker: Tracker) -> dict[str, Array]:
             f"warm_start: the run before was made by {type(end.tracker).__name__}, this one is by "
             f"{type(tracker).__name__}; start from its estimates instead, with theta0= and p0=."
         )
-    if (model.n, model.m, model.steps) != (end.model.n, end.model.m, end.model.steps):
+    if not model.follows(end.model):
         raise ValueError(f"warm_start: the run before followed {end.model!r}, this one follows {model!r}.")
     before, now = end.tracker.state_for(end.model), tracker.state_for(model)
     changed = {name for name, value in now.items() if not _same(before.get(name), value)}

@@ -105,3 +105,15 @@ class Model(Settings, ABC):
             f"{type(self).__name__} does not say how it runs forward, so nothing can be simulated; a model of your own "
             "does with the methods `reach` and `play` (driftfit.models.base)."
         )
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """Slope against y of what the model is fitted to, at outputs y (...): what turns its errors into those of y."""
+        return np.ones(np.shape(y))
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """By what the noise variance of a tracker is multiplied at an output."""
+        return 1.0
+
+    def follows(self, other: Model) -> bool:
+        """Whether the memory of the other model is that of this one, so that a run can go on from it."""
+        return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)
