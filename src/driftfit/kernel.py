@@ -134,15 +134,11 @@ def core(function: Callable[..., Any]) -> Any:
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """A `core` that is written into the place where it is used: passing its arrays would cost more than its work."""
+    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides.
+
+    Passing a few dozen arrays may cost more than the work on them.
+    """
     return _compiled(function, cache=True, forceinline=True, **_PLAIN)
-
-
-def part(function: Callable[..., Any]) -> Any:
-    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides."""
-    assert isinstance(function, FunctionType)
-    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-    return _identified(njit(cache=True, forceinline=True, _nrt=False, **options)(function))
 
 
 def named(function: Any, *parts: Any) -> Any:
