@@ -112,6 +112,12 @@ class Sensor(Settings):
             )
         return cls("frozen", prob=prob, resolution=resolution)
 
+    def row(self) -> list[float]:
+        """What compiled code knows of it: the columns of `driftfit.hypotheses.forecast`."""
+        width = -STUCK if self.resolution is None else self.resolution**2 / (2.0 * math.pi)
+        own = self.kind in ("additive", "frozen")
+        return [self.factor, self.value, float(self.kind == "frozen"), width, float(own)]
+
     @property
     def cleans(self) -> bool:
         """Whether a leaf that believes it puts something other than y into its output lags."""

@@ -46,6 +46,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    weighs: ClassVar[bool] = False
+    """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
 
@@ -128,6 +130,10 @@ class Tracker(Settings, ABC):
         full: Array = lower + np.tril(lower, -1).T
         np.fill_diagonal(full, lane["var"])
         return full
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        """What the summary of a run should say beside its numbers: a name and a sentence each."""
+        return ()
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""
