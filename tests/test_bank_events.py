@@ -38,7 +38,12 @@ def test_jumps_are_found_and_dated(run):
         assert event.first <= jump <= event.last
         assert event.prob > 0.9
         assert event.known <= jump + 5
-    assert run.hypotheses.table().height == 2
+    table = run.hypotheses.table()
+    assert table.height == 2
+    assert table["theta1"].to_list() == [event.shift["theta1"] for event in events]
+    assert table["std_theta2"].is_between(0.01, 0.3).all()
+    assert table["time"].to_list() == [event.date for event in events]
+    assert "2 changes; see" in str(run.summary())
     assert len(run.hypotheses.plot().axes) == N + 1
 
 
@@ -61,6 +66,8 @@ def test_the_mixture_is_what_the_track_says(bank):
         assert mixture.weights.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(mixture.mean, run.theta[t], atol=1e-12)
         np.testing.assert_allclose(mixture.cov, run.cov(t), atol=1e-12)
+    assert mixture.weights[(mixture.ages > 18) & (mixture.ages < 21)].sum() > 0.5
+    assert mixture.ages.min() >= 0.0
 
 
 def test_a_stream_says_what_the_record_says(run, tmp_path):
@@ -87,6 +94,13 @@ def test_decisions_come_after_their_depth():
     assert {d.decided - d.sample for d in decisions} == {2}
     assert [d.sample for d in decisions if d.event] == [40]
     assert [d.sample for d in run.hypotheses.finish()] == [98, 99]
+    held = track(Regression(N), Bank(changes(), KNOWN, reduce=Decide(5), p0=2.0), *record(44, 5, (40,)))
+    assert [d.sample for d in held.hypotheses.finish()] == [40, 41, 42, 43]
+    assert [d.event > 0 for d in held.hypotheses.finish()] == [True, False, False, False]
+    brief = track(Regression(N), Bank(changes(), KNOWN, reduce=Decide(5), p0=2.0), *record(3, 5))
+    assert brief.hypotheses.decisions == []
+    assert [d.sample for d in brief.hypotheses.finish()] == [0, 1, 2]
+    assert track(Regression(N), BANK, *record(3, 5)).hypotheses.finish() == []
     auto = track(
         Regression(N), Bank(changes(), KNOWN, reduce=Decide("auto", wait_cost=0.005), p0=2.0), *record(100, 5, (40,))
     )
@@ -133,9 +147,13 @@ def test_an_impossible_sample_is_survived():
     prob = np.full((30, 6), np.nan)
     prob[0] = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     run = track(Regression(N), bank, y, u, prob=prob)
-    assert run.hypotheses.impossible == 1
+    with pytest.warns(UserWarning, match="1 samples were impossible"):
+        told = run.hypotheses
+    assert told.impossible == 1
+    with pytest.warns(UserWarning, match="probability above 0"):
+        assert "1 samples that every hypothesis ruled out" in str(run.summary())
     assert np.isfinite(run.theta).all()
-    assert run.hypotheses.prob()[0, 0] == pytest.approx(0.0, abs=1e-12)
+    assert told.prob()[0, 0] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_frozen_sensor_is_named():

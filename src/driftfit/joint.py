@@ -39,11 +39,6 @@ def trackers_of(model: Model, tracker: Any) -> tuple[Tracker, ...]:
         if not isinstance(one, Tracker):
             raise ValueError(f"several outputs take one tracker, or one for each output by its name; got {tracker!r}.")
         check_ready(one)
-        if one.alone and not model.shared:
-            raise ValueError(
-                f"{type(one).__name__} follows one output at a time: track each output by itself, with the other "
-                "outputs among its inputs, as in track(ARX(na, nb, inputs=2), tracker, y[:, 0], [y[:, 1], u])."
-            )
     if len({one.steps_for(model) for one in trackers}) > 1 or len({shapes(one, model) for one in trackers}) > 1:
         raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
     return trackers

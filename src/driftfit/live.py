@@ -21,7 +21,7 @@ from driftfit.warm import End, Run, carried, fresh_tile
 
 if TYPE_CHECKING:
     from driftfit.blocks.paths import Groups
-    from driftfit.hypotheses.results import LiveHypotheses
+    from driftfit.hypotheses.live_results import LiveHypotheses
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
@@ -262,9 +262,9 @@ class Live:
     @property
     def hypotheses(self) -> LiveHypotheses:
         """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
-        if "report" not in self.tracker.outputs:
+        if not self.tracker.weighs:
             raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
-        from driftfit.hypotheses.results import LiveHypotheses
+        from driftfit.hypotheses.live_results import LiveHypotheses
 
         return LiveHypotheses(self)
 

@@ -191,7 +191,7 @@ class Track(Judged):
     @property
     def hypotheses(self) -> Hypotheses:
         """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
-        if "report" not in self.tracker.outputs:
+        if not self.tracker.weighs:
             raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
         from driftfit.hypotheses.results import Hypotheses
 
@@ -212,7 +212,7 @@ class Track(Judged):
 
         if self._start is not None:
             raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
-        if "report" in self.tracker.outputs:
+        if self.tracker.weighs:
             return cast("Smoothed", self.hypotheses.smooth())
         return Smoothed.of(self, keep, order_by, undetermined)
 

@@ -53,6 +53,7 @@ class Summary:
     signals: str
     span: str
     dropped: str
+    remarks: tuple[tuple[str, str], ...] = ()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         yield facts(
@@ -63,6 +64,7 @@ class Summary:
             ("Samples", f"{self.samples}, {self.used} used, {self.samples - self.used} skipped"),
             *([("Rows left out", self.dropped)] if self.dropped else []),
             ("Log-likelihood", f"{self.loglik:.6g}"),
+            *self.remarks,
         )
         heads = ("theta", "std", "[0.025", "0.975]", "lowest", "highest")
         table = table_of("Parameters after the last sample", "", *heads)
@@ -103,7 +105,7 @@ def summarise(run: Track) -> Summary:
     )  # fmt: skip
     return Summary(
         repr(run.model), _short(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped),
+        _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
     )  # fmt: skip
 
 

@@ -69,6 +69,8 @@ WAITING, READY = 0, -1
 """Numbers of the present sample: what comes in, and what goes out."""
 GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
+NEVER = 1e9
+"""Floors since the last change of a leaf that has none, or more."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
@@ -324,7 +326,7 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
     at = FIRST + n
     for row in range(LOG, FIRST):
         B[row, 0] = 0.0
-    B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, 1e9
+    B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER
     for i in range(n):
         B[FIRST + i, 0] = theta[i]
         for j in range(i + 1):

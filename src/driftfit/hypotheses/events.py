@@ -38,7 +38,7 @@ class Event:
     name : str
         The likeliest change, or the sensor fault.
     names : mapping from names of changes to their share
-    shift, std : mapping from parameters to how far they moved and its standard error (changes only)
+    shift, std, z : mappings from parameters to how far they moved, its standard error, and their ratio (changes only)
         From the smoothed path given the events: conditional on them.
     """
 
@@ -67,17 +67,21 @@ class Event:
             self, shift=dict(zip(names, mean.tolist(), strict=True)), std=dict(zip(names, std.tolist(), strict=True))
         )
 
-    def row(self) -> dict[str, Any]:
-        """For a table."""
-        moved = ", ".join(
-            f"{name} {shift:+.3g} ({self.std[name]:.2g})"
-            for name, shift in self.shift.items()
-            if abs(shift) > 2.0 * self.std[name]
-        )
-        return {
+    @property
+    def z(self) -> dict[str, float]:
+        """How far each parameter moved in standard errors."""
+        return {name: shift / self.std[name] if self.std[name] > 0.0 else 0.0 for name, shift in self.shift.items()}
+
+    def row(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """For a table, with shift and standard error of every parameter, None where there is none."""
+        told = {
             "kind": self.kind, "date": self.date, "first": self.first, "last": self.last, "known": self.known,
-            "prob": self.prob, "name": self.name, "moved": moved,
+            "prob": self.prob, "name": self.name,
+            "moved": ", ".join(name for name, z in self.z.items() if abs(z) > 2.0),
         }  # fmt: skip
+        for name in names:
+            told |= {name: self.shift.get(name), f"std_{name}": self.std.get(name)}
+        return told
 
 
 class Told(NamedTuple):

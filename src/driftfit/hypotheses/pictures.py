@@ -28,7 +28,7 @@ def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
     for i in range(n):
         draw_parameter(axes[i], run, i, level)
     stack(axes[n], run.time, np.nan_to_num(told.latest), told.names)
-    for event in told._found(threshold):
+    for event in told.found(threshold):
         if event.kind == "change":
             for axis in axes[:n]:
                 axis.axvline(run.time[event.date], color=RED, linewidth=1.0, linestyle=":")

@@ -115,3 +115,24 @@ def _initial(owner: str, initial: Any, P: Array) -> Array:
     if p.shape != (len(P),) or p.min() < 0.0 or abs(p.sum() - 1.0) > TOLERANCE:
         raise ValueError(f"{owner}: initial must be {len(P)} probabilities that sum to 1; got {initial!r}.")
     return np.asarray(p / p.sum())
+
+
+def per_sample(owner: str, p: Array, usual: Array, Hd: int) -> Array:
+    """Priors (T, H) of joint events from such, or from (T, H_d) of changes; rows of NaN stay.
+
+    ``usual`` (H,) is what holds where nothing is said.
+    """
+    Hm = len(usual) // Hd
+    if p.shape[1] == Hd and Hm > 1:
+        sensors = usual.reshape(Hd, Hm).sum(axis=0)
+        p = np.einsum("ti,j->tij", p, sensors).reshape(len(p), -1)
+    if p.shape[1] != Hd * Hm:
+        raise ValueError(
+            f"{owner}: prob must have {Hd} columns (changes) or {Hd * Hm} (joint events); got {p.shape[1]}."
+        )
+    given = ~np.isnan(p).all(axis=1)
+    wrong = given & ~((p >= 0.0).all(axis=1) & (np.abs(p.sum(axis=1) - 1.0) < 1e-8))
+    if wrong.any():
+        t = int(np.argmax(wrong))
+        raise ValueError(f"{owner}: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
+    return p

@@ -6,48 +6,22 @@ decided, probabilities are conditional on the decisions.
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from driftfit.hypotheses.events import Event, Told, all_of
-from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S
+from driftfit.hypotheses.mixture import Mixture, mixture_of, undecided
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from driftfit.hypotheses.smooth import EventSmoothed
-    from driftfit.live import Live
     from driftfit.result import Track
     from driftfit.trackers.bank import Bank
-
-
-SINGLE = ("evidence", "window", "kept", "leaves")
-"""Entries of the head of a report, in its order."""
-
-
-class Mixture(NamedTuple):
-    """The leaves after a sample: what control works with."""
-
-    weights: Array
-    """(L,), summing to 1."""
-    means: Array
-    """(L, n)"""
-    covs: Array
-    """(L, n, n)"""
-
-    @property
-    def mean(self) -> Array:
-        """sum w m, (n,)."""
-        return np.asarray(self.weights @ self.means)
-
-    @property
-    def cov(self) -> Array:
-        """sum w (C + d d'), (n, n)."""
-        away = self.means - self.mean
-        return np.asarray(np.einsum("l,lij->ij", self.weights, self.covs + away[:, :, None] * away[:, None, :]))
 
 
 class Alarm(NamedTuple):
@@ -98,6 +72,12 @@ class Hypotheses:
         self._report = run._written("report")
         self.names = self.tracker.event_names
         self.sensors = len(self.tracker.all_sensors)
+        if self.impossible:
+            warnings.warn(
+                f"{self.impossible} samples were impossible under every hypothesis of the bank and were not used. Give "
+                "each event that may happen a probability above 0 in transition= and prob=.",
+                stacklevel=3,
+            )
 
     def _told(self, name: str) -> Array:
         return self.tracker.told(self._report, name)
@@ -175,19 +155,25 @@ class Hypotheses:
         ]
 
     def finish(self) -> list[Decision]:
-        """What would be decided of the events still held, in order, each on its own marginal."""
-        if not self.decisions:
+        """What `Decide` would decide of the events still held, the oldest first, each given those before it.
+
+        Also where the record is shorter than the depth; empty for reductions that decide nothing.
+        """
+        from driftfit.hypotheses.reduction import Decide
+
+        reduce = self.tracker.reduction
+        if not isinstance(reduce, Decide) or not len(self.run):
             return []
-        after = self.decisions[-1].sample + 1
-        T = len(self.run)
-        rows = self.latest[after:T]
-        return [Decision(after + k, T - 1, int(p.argmax()), float(p.max())) for k, p in enumerate(rows) if p[0] == p[0]]
+        lane, last = self.run.lane(-1), len(self.run) - 1
+        loss = reduce.losses(len(self.names))
+        found = undecided(self.tracker, self.run, lane, loss)
+        return [Decision(sample, last, event, prob) for sample, event, prob in found]
 
     def smooth(self, threshold: float = 0.5) -> EventSmoothed:
         """The path of the whole record given the events."""
         from driftfit.hypotheses.smooth import EventSmoothed
 
-        return EventSmoothed(self.run, self._found(threshold))
+        return EventSmoothed(self.run, self.found(threshold))
 
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, in order of time.
@@ -195,23 +181,25 @@ class Hypotheses:
         How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
         change forgets or resets there is nothing to smooth, and it is not said.
         """
-        found = self._found(threshold)
+        found = self.found(threshold)
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
         smoothed = self.smooth(threshold)
         return [event.measured(smoothed) if event.kind == "change" and event.date else event for event in found]
 
-    def _found(self, threshold: float) -> list[Event]:
-        """Events without what they moved."""
+    def found(self, threshold: float = 0.5) -> list[Event]:
+        """`events`, without how far parameters moved, which takes a smoother."""
         bank = self.tracker
         told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
         return all_of(told, threshold)
 
     def table(self, threshold: float = 0.5) -> Any:
-        """`events` as a polars table."""
+        """`events` as a polars table: for every parameter how far it moved, with its standard error."""
         import polars as pl
 
-        return pl.DataFrame([event.row() for event in self.events(threshold)])
+        names, at = self.run.names, self.run.time
+        rows = [{**event.row(names), "time": at[event.date]} for event in self.events(threshold)]
+        return pl.DataFrame(rows, infer_schema_length=None)
 
     def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:
         """Alarm while the window probability exceeds a threshold.
@@ -249,66 +237,6 @@ class Hypotheses:
         return plot_hypotheses(self, threshold, level)
 
 
-class LiveHypotheses:
-    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
-
-    ``lag_prob`` (W, H), ``window``, ``evidence``, ``leaves`` and ``kept`` are those of `Hypotheses` after the last
-    sample.
-    """
-
-    def __init__(self, live: Live) -> None:
-        self._live = live
-        self.tracker: Bank = live.tracker  # type: ignore[assignment]
-        self._lane = live.lane()
-        self.names = self.tracker.event_names
-        told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
-        self.lag_prob: Array = told["lag_prob"].copy()
-        self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
-
-    def mixture(self) -> Mixture:
-        """The leaves now: what control works with."""
-        return mixture_of(self.tracker, self._live, self._lane)
-
-    def events(self, threshold: float = 0.5) -> list[Event]:
-        """Events that were decided since this was asked last: all that can be known of them is known.
-
-        A stream remembers the last 256 samples, so ask more often than that.
-        """
-        from driftfit.hypotheses.advance import CLOCK, REPORTED_TO
-
-        many, bank = self._lane["many"], self.tracker
-        ring = bank.array(self._live.model, self._lane, "ring")
-        now, W = int(many[CLOCK]), len(self.lag_prob)
-        at = np.arange(max(0, now - len(ring)), now)
-        rows = ring[at % len(ring)]
-        first = int(at[0]) - W + 1 if len(at) else 0
-        window = np.r_[np.zeros(W - 1), rows[:, 0]]
-        latest = np.vstack([rows[:, 1:], np.zeros((W - 1, rows.shape[1] - 1))])
-        told = Told(latest, window, W, bank.change_names, bank.sensor_names)
-        found = [event.moved(first) for event in all_of(told, threshold)]
-        busy = window[-1] > threshold
-        done = [event for event in found if many[REPORTED_TO] <= event.date and event.last < now - W + 1 and not busy]
-        if not busy:
-            many[REPORTED_TO] = max(now - W + 1, many[REPORTED_TO])
-        return done
-
-
 def onsets(on: Array) -> Array:
     """Where a condition begins to hold."""
     return np.flatnonzero(on & ~np.r_[False, on[:-1]])
-
-
-def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
-    """The leaves in the fields of one lane; before the bank has begun, its one filter."""
-    from driftfit.hypotheses.advance import LEAVES, SETTLED
-
-    n = len(lane["theta"])
-    if lane["many"][SETTLED] != 1:
-        return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None])
-    B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
-    covs = np.zeros((B.shape[1], n, n))
-    i, j = np.tril_indices(n)
-    covs[:, i, j] = covs[:, j, i] = B[FIRST + n : FIRST + n + len(i)].T
-    if lane["unknown"]:
-        covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
-    return Mixture(B[WEIGHT].copy(), B[FIRST : FIRST + n].T.copy(), covs)

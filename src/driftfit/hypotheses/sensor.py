@@ -66,8 +66,8 @@ class Sensor(Settings):
         """The sensor as it should be, with noise variance r.
 
         r=None: the variance is unknown, and every leaf carries an inverse gamma distribution of it that forgets over
-        ``memory`` samples (None: never). ``guess`` is its mean before the first sample, worth ``nu`` samples; without
-        one it comes from the first residuals, and q and p0 are in units of it.
+        ``memory`` samples (None: never). 1 / ``guess`` is the mean of 1 / r before the first sample, worth ``nu``
+        samples; without a guess it comes from the first residuals, and q and p0 are in units of it.
         """
         return cls("nominal", r, prob, guess=guess, nu=nu, memory=memory)
 
@@ -111,6 +111,12 @@ class Sensor(Settings):
                 f"{resolution!r}. Without resolution= the width is {math.sqrt(STUCK):g} of the noise's."
             )
         return cls("frozen", prob=prob, resolution=resolution)
+
+    def row(self) -> list[float]:
+        """What compiled code knows of it: the columns of `driftfit.hypotheses.forecast`."""
+        width = -STUCK if self.resolution is None else self.resolution**2 / (2.0 * math.pi)
+        own = self.kind in ("additive", "frozen")
+        return [self.factor, self.value, float(self.kind == "frozen"), width, float(own)]
 
     @property
     def cleans(self) -> bool:

@@ -42,7 +42,7 @@ class Segments:
         self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
         seen = replay(run)
         known = seen["ok"][:, 0] > 0.0
-        if "report" in run.tracker.outputs:  # a sensor at fault tells nothing of the segment
+        if run.tracker.weighs:  # a sensor at fault tells nothing of the segment
             from driftfit.hypotheses.smooth import faults
 
             known &= faults(run.tracker, run, run.hypotheses.events()) == 1.0  # type: ignore[arg-type]

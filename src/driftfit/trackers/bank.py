@@ -31,20 +31,17 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.eights import WIDTH
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
-from driftfit.hypotheses import forget, plan
+from driftfit.hypotheses import forget
 from driftfit.hypotheses import reduction as reductions
-from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED, bank
+from driftfit.hypotheses.advance import HEAD, PACKED, bank
 from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.forecast import FROZEN, VALUE
 from driftfit.hypotheses.leaves import FIRST, NU, S
-from driftfit.hypotheses.lookahead import NODES
-from driftfit.hypotheses.prior import events
+from driftfit.hypotheses.memory import SINGLE, arrays_of, packed
+from driftfit.hypotheses.prior import events, per_sample
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
-from driftfit.hypotheses.results import SINGLE
-from driftfit.hypotheses.sensor import STUCK, Sensor
+from driftfit.hypotheses.sensor import Sensor
 from driftfit.hypotheses.steps import STEPS
 from driftfit.kernel import Array
 from driftfit.models.base import Model
@@ -52,9 +49,6 @@ from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
-
-RING = 256
-"""Samples of which a stream remembers probabilities, for events."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +91,8 @@ class Bank(Tracker):
     lag_variance: bool = True
 
     width: ClassVar[int] = 1
-    alone: ClassVar[bool] = True
     outputs: ClassVar[tuple[str, ...]] = ("report",)
+    weighs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, kind, what in (("changes", Change, "a Change"), ("sensors", Sensor, "a Sensor")):
@@ -212,15 +206,6 @@ class Bank(Tracker):
             given["reduce"] = getattr(reductions, reduce.pop("kind")).from_settings(reduce)
         return cls(**given)
 
-    def _sensor_table(self) -> Array:
-        rows = []
-        for one in self.all_sensors:
-            width = -STUCK if one.resolution is None else one.resolution**2 / (2.0 * np.pi)
-            rows.append(
-                [one.factor, one.value, float(one.kind == "frozen"), width, float(one.kind in ("additive", "frozen"))]
-            )
-        return np.array(rows)
-
     def state(self, n: int) -> Mapping[str, Any]:
         return self._state(n, 0)
 
@@ -243,7 +228,7 @@ class Bank(Tracker):
         now[core.FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
-        arrays = self._arrays(n, na, unit, theta0)
+        arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
@@ -259,67 +244,19 @@ class Bank(Tracker):
             **packed(arrays, n, na, nominal.r is None, self._alike),
         }  # fmt: skip
 
-    def _arrays(self, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
-        """What `driftfit.hypotheses.advance` works on, before the first sample."""
-        shape, Hd, Hm, H = self._shape, len(self.all_changes), len(self.all_sensors), self._count
-        tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
-        chain, initial = self._events
-        rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if self.lag_variance else 0), np.tril_indices(n)
-        steps = [one.increments(n) for one in self.all_changes]
-        forgets = any(one.forgets for one in self.all_changes)
-        more = na + (tri + 2 * n if forgets else 0)
-        places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
-        places[forget.MEAN], places[forget.CAP] = theta0, np.inf
-        if forgets:
-            places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in self.all_changes])
-        parents, children = _room(max(shape.parents, K // (Hd * Hm)), Hd, Hm)
-        past = -(-W * (H + 1) // WIDTH) * WIDTH
-        refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
-        return {
-            "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
-            "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
-            "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
-            "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
-            "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
-            "factors": np.ones(Hd), "theta0": places,
-            "maps": np.array([change.mapping() for change in self.all_changes] * 2),
-            "sensors": self._sensor_table(), "chain": chain, "initial": initial, "given": np.full(H, np.nan),
-            "loss": self.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
-            "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-            "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
-            "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-            "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
-        }  # fmt: skip
-
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
         if prob is not None:
-            columns[:, : Hd * Hm] = self._given(np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1])))
+            given = np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1]))
+            columns[:, : Hd * Hm] = per_sample("Bank", given, self._events[1], Hd)
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
                 raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
             columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
         return columns
-
-    def _given(self, p: Array) -> Array:
-        """Priors of joint events from priors of joint events or of changes; rows of NaN stay."""
-        Hd, Hm = len(self.all_changes), len(self.all_sensors)
-        if p.shape[1] == Hd and Hm > 1:
-            sensors = self._events[1].reshape(Hd, Hm).sum(axis=0)
-            p = np.einsum("ti,j->tij", p, sensors).reshape(len(p), -1)
-        if p.shape[1] != Hd * Hm:
-            raise ValueError(
-                f"Bank: prob must have {Hd} columns (changes) or {Hd * Hm} (joint events); got {p.shape[1]}."
-            )
-        given = ~np.isnan(p).all(axis=1)
-        wrong = given & ~((p >= 0.0).all(axis=1) & (np.abs(p.sum(axis=1) - 1.0) < 1e-8))
-        if wrong.any():
-            t = int(np.argmax(wrong))
-            raise ValueError(f"Bank: prob must be probabilities that sum to 1 at every sample; row {t} is {p[t]}.")
-        return p
 
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
@@ -364,44 +301,19 @@ class Bank(Tracker):
         part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return part.view(np.int64) if name in ("links", "group", "slots") else part
 
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        told = run.hypotheses
+        kinds = [event.kind for event in told.found()]
+        faults = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
+        said = [("Events", f"{kinds.count('change')} changes{faults}; see run.hypotheses.events()")]
+        if told.impossible:
+            said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
+        return tuple(said)
+
     @property
     def steps(self) -> TrackerSteps:
         bank.load()
         return STEPS
-
-
-def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool) -> dict[str, Any]:
-    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver."""
-    table = np.zeros((core.ROWS, 3), int)
-    flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
-    for k, name in enumerate(PACKED):
-        array = np.ascontiguousarray(arrays[name])
-        into = flat[name in REPORTED]
-        table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
-        into.append(array.ravel().view(np.float64))
-    table[core.THETA, 1] = n
-    table[core.FLAGS] = na, unknown, alike
-    walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
-    noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[core.PLAIN] = na == 0 and walks and noises
-    memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
-
-
-def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
-    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
-    blocks = (parents, parents * Hd, parents * Hd * Hm)
-    up = [-(-size // WIDTH) * WIDTH for size in blocks]
-    most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
-    return up[0], -(-most // WIDTH) * WIDTH
-
-
-def _padded(x: Array, least: int) -> Array:
-    """With zeros up to one of few sizes."""
-    size = least
-    while size < len(x):
-        size *= 2
-    return np.concatenate([x, np.zeros(size - len(x))])
 
 
 def _tuples(value: Any) -> Any:

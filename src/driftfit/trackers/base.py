@@ -49,8 +49,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
-    alone: ClassVar[bool] = False
-    """Whether the state works in single lanes only, so that several outputs cannot share a tile."""
+    weighs: ClassVar[bool] = False
+    """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
     output_error: ClassVar[bool] = False
@@ -140,6 +140,10 @@ class Tracker(Settings, ABC):
         full: Array = lower + np.tril(lower, -1).T
         np.fill_diagonal(full, lane["var"])
         return full
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        """What the summary of a run should say beside its numbers: a name and a sentence each."""
+        return ()
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""

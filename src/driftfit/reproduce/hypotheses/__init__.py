@@ -50,9 +50,9 @@ def cell(value: float, reference: float | None) -> str:
 
 def short(value: float) -> str:
     """Three digits, without the zero before the point."""
-    digits = 1 if abs(value) >= 9.95 else 2 if abs(value) >= 0.995 else 3
+    digits = 1 if abs(value) >= 9.95 else 2 if abs(value) >= 0.9995 else 3
     text = f"{value:.{digits}f}"
-    return text.replace("0.", ".", 1) if abs(value) < 0.995 else text
+    return text.replace("0.", ".", 1) if text.lstrip("-").startswith("0.") else text
 
 
 def with_gap(reference: tuple[float | None, ...] | None) -> tuple[float | None, ...] | None:
@@ -137,7 +137,7 @@ def main(
     """Tables of accuracy of banks of hypotheses, beside reference values."""
     from driftfit.reproduce.hypotheses.claims import print_claims
 
-    console = Console(width=180)
+    console = Console(width=200)
     found = {
         contest.table: contest_of(contest, QUICK if quick else contest.runs, quick, console)
         for contest in contests()

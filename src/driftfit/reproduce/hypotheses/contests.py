@@ -14,7 +14,7 @@ from driftfit.hypotheses.results import Hypotheses
 from driftfit.hypotheses.sensor import Sensor
 from driftfit.kernel import Array
 from driftfit.reproduce.hypotheses.references import Row, references
-from driftfit.reproduce.hypotheses.rivals import rivals
+from driftfit.reproduce.hypotheses.rivals import tuned
 from driftfit.systems.jumps import Jumping
 from driftfit.trackers.bank import Bank
 from driftfit.trackers.base import Tracker
@@ -175,9 +175,10 @@ def contests() -> list[Contest]:
     ]  # fmt: skip
 
 
-def tuned(fault: str, offset: int) -> dict[str, Entry]:
-    """RLS and a Kalman filter, tuned for the error of all parameters on other records of the kind."""
-    return {name: Entry(tracker) for name, tracker in rivals(fault, offset).items()}
+def rls(fault: str, offset: int) -> dict[str, Entry]:
+    """Recursive least squares, tuned on other records of the kind."""
+    tracker = tuned(fault, offset)
+    return {f"RLS-EF {tracker.forgetting:g}": Entry(tracker)}
 
 
 @cache
@@ -198,8 +199,8 @@ def clean() -> dict[str, Entry]:
 @cache
 def outliers() -> dict[str, Entry]:
     return {
-        **tuned("innovation", 2500),
-        "KF tuned Q, r": kalman((0.002, 0.002, 0.02), 4.0 * R), "Decide d=2, no sensor alternative": decide(2),
+        **rls("innovation", 2500), "KF tuned Q, r": kalman((0.002, 0.002, 0.02), 4.0 * R),
+        "Decide d=2, no sensor alternative": decide(2),
         "GPB(2), no sensor alternative": gpb(2), "IMM joint": imm(OUTLIER),
         **{f"joint Decide d={d}": decide(d, OUTLIER) for d in range(1, 5)},
         "joint Decide d=2 asym jump-miss=5": decide(2, OUTLIER, loss=joint_loss(5.0)),
@@ -211,7 +212,7 @@ def outliers() -> dict[str, Entry]:
 @cache
 def mixed() -> dict[str, Entry]:
     return {
-        **tuned("innovation", 2500),
+        **rls("innovation", 2500), "KF tuned Q, r": kalman((0.002, 0.002, 0.02), 4.0 * R),
         "GPB(2) joint": gpb(2, OUTLIER), "Beam 16": beam(16, OUTLIER),
         "Hybrid M=9": hybrid(9, OUTLIER), "Hybrid M=16": hybrid(16, OUTLIER),
         "joint Decide d=3": decide(3, OUTLIER), "GPB(3) joint": gpb(3, OUTLIER), "IMM joint": imm(OUTLIER),
@@ -222,8 +223,8 @@ def mixed() -> dict[str, Entry]:
 @cache
 def additive() -> dict[str, Entry]:
     return {
-        **tuned("additive", 3500),
-        "KF diag(.004,.004,.04)": kalman(), "KF Q/4, 12r": kalman((0.001, 0.001, 0.01), 12.0 * R),
+        **rls("additive", 3500), "KF diag(.004,.004,.04)": kalman(),
+        "KF Q/4, 12r": kalman((0.001, 0.001, 0.01), 12.0 * R),
         "IMM joint, leaf-cleaned": imm(SPIKE), "GPB(2), no sensor alternative": gpb(2),
         "joint Decide d=2, literal (dirty regressor)": decide(2, SPIKE, literal=True),
         **{f"joint Decide d={d}, leaf-cleaned regressor": decide(d, SPIKE) for d in (2, 3, 4)},
@@ -237,8 +238,8 @@ def additive() -> dict[str, Entry]:
 @cache
 def frozen() -> dict[str, Entry]:
     return {
-        **tuned("frozen", 4500),
-        "KF diag(.004,.004,.04)": kalman(), "GPB(2), no sensor alternative": gpb(2),
+        **rls("frozen", 4500), "KF diag(.004,.004,.04)": kalman(),
+        "KF 2Q, 8r": kalman((0.008, 0.008, 0.08), 8.0 * R), "GPB(2), no sensor alternative": gpb(2),
         "Decide d=2 outlier sensor only": decide(2, SPIKE),
         "Decide d=2 ok/frozen literal (dirty regr.)": decide(2, FROZEN, transition=FREEZES, literal=True),
         "Decide d=2 ok/outl/frozen cleaned, Markov": decide(2, SPIKE, FROZEN, transition=FREEZES_OR_OUTLIERS),
@@ -255,7 +256,7 @@ def frozen() -> dict[str, Entry]:
 @cache
 def persistent() -> dict[str, Entry]:
     moving = (Change(0.002**2, prob=1.0 - STATIONARY), Change(0.06**2, prob=STATIONARY, name="fast"))
-    rows = {**tuned("regimes", 5500), "KF tuned 0.001": kalman(0.001)}
+    rows = {**rls("regimes", 5500), "KF tuned 0.001": kalman(0.001)}
     for name, transition in (("iid", None), ("Markov", REGIMES)):
         for d in (2, 7):
             rows[f"Decide d={d} {name}"] = decide(d, transition=transition, changes=moving)
@@ -270,7 +271,7 @@ def persistent() -> dict[str, Entry]:
 @cache
 def variable() -> dict[str, Entry]:
     return {
-        **tuned("none", 1000), "IMM": imm(),
+        **rls("none", 1000), "KF diag(.004,.004,.04)": kalman(), "IMM": imm(),
         "fixed d=5": decide(5), "fixed d=3": decide(3), "threshold tau=0.02 dmax=6": auto(0.02),
         "threshold tau=0.001 dmax=6": auto(0.001), "look-ahead c=0.005 dmax=6": auto(0.0, 0.005),
         "look-ahead c=.01 dmax=6 asym10": auto(0.0, 0.01, loss_of(10.0)),

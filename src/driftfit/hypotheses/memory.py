@@ -1,0 +1,93 @@
+"""The memory of a bank: its arrays before the first sample, and how they lie one after the other in one field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.eights import WIDTH
+from driftfit.hypotheses import advance as core
+from driftfit.hypotheses import forget, plan
+from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED
+from driftfit.hypotheses.forecast import FROZEN, VALUE
+from driftfit.hypotheses.leaves import FIRST
+from driftfit.hypotheses.lookahead import NODES
+from driftfit.kernel import Array
+
+if TYPE_CHECKING:
+    from driftfit.trackers.bank import Bank
+
+SINGLE = ("evidence", "window", "kept", "leaves")
+"""Entries of the head of a report, in its order."""
+RING = 256
+"""Samples of which a stream remembers probabilities, for events."""
+
+
+def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+    """What `driftfit.hypotheses.advance` works on, before the first sample; covariances are multiplied by ``unit``."""
+    shape, Hd, Hm, H = bank._shape, len(bank.all_changes), len(bank.all_sensors), bank._count
+    tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
+    chain, initial = bank._events
+    rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
+    steps = [one.increments(n) for one in bank.all_changes]
+    forgets = any(one.forgets for one in bank.all_changes)
+    more = na + (tri + 2 * n if forgets else 0)
+    places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
+    places[forget.MEAN], places[forget.CAP] = theta0, np.inf
+    if forgets:
+        places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
+    parents, children = _room(max(shape.parents, K // H), Hd, Hm)
+    past = -(-W * (H + 1) // WIDTH) * WIDTH
+    refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
+    return {
+        "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
+        "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
+        "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
+        "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
+        "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
+        "factors": np.ones(Hd), "theta0": places,
+        "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
+        "sensors": np.array([sensor.row() for sensor in bank.all_sensors]),
+        "chain": chain, "initial": initial, "given": np.full(H, np.nan),
+        "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
+        "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
+        "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
+        "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
+    }  # fmt: skip
+
+
+def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool) -> dict[str, Any]:
+    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver."""
+    table = np.zeros((core.ROWS, 3), int)
+    flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
+    for k, name in enumerate(PACKED):
+        array = np.ascontiguousarray(arrays[name])
+        into = flat[name in REPORTED]
+        table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
+        into.append(array.ravel().view(np.float64))
+    table[core.THETA, 1] = n
+    table[core.FLAGS] = na, unknown, alike
+    walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
+    noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    table[core.PLAIN] = na == 0 and walks and noises
+    memory, report = (np.concatenate(parts) for parts in flat)
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+
+
+def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
+    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
+    blocks = (parents, parents * Hd, parents * Hd * Hm)
+    up = [-(-size // WIDTH) * WIDTH for size in blocks]
+    most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
+    return up[0], -(-most // WIDTH) * WIDTH
+
+
+def _padded(x: Array, least: int) -> Array:
+    """With zeros up to one of few sizes."""
+    size = least
+    while size < len(x):
+        size *= 2
+    return np.concatenate([x, np.zeros(size - len(x))])
