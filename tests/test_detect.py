@@ -9,7 +9,8 @@ from scipy import signal, stats
 from support import arx_record
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
-from driftfit.detect import Alarms, normal_scores
+from driftfit.detect import Alarms
+from driftfit.judges.alarm_statistics import normal_scores
 from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
 from driftfit.judges.onsets import held, mean_limit, normal_limit, onsets, power_limit
 from driftfit.judges.scale import core
