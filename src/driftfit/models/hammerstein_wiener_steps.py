@@ -7,7 +7,7 @@ on its own coefficients is evaluated anew for all lags. The output is predicted 
 
 with `driftfit.models.block_curve`. The steps that drivers are compiled with only hand a lane over to two machines,
 which are compiled once for all trackers: a call of a machine that knows its orders is as fast as code in the midst of a
-driver. With orders at run time one machine would do for all models, but took three times as long a sample.
+driver. With orders at run time one machine would do for all models, but took twice as long a sample.
 """
 
 from __future__ import annotations
