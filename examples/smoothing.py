@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track, tune
 from driftfit.smoothers.augmented import augmented
 from driftfit.smoothers.huber import huber
 from driftfit.smoothers.total_variation import total_variation
@@ -153,6 +153,67 @@ def forecasts() -> None:
     table(f"Forecasts of y, {10 * SEEDS} records", ["samples ahead", "95 % bands cover"], rows)
 
 
+def trending(seed: int, T: int = 300, ahead: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two coefficients that swing slowly, seen in noise of 0.3."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(T + ahead)
+    theta = np.column_stack([np.sin(2.0 * np.pi * t / 200.0 + rng.uniform(0.0, 6.0)), 0.5 + 0.004 * t])
+    phi = np.column_stack([rng.standard_normal(len(t)), np.ones(len(t))])
+    return phi, np.sum(phi * theta, axis=1) + 0.3 * rng.standard_normal(len(t)), theta
+
+
+def differences() -> None:
+    """First and second differences, each with the mu of maximum likelihood, where they suit and where they do not."""
+    rows = []
+    truths = {"swings slowly": trending, "walks at random": lambda seed: random_walk(seed, 320)}
+    for name, make in truths.items():
+        for order in (1, 2):
+            errors: list[tuple[float, ...]] = []
+            for seed in range(SEEDS):
+                phi, y, theta = make(seed)
+                y, seen, known, later = y[:300], phi[:300], theta[:300], theta[300:]
+                run = track(TWO, tune(TWO, FLS(differences=order), y, seen).tracker, y, seen)
+                paths = (run.theta[50:] - known[50:], run.smooth().theta - known, run.forecast(20).theta - later)
+                errors.append(tuple(rms(path) for path in paths))
+            rows.append([f"{name}: differences={order}", *(f"{value:.3f}" for value in np.median(errors, axis=0))])
+    table(
+        f"Errors of theta (rms), mu by maximum likelihood, median of {SEEDS} records",
+        ["", "filtered", "smoothed", "20 samples ahead"],
+        rows,
+    )
+
+
+def maintained(seed: int, T: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A gain that only changes at sample 150, on maintenance, beside an offset that drifts; and what is known of it."""
+    rng = np.random.default_rng(seed)
+    theta = np.column_stack([np.where(np.arange(T) < 150, 1.0, 1.6), np.cumsum(0.05 * rng.standard_normal(T))])
+    phi = np.column_stack([rng.standard_normal(T), np.ones(T)])
+    y = np.sum(phi * theta, axis=1) + 0.5 * rng.standard_normal(T)
+    drift = np.column_stack([np.where(np.arange(T) == 150, 1e3, 0.0), np.ones(T)])
+    return phi, y, theta, drift
+
+
+def known_changes() -> None:
+    """A drift for every step and parameter against one that maximum likelihood finds for each parameter."""
+    found: dict[str, list[list[float]]] = {}
+    for seed in range(SEEDS):
+        phi, y, theta, drift = maintained(seed)
+        tuned = tune(TWO, Kalman(), y, phi, groups="each").tracker
+        for name, run in {
+            "a drift for each parameter, maximum likelihood": track(TWO, tuned, y, phi),
+            "FLS(100), drift of the gain at sample 150 only": track(TWO, FLS(100.0), y, phi, drift=drift),
+        }.items():
+            errors = [rms(run.theta[50:, i] - theta[50:, i]) for i in (0, 1)]
+            errors += [rms(run.smooth().theta[:, i] - theta[:, i]) for i in (0, 1)]
+            found.setdefault(name, []).append(errors)
+    rows = [[name, *(f"{value:.3f}" for value in np.median(errors, axis=0))] for name, errors in found.items()]
+    table(
+        f"A gain that changes once, at a known time, median of {SEEDS} records, error (rms)",
+        ["", "gain, filtered", "offset", "gain, smoothed", "offset"],
+        rows,
+    )
+
+
 def pictures(folder: Path) -> None:
     phi, y, theta = random_walk(3)
     smoothed = track(TWO, FLS(100.0), y, phi).smooth()
@@ -181,6 +242,31 @@ def pictures(folder: Path) -> None:
         axis.legend(loc="best", fontsize=8, ncols=3, frameon=False)
     right.set_xlabel("sample")
     figure.savefig(folder / "fls_robust.png", dpi=110)
+    second_differences().savefig(folder / "fls_second.png", dpi=110)
+
+
+def second_differences() -> Figure:
+    """The first coefficient of a slow swing, smoothed and forecast with first and with second differences."""
+    phi, y, theta = trending(1, ahead=60)
+    figure = Figure(figsize=(9.0, 5.6), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True, sharey=True)
+    for order, axis in enumerate(axes, start=1):
+        run = track(TWO, tune(TWO, FLS(differences=order), y[:300], phi[:300]).tracker, y[:300], phi[:300])
+        path, ahead = run.smooth(), run.forecast(60)
+        t = np.arange(360)
+        mean = np.append(path.theta[:, 0], ahead.theta[:, 0])
+        half = 1.96 * np.append(path.std[:, 0], ahead.std[:, 0])
+        axis.set_title(f"differences={order}", fontsize=9, loc="left")
+        axis.fill_between(t, mean - half, mean + half, color=BLUE, alpha=0.15, lw=0)
+        axis.plot(t, mean, color=BLUE, lw=1.4, label="smoothed, then forecast")
+        axis.plot(t, theta[:, 0], color=RED, lw=0.9, label="truth")
+        axis.axvline(299.5, color=GREY, lw=0.8, ls=":")
+        axis.set_ylim(-2.4, 2.4)
+        axis.set_ylabel("gain")
+        axis.grid(alpha=0.25, lw=0.5)
+    axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
+    axes[1].set_xlabel("sample")
+    return figure
 
 
 def main(folder: str | None = None) -> None:
@@ -188,6 +274,8 @@ def main(folder: str | None = None) -> None:
     robust()
     sweeps()
     forecasts()
+    differences()
+    known_changes()
     if folder:
         pictures(Path(folder))
 

@@ -89,3 +89,27 @@ def inverse(A):
             if k != i:
                 M[k] = [a - M[k][i] * b for a, b in zip(M[k], M[i], strict=True)]
     return [row[n:] for row in M]
+
+
+def second_differences(phi, y, mu, dt=None, drift=1.0, weight=1.0):
+    """The rows of the cost with second differences: (A, b) with J = |A theta - b|^2."""
+    L, n = phi.shape
+    dt, drift, w = np.ones(L) if dt is None else dt, np.ones((L, n)) * drift, np.ones(L) * weight
+    A, b = np.zeros((L + (L - 2) * n, L, n)), np.zeros(L + (L - 2) * n)
+    for k in range(L):
+        A[k, k], b[k] = np.sqrt(w[k]) * phi[k], np.sqrt(w[k]) * y[k]
+    for k in range(1, L - 1):
+        for i in range(n):
+            row, price = A[L + (k - 1) * n + i], np.sqrt(mu / (dt[k + 1] * drift[k + 1, i]))
+            row[k + 1, i], row[k - 1, i] = price / dt[k + 1], price / dt[k]
+            row[k, i] = -price / dt[k + 1] - price / dt[k]
+    return A.reshape(len(A), L * n), b
+
+
+def exact_normal_equations(A, b):
+    """(theta, diagonal of the inverse) of |A theta - b|^2 in eighty digits."""
+    rows = [[Decimal(float(v)) for v in row] for row in A]
+    columns = [list(column) for column in zip(*rows, strict=True)]
+    right = [sum(v * Decimal(float(c)) for v, c in zip(column, b, strict=True)) for column in columns]
+    C = inverse([[sum(u * v for u, v in zip(p, q, strict=True)) for q in columns] for p in columns])
+    return np.array(apply(C, right), dtype=float), np.array([C[i][i] for i in range(len(C))], dtype=float)

@@ -11,10 +11,11 @@ import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, track
 from driftfit.checks import check_tracker
-from driftfit.drivers import TrackerSteps, unknown
+from driftfit.drivers import TrackerSteps, nothing_told, unknown
 from driftfit.kernel import kernel, nothing
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import prediction
+from driftfit.trackers.kalman import INDEPENDENT
 
 
 def steps(predict, correct) -> TrackerSteps:
@@ -115,6 +116,14 @@ class Boastful(NLMS):
     kind = TrackerSteps(nothing, follow)
 
 
+class Deaf(Kalman):
+    """Promises a drift for each parameter and is not told of any."""
+
+    @property
+    def steps(self) -> TrackerSteps:
+        return INDEPENDENT._replace(told=nothing_told)
+
+
 @dataclass
 class Loose(Tracker):
     gain: Any = 0.5
@@ -145,6 +154,7 @@ def test_trackers_that_keep_their_promises(tracker):
         (Bold(), ["poison theta"]),
         (Hindsight(), ["depends on that output", "s.e is not"]),
         (Boastful(), ["It does not run"]),
+        (Deaf(q=1e-4, r=0.01), ["drift_each = True"]),
         (Loose(), ["frozen=True"]),
         (NLMS(gain=0.0), ["does not follow a constant system"]),
     ],

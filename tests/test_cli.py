@@ -9,6 +9,8 @@ import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
 from driftfit.export import as_table
 from driftfit.files import read_columns
+from driftfit.models.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial
+from driftfit.models.hammerstein_wiener import HammersteinWiener
 
 runner = CliRunner()
 SETTINGS = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
@@ -164,6 +166,9 @@ def test_missing_and_unreadable_files(file, tmp_path):
         ("arx", "missing 1 required"),
         ("arx:1,1/1", "2 inputs"),
         ("arx:1,1,start=later", "'drop', 'zero'"),
+        ("hammerstein-wiener:1,1,input=cubic/3", "polynomial/DEGREE"),
+        ("hammerstein-wiener:1,1,input=polynomial/2/3", "too many"),
+        ("hammerstein-wiener:1,1,input=legendre/2/3/1", "low below high"),
     ],
 )
 def test_wrong_models(file, model, hint):
@@ -212,6 +217,13 @@ def test_values():
     assert kalman == Kalman(q=(1e-4, 0.0), r=0.1, p0=None, theta0=-1.0)
     assert cli.parse_model("ARX:2,1/2,nk=0/1,intercept") == ARX(2, (1, 2), (0, 1), intercept=True)
     assert cli.parse_model("arx: na=2, nb=0") == ARX(2, 0)
+    for words, basis in (
+        ("polynomial/3", Polynomial(3)), ("Legendre/4/-2/2.5", Legendre(4, (-2, 2.5))),
+        ("piecewise-linear/-1/0/1", PiecewiseLinear([-1, 0, 1])), ("bspline/2/-1/0/1", BSpline(2, [-1, 0, 1])),
+        ("dead-zone/3", DeadZone(3)),
+    ):  # fmt: skip
+        model = cli.parse_model(f"hammerstein-wiener:1,2,input={words}")
+        assert model == HammersteinWiener(1, 2, input=basis)
     assert cli.parse_model("arx:1,intercept=false,start=zero") == ARX(1, start="zero")
     assert cli.parse_model("regression:intercept").bind(["a"]) == Regression(["a"], intercept=True)
 

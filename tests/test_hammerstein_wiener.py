@@ -11,6 +11,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 from support import same
 
 from driftfit import ARX, RLS, Kalman, Live, Track, track
+from driftfit.blocks.free_run import believed
 from driftfit.drivers import TrackerSteps, unknown
 from driftfit.kernel import kernel, nothing
 from driftfit.models.basis import (
@@ -453,3 +454,50 @@ def test_the_likelihood_of_y_integrates_to_one():
     assert np.trapezoid(density * model.slope(theta, y), y) == pytest.approx(1.0, abs=1e-4)
     theta[:, 1:] = d
     assert 1.004 < np.trapezoid(density * model.slope(theta, y), y) < 1.02
+
+
+def test_an_absurd_output_spoils_no_prediction():
+    """A number of 1e30, alone, at the beginning or later: the grid forgets it or never believes it."""
+    s = example(1, 3, T=300)
+    still = Still((-0.6, 0.4, 0.7, -0.36, -0.4, 0.6, *np.zeros(8)))
+    usual = track(s.model, still, s.y, s.u).prediction[200:]
+    inside = np.abs(usual) < 1.0
+    assert inside.sum() > 50
+    for at in (0, 150):
+        y = s.y.copy()
+        y[at] = 1e30
+        with pytest.warns(UserWarning, match="root mean square"):
+            run = track(s.model, still, y, s.u)
+        np.testing.assert_allclose(run.prediction[200:][inside], usual[inside], atol=1e-9)
+        low, high = believed(y)
+        assert low[-1] > -10.0
+        assert high[-1] < 10.0
+
+
+def test_forecasts_have_the_unit_of_the_output():
+    """The spread of what came, h samples ahead, is what the forecast said: constants known, equation noise."""
+    rng = np.random.default_rng(11)
+    model, e = HammersteinWiener(1, 1, output=Polynomial(3)), 0.02
+    weights = (-0.8, 0.5, 0.4, 0.6)
+    errors, said = [], []
+    for _ in range(150):
+        u = np.concatenate([rng.normal(size=40), np.zeros(5)])
+        s = simulate(model, [weights[0]], [weights[1]], [], weights[2:], T=45, rng=rng, u=u, equation_noise=e)
+        theta0 = (*weights, weights[0] * weights[2], weights[0] * weights[3])
+        run = track(model, Kalman(q=0.0, r=e * e, p0=1e-12, theta0=theta0), s.y[:40], s.u[:40])
+        ahead = run.forecast(5, s.u[40:])
+        errors.append(s.y[40:] - ahead.y_hat)
+        said.append(ahead.y_std)
+    ratio = np.sqrt(np.mean((np.array(errors) / np.array(said)) ** 2, axis=0))
+    assert (np.abs(ratio - 1.0) < 0.2).all()
+    assert np.mean(said, axis=0)[4] > 1.5 * np.mean(said, axis=0)[0]
+
+
+def test_a_run_goes_on_with_its_own_model_only():
+    rng = np.random.default_rng(12)
+    y, u = rng.uniform(-1.0, 1.0, (2, 60))
+    run = track(SMALL, K, y[:30], u[:30])
+    again = track(SMALL, K, y[30:], u[30:], warm_start=run)
+    assert same(again.theta, track(SMALL, K, y, u).theta[30:])
+    with pytest.raises(ValueError, match="followed"):
+        track(HammersteinWiener(1, 1, input=Legendre(2, (-1, 1)), output=Polynomial(2)), K, y, u, warm_start=run)

@@ -154,8 +154,12 @@ def test_what_does_not_fit_is_named():
         track(Regression(2, ny=2, shared=True), FLS(1.0), z, phi[:, 0])
     with pytest.raises(ValueError, match="carries no covariance"):
         track(Regression(2, ny=2, shared=True), AugmentedFLS(1.0), z, phi)
-    with pytest.raises(ValueError, match="for single outputs"):
-        track(ARX(1, 1, ny=2), [FLS(1.0), FLS(2.0)], y, u)
+    with pytest.raises(ValueError, match="must be of one kind and form"):
+        track(ARX(1, 1, ny=2), {"y1": FLS(1.0), "y2": RLS(0.9)}, y, u)
+    with pytest.raises(ValueError, match="trackers were given for level"):
+        track(ARX(1, 1, ny=2), {"level": FLS(1.0)}, y, u)
+    with pytest.raises(ValueError, match="one for each output by its name"):
+        Live(ARX(1, 1, inputs=1, ny=2), [FLS(1.0), FLS(2.0)])
     with pytest.raises(KeyError, match="no output"):
         track(ARX(1, 1, ny=2), FLS(1.0), y, u)["flow"]
     with pytest.raises(ValueError, match="u must have shape"):

@@ -3,8 +3,10 @@
 import naive_smoother as naive
 import numpy as np
 import pytest
+from scipy.linalg import solveh_banded
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, track
+from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
+from driftfit.models.basis import Polynomial
 from driftfit.smoothers import exact
 from driftfit.smoothers.walk import Walk
 
@@ -173,9 +175,11 @@ def test_a_sample_that_alone_excites_a_direction_cannot_be_left_out():
     phi = np.tile([1.0, 2.0], (12, 1))
     phi[6] = [0.0, 1.0]
     run = track(Regression(2), FLS(mu=1.0), record(12, 2)[1], phi)
-    loo = run.smooth().loo
-    assert np.isnan(loo[6])
-    assert np.isfinite(np.delete(loo, 6)).all()
+    path = run.smooth()
+    assert np.isnan(path.loo[6])
+    assert np.isfinite(np.delete(path.loo, 6)).all()
+    assert path.alone == 1
+    assert path.press == pytest.approx(np.mean(np.delete(path.loo, 6) ** 2))
 
 
 class TestInvariances:
@@ -255,6 +259,34 @@ def test_directions_that_are_never_excited_keep_theta0(mu):
     np.testing.assert_allclose(found.theta @ across, theta0 @ across, rtol=1e-10 if mu == 1.0 else 1e-7)
     along = exact.smooth(walk(phi @ direction[:, None], y, mu)).theta[:, 0]
     close(found.theta @ direction, along, 1e-10 if mu == 1.0 else 1e-7)
+
+
+def test_fewer_samples_than_parameters():
+    phi, y = record(2, 4)
+    theta0 = np.array([1.0, -1.0, 2.0, 0.5])
+    found = exact.smooth(walk(phi, y, 0.7, theta0=theta0))
+    assert found.rank.tolist() == [1, 2]
+    assert np.isinf(found.var).all()
+    hidden = np.linalg.svd(phi)[2][2:]
+    np.testing.assert_allclose(found.theta @ hidden.T, np.tile(hidden @ theta0, (2, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.sum(phi * found.theta, axis=1), y, atol=1e-12)
+
+
+@pytest.mark.parametrize("mu", [0.1, 30.0])
+def test_path_is_that_of_the_banded_normal_equations(mu):
+    L, n = 200, 5
+    phi, y = record(L, n)
+    ab = np.zeros((2 * n, L * n))  # lower form: ab[i - j, j]
+    ab[n, : (L - 1) * n] = -mu
+    for k in range(L):
+        block = np.outer(phi[k], phi[k]) + mu * ((k > 0) + (k < L - 1)) * np.eye(n)
+        for i in range(n):
+            for j in range(i + 1):
+                ab[i - j, k * n + j] += block[i, j]
+    banded = solveh_banded(ab, (phi * y[:, None]).ravel(), lower=True).reshape(L, n)
+    found = exact.smooth(walk(phi, y, mu))
+    assert found.method == "fast"
+    close(found.theta, banded, 1e-10)
 
 
 def test_regressors_of_zero_no_sample_and_one_sample():
@@ -352,3 +384,24 @@ def test_what_the_record_does_not_determine_is_as_asked():
         run.smooth(undetermined="raise")
     with pytest.raises(ValueError, match="undetermined"):
         run.smooth(undetermined="zero")
+
+
+def test_noise_that_the_model_adds_is_the_noise_of_the_smoother():
+    """Measurement noise that comes in through a curve, beside the user's weights: the last point is the filter's."""
+    s = linear_record()
+    weights = np.random.default_rng(2).uniform(0.3, 2.0, len(s[0]))
+    model = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2), output_noise=0.05)
+    run = track(model, Kalman(q=1e-5, r=0.02, p0=1.0), *s, weights=weights)
+    path = run.smooth("cov")
+    np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(path.cov(-1), run.cov(-1), rtol=1e-8)
+    used = path.walk.weight > 0.0
+    assert np.ptp(path.walk.weight[used] / weights[used]) > 0.1
+
+
+def linear_record():
+    rng = np.random.default_rng(1)
+    u, y = rng.uniform(-1.0, 1.0, 150), np.zeros(150)
+    for t in range(1, 150):
+        y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.02 * rng.standard_normal()
+    return y + 0.05 * rng.standard_normal(150), u

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Live, Regression, track
+from driftfit.models.basis import Polynomial
 from driftfit.smoothers.augmented import augmented
 from driftfit.smoothers.huber import huber
 from driftfit.smoothers.total_variation import total_variation
@@ -244,6 +245,9 @@ class TestFixedLag:
     def test_what_cannot_be_smoothed_says_so(self):
         with pytest.raises(ValueError, match="no samples are kept"):
             Live(Regression(2), FLS(1.0)).smooth()
+        noisy = HammersteinWiener(1, 1, output=Polynomial(2), output_noise=0.1)
+        with pytest.raises(ValueError, match="what the measurement noise of the model adds"):
+            Live(noisy, Kalman(0.1, 0.4, p0=1.0), lag=3)
         with pytest.raises(ValueError, match="lag must be a whole number"):
             Live(Regression(2), FLS(1.0), lag=-1)
         with pytest.raises(ValueError, match="track with FLS or Kalman"):

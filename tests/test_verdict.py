@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 from support import THETA, arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
 from driftfit.judges.attribute import attribute, holm
 from driftfit.judges.constancy import constancy, robust_fit
+from driftfit.judges.constants import constant_least_squares
 from driftfit.judges.paired import newey_west, paired
 from driftfit.judges.quadratic import quantile, tail
 from driftfit.judges.whiteness import crossing, whiteness
@@ -53,7 +54,7 @@ def test_stationary_null_is_the_published_table(n, published):
 def test_null_is_that_of_a_naive_simulation(noise):
     """Multiplying the scores by independent signs of mean zero, with regressors fixed, gives the same p-values."""
     phi, y = record(240, 3, noise)
-    got = constancy(phi, y)
+    got = constancy(phi, y, 0)
     scores = phi * got.fit.psi[:, None]
     rng, G = np.random.default_rng(1), np.linalg.inv(phi.T @ (phi * got.fit.inside[:, None]))
     A = np.cumsum(phi[:, :, None] * phi[:, None, :] * got.fit.inside[:, None, None], axis=0)
@@ -76,17 +77,36 @@ def test_error_rate(noise):
     assert abs(np.mean(said) - 0.2) < 3.0 * np.sqrt(0.16 / 50)
 
 
-def test_correlated_noise_needs_lags():
-    def p(seed, lags):
-        rng = np.random.default_rng(seed)
-        phi, e = np.ones((400, 1)), rng.normal(size=400)
-        for t in range(1, 400):
-            e[t] += 0.5 * e[t - 1]
-        return constancy(phi, 1.0 + e, lags).p_joint
+def correlated(seed, T=300, rho=0.6, jump=0.0):
+    """A regression whose inputs and noise are autoregressions."""
+    rng = np.random.default_rng(seed)
+    slow = signal.lfilter([1.0], [1.0, -0.8], rng.normal(size=T))
+    e = signal.lfilter([np.sqrt(1.0 - rho * rho)], [1.0, -rho], rng.normal(size=T))
+    phi = np.column_stack([slow, np.ones(T)])
+    return phi, phi @ [1.0, 2.0] + jump * slow * (np.arange(T) >= T // 2) + e
 
-    plain, allowed = (np.mean([p(seed, lags) < 0.05 for seed in range(60)]) for lags in (0, 10))
-    assert plain > 0.2
+
+def test_correlated_noise_does_not_pass_for_drift():
+    """Without lags constants in correlated noise are rejected half of the time; lags are found, and drift still is."""
+    plain, allowed, found = (
+        np.mean([constancy(*correlated(seed, jump=jump), lags).p_joint < 0.05 for seed in range(40)])
+        for jump, lags in ((0.0, 0), (0.0, None), (0.8, None))
+    )
+    assert plain > 0.3
     assert allowed < 0.15
+    assert found > 0.6
+
+
+def test_white_scores_need_no_lags_and_drift_does_not_pass_for_correlation():
+    """Noise that is white, steady or not, and a jump that makes the residuals of constants correlated."""
+    for noise, most in (("steady", 0), ("changing", 2)):
+        lags = [constancy(*record(300, seed, noise)).lags for seed in range(12)]
+        assert np.median(lags) <= most
+    phi, y = record(400, 3)
+    jumped = y + 3.0 * phi[:, 1] * (np.arange(400) >= 200)
+    assert constancy(phi, jumped).lags <= 5  # the rule of thumb
+    assert constancy(phi, jumped).p_joint < 1e-4
+    assert constancy(*correlated(1)).lags >= 3
 
 
 def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
@@ -219,3 +239,16 @@ def test_whiteness_does_not_mistake_changing_variance_for_correlation():
     assert whiteness(z[1:] + 0.5 * z[:-1]).p < 1e-4
     assert crossing(z[1:], z[:-1]).p > 0.001
     assert crossing(z[1:] + 0.5 * z[:-1], z[1:]).p < 1e-6
+
+
+def test_constants_are_those_of_rls_from_a_diffuse_start():
+    """Also with gaps that are filled, samples of other weights, and a regressor that starts late."""
+    y, u = damaged(*arx_record(300, 7))
+    u[:40] = 0.0
+    weights = np.where(np.arange(300) % 3 == 0, 0.2, 1.0)
+    steady = track(ARX(2, 2), RLS(1.0), y, u, weights=weights)
+    got = constant_least_squares(steady.model, y, steady.u, steady._known)
+    later = slice(60, None)
+    assert got["theta"][later, :, 0] == pytest.approx(steady.theta[later], rel=1e-6, abs=1e-9)
+    assert got["e"][later, 0] == pytest.approx(steady.innovation[later], rel=1e-6, abs=1e-8, nan_ok=True)
+    assert np.isfinite(got["theta"]).all()

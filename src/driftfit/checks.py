@@ -54,7 +54,7 @@ def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
     broken += _missing(tracker, bound)
     if broken and "poison" in broken[-1]:  # nothing else can be told apart
         return broken
-    for check in (_live, _lanes, _causal, _unused, _no_time, _variances, _rest, _saving, _learning):
+    for check in (_live, _lanes, _causal, _unused, _no_time, _each, _variances, _rest, _saving, _learning):
         broken += check(tracker, bound, run)
     return broken
 
@@ -178,6 +178,20 @@ def _no_time(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
         live.update(y[t], u[t])
     if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, (live.theta, live.cov), strict=True)):
         yield "Something happens although no time passes and nothing is used: with s.dt[l] = 0 predict changes nothing."
+
+
+def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
+    if not tracker.drift_each:
+        return
+    y, u = record()
+    drift = np.where(np.arange(T) % 20 == 0, 100.0, 1.0)
+    columns = np.repeat(drift[:, None], len(tracker.names_for(model)), axis=1)
+    one, each = (track(model, tracker, y, u, drift=given) for given in (drift, columns))
+    if not np.allclose(one.theta, each.theta, rtol=1e-6, atol=1e-9):
+        yield (
+            "It declares drift_each = True, but a drift for each parameter is not what the same drift for all is: give "
+            "its steps told=driftfit.trackers.each.told and multiply q by s.each[i, l] ** 2."
+        )
 
 
 def _variances(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:

@@ -109,7 +109,8 @@ def track(
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")] = None,
     report: Annotated[
-        Path | None, typer.Option(help="Write a page about the run (.html), to send to someone; not for fleets.")
+        Path | None,
+        typer.Option(help="Write a page (.html) to send to someone; a fleet has one page."),
     ] = None,
 ) -> None:
     """Follow the parameters of a model through a record, or through a fleet of them."""
@@ -119,8 +120,6 @@ def track(
         chosen = parse_tracker(tracker, p or [], own)
         if write_to is not None:
             check_ending(write_to)
-        if report is not None and by:
-            raise ValueError("--report: a page is about one series; leave out --by, or pick a series in Python.")
         signals: Any = {"y": y, "u": inputs, "data": file, "time": time, "by": by or None}
         with progress.status("tracking (the first run of a model and tracker compiles it)"):
             run: Any = run_track(bound, chosen, **signals, dt=parse_interval(dt), units=parse_units(unit))

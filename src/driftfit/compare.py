@@ -14,12 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.judges.seen import constant_least_squares
+from driftfit.judges.constants import constant_least_squares
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.result import Track, root_mean_square
-from driftfit.track import track
-from driftfit.trackers.rls import RLS
 
 
 class Comparison(NamedTuple):
@@ -57,12 +55,14 @@ class Errors(NamedTuple):
 def errors(run: Track) -> Errors:
     """One-step errors of a run, of persistence, of constant least squares and of constant ARX."""
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
-    gaps = run._known[:, 0]  # 0 before the lags are filled
-    time = None if len(gaps) == 1 else np.cumsum(np.where(gaps > 0.0, gaps, 1.0))
     steady = constant_least_squares(run.model, run.y, run.u, run._known)
-    arx = track(ARX(2, 1 if u.shape[1] else 0, intercept=True), RLS(1.0), y, u if u.shape[1] else None, time=time)
+    known = run._known[:, :3].copy()
+    known[:, 0] = np.where(known[:, 0] > 0.0, known[:, 0], 1.0)  # 0 before the lags of the run were filled
+    known[:, 1] = 1.0
+    small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
+    arx = constant_least_squares(small, y, u, known)
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    own = (tracked, y - persistence(y), constant, arx.innovation)
+    own = (tracked, y - persistence(y), constant, arx["e"][:, 0])
     scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
     for error in own:
         scored &= np.isfinite(error)

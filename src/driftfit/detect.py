@@ -6,9 +6,10 @@
 
 ``every`` is the number of samples in which one false alarm may begin (an alarm that stays on counts once).
 
-* band: z is the normal quantile of 1 / (every c) for c parameters watched. The rate holds for a parameter that stands
-  at the very edge of its band, where the run's std is right; inside the band alarms are rarer, and successive estimates
-  are alike, so that what begins is rarer than what exceeds. The rate is a bound.
+* band: z such that a Gaussian sequence begins to exceed it once in ``every`` times c samples, for c parameters watched.
+  Successive errors of an estimate have the correlation 1 / (1 + d), d = mean (theta_t - theta_(t-1))^2 / var_t, since
+  a step of the filter has the variance that it takes away. The rate holds for a parameter that stands at the very edge
+  of its band, where the run's std is right; inside the band alarms are rarer.
 * innovation: g = e / s; limits of the windowed sums of g^2 and of g from their exact rate of onsets
   (`driftfit.judges.onsets`), half of the rate for each. With ``reference`` the g are normal scores of the
   innovations among those of the reference, so that outliers and tails that were normal there are normal later.
@@ -17,7 +18,7 @@
   rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
 
 Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many
-runs as 5 every / T for a calibration.
+runs as 50 every / T for a calibration.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import StringIO
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ from rich.text import Text
 from scipy import special
 
 from driftfit.judges.calibrate import limit_of, null_records
-from driftfit.judges.onsets import held, mean_limit, onsets, power_limit
+from driftfit.judges.onsets import held, mean_limit, normal_limit, onsets, power_limit
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import near, one_of, whole
@@ -223,8 +223,16 @@ def _band(run: Track, every: float, reference: Reference, window: int) -> tuple[
     theta, std = run.theta[:, columns], run.std[:, columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         outside = np.maximum(theta - high, low - theta) / std
-    z = NormalDist().inv_cdf(1.0 - 1.0 / (every * len(names)))
-    return np.where(np.isfinite(std), outside, np.nan), np.full(len(names), z), names, start
+    limits = np.array([normal_limit(rho, every * len(names)) for rho in _alike(theta[_burn(run) :], std[_burn(run) :])])
+    return np.where(np.isfinite(std), outside, np.nan), limits, names, start
+
+
+def _alike(theta: Array, std: Array) -> Array:
+    """(c,): correlation of successive errors of estimates theta (T, c)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = np.diff(theta, axis=0) ** 2 / std[1:] ** 2
+    d = np.array([np.mean(column[np.isfinite(column)]) if np.isfinite(column).any() else 1.0 for column in step.T])
+    return np.asarray(1.0 / (1.0 + d))
 
 
 def _reference(run: Track, reference: Any, start: int) -> int:

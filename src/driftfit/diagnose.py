@@ -32,7 +32,8 @@ from driftfit.compare import errors
 from driftfit.drivers import LARGEST
 from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.excitation import INDEX, Excitation, excitation
-from driftfit.judges.seen import Seen, regressors
+from driftfit.judges.regressors import Rows, regressors
+from driftfit.judges.scale import core
 from driftfit.judges.whiteness import Whiteness, crossing, whiteness
 from driftfit.kernel import Array
 from driftfit.result import Track, root_mean_square
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
 PARTS = 10
 BEYOND = 4.0
 """Standard deviations from which on an innovation counts as an outlier."""
-INSIDE = 0.9733
-"""Mean square of a Gaussian within three standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class Diagnosis:
     white: Whiteness = field(repr=False, compare=False)
     excited: Excitation = field(repr=False, compare=False)
     constant: Constancy = field(repr=False, compare=False)
-    seen: Seen = field(repr=False, compare=False)
+    rows: Rows = field(repr=False, compare=False)
 
     @property
     def ok(self) -> bool:
@@ -128,10 +127,10 @@ def diagnose(run: Track) -> Diagnosis:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = run.innovation / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
-    seen = regressors(run)
+    rows = regressors(run)
     # without a covariance there is no scale, but correlation needs none
     white = whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
-    excited, constant = excitation(seen.phi), constancy(seen.phi, seen.y)
+    excited, constant = excitation(rows.phi), constancy(rows.phi, rows.y)
     checks = (
         _whiteness(white),
         *_inputs(run, z),
@@ -140,7 +139,7 @@ def diagnose(run: Track) -> Diagnosis:
         _excitation(run, excited),
         _constancy(run, constant),
     )
-    return Diagnosis(checks, run, z, white, excited, constant, seen)
+    return Diagnosis(checks, run, z, white, excited, constant, rows)
 
 
 def _whiteness(white: Whiteness) -> Check:
@@ -174,15 +173,6 @@ def _inputs(run: Track, z: Array) -> list[Check]:
     return [Check("inputs (p)", min(1.0, float(p[worst]) * len(p)), 0.01, np.inf, advice)]
 
 
-def _core(z: Array) -> float:
-    """Mean square of z without its outliers, 1 for a Gaussian of variance 1; NaN for fewer than ten."""
-    z = z[np.isfinite(z)]
-    if len(z) < 10:
-        return float("nan")
-    limit = 3.0 * 1.4826 * float(np.median(np.abs(z)))
-    return float(np.mean(z[np.abs(z) <= limit] ** 2)) / INSIDE
-
-
 def _robust(run: Track) -> bool:
     """Whether the tracker discounts outliers and follows the noise by itself."""
     return isinstance(run.tracker, AdaptiveKalman)
@@ -190,7 +180,7 @@ def _robust(run: Track) -> bool:
 
 def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
     count = int(np.isfinite(z).sum())
-    level = _core(z)
+    level = core(z)
     slack = 3.0 * np.sqrt(2.0 / count) if count else 0.0
     sign = white.r[0] if len(white.r) and white.p < 0.05 else 0.0
     if level > 1.0:
@@ -198,7 +188,7 @@ def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
     else:
         what = f"smaller than it says; lower {'q, since one overshoots the last' if sign < 0.0 else 'r'}"
     advice = f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() finds the numbers."
-    levels = np.array([_core(part) for part in np.array_split(z, PARTS)])
+    levels = np.array([core(part) for part in np.array_split(z, PARTS)])
     ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")
     wide = 3.0 * np.exp(2.0 * slack * np.sqrt(PARTS) / 2.0) if count else 3.0
     changing = (
@@ -254,7 +244,7 @@ def _constancy(run: Track, test: Constancy) -> Check:
         f"Constants are not rejected, and predict better ({steady:.4g} against {own:.4g}): the drift is set too high. "
         "Lower q or raise the memory; tune() finds it."
     )
-    return Check("constancy (p)", test.p_joint, -np.inf, 0.05 if own > 1.01 * steady else np.inf, advice)
+    return Check("constancy (p)", test.p_joint, -np.inf, 0.05 if own > 1.03 * steady else np.inf, advice)
 
 
 def holds_constant(run: Track) -> bool:

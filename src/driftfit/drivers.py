@@ -17,7 +17,7 @@ elsewhere). Models and trackers add their own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -38,11 +38,19 @@ INPUTS = types.Array(types.float64, 1, "A", readonly=True)
 """The compiler's type of the inputs of one sample."""
 
 
+def no_preparation(L: int) -> None:
+    """Steps that call nothing by symbol need none."""
+
+
 class ModelSteps(NamedTuple):
-    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags."""
+    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
+
+    ``ready(L)`` brings what they call by symbol within reach, before a tile of L lanes is driven for the first time.
+    """
 
     regress: Step
     push: Step
+    ready: Callable[[int], None] = no_preparation
 
 
 @kernel
@@ -241,7 +249,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u; both take what is known from
     the fields ``interval``, ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
     """
-    regress, push = model
+    regress, push, ready = model
+    ready(1)
     told = tracker.told
     store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
     advance = _advance(tracker)
@@ -322,6 +331,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         inputs = {"y": y, "u": u, "known": known}
         inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
         _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
         run(tile, *inputs.values(), out)
 
     return Drivers(checked, update, update_one)

@@ -23,6 +23,9 @@ from driftfit.settings import one_of
 
 if TYPE_CHECKING:
     from driftfit.fleet import Fleet
+    from driftfit.outputs import Outputs
+    from driftfit.shared_outputs import Shared
+    from driftfit.track_outputs import OutputsFleet
 
 ENDINGS = (".csv", ".parquet", ".npz")
 _OWN = ("prediction", "innovation", "innovation_std", "ok")
@@ -50,7 +53,7 @@ def _runs(result: Track | Fleet) -> tuple[list[Track], list[Any]]:
     return ([result], []) if isinstance(result, Track) else (list(result.values()), list(result))
 
 
-def _time_name(run: Track) -> str:
+def _time_name(run: Track | Outputs | Shared) -> str:
     return run.labels.time or ("sample" if run._time is None else "time")
 
 
@@ -80,6 +83,33 @@ def units_of(result: Track | Fleet) -> dict[str, str]:
     for name, unit in zip(run.names, run.units, strict=True):
         units |= {f"theta_{name}": unit, f"std_{name}": unit} if unit else {}
     return units
+
+
+def outputs_table(runs: Outputs | Shared | OutputsFleet, kind: str = "polars") -> Any:
+    """Records of several outputs: each result with its output in brackets, parameters under their names."""
+    one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
+    if isinstance(runs, dict):
+        parts = []
+        for key, run in runs.items():
+            keys = zip(runs.by, key if isinstance(key, tuple) else (key,), strict=True)
+            parts.append(_of_outputs(run).select([*(pl.lit(k).alias(name) for name, k in keys), pl.all()]))
+        table = pl.concat(parts)
+    else:
+        table = _of_outputs(runs)
+    return table if kind == "polars" else table.to_pandas() if kind == "pandas" else table.to_arrow()
+
+
+def _of_outputs(run: Outputs | Shared) -> pl.DataFrame:
+    columns: dict[str, Any] = {_time_name(run): run.time}
+    for j, output in enumerate(run.outputs):
+        columns[_free(output)] = run.y[:, j]
+        columns |= {f"{name}[{output}]": getattr(run, name)[:, j] for name in _OWN}
+    shared = run.model.shared
+    for j, names in enumerate([run.names] if shared else run.names):
+        theta, std = (run.theta, run.std) if shared else (run.theta[:, j], run.std[:, j])
+        for i, name in enumerate(names):
+            columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
+    return pl.DataFrame(columns)
 
 
 def to_table(result: Track | Fleet, kind: str = "polars") -> Any:

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.drivers import drivers, make_tile, output_type, repeat_tile
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import Records
@@ -62,7 +63,7 @@ class Place(NamedTuple):
     lane: int
 
 
-class Fleet:
+class Fleet(JudgedMany):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
@@ -121,6 +122,9 @@ class Fleet:
     def items(self) -> Iterator[tuple[Hashable, Track]]:
         """Keys and results."""
         return ((key, self._track(k)) for key, k in self._index.items())
+
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(self.items())
 
     def __iter__(self) -> Iterator[Hashable]:
         return iter(self._index)
@@ -324,7 +328,7 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     """Run one tile over its first ``stop`` samples, block by block."""
     L = len(job.series)
     first, length = records.first[job.series], records.length[job.series]
-    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)))
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)), records.known.shape[1])
     finals: dict[int, Array] = {}
     bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
@@ -337,9 +341,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
         _words(job.tile, L)[:, lane] = words
 
 
-def _block(L: int, m: int, factors: int) -> tuple[Array, Array, Array]:
+def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
     """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
-    shapes = (BLOCK, L), (BLOCK, m, L), (factors, 3, L)
+    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
     if getattr(_thread, "shapes", None) != shapes:
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block
@@ -372,6 +376,6 @@ def _gather(
             for l in range(L):
                 to_u[t, j, l] = u[start[l] + t, j] if there[l] else np.nan
     for t in range(b - a if changing else 1):
-        for j in range(3):
+        for j in range(known.shape[1]):
             for l in range(L):
                 to_known[t, j, l] = known[(start[l] + t) * changing, j] if there[l] else 1.0 * (j > 0)

@@ -74,6 +74,8 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
         return str(value.__name__)
     if isinstance(value, bool | int | float | str | type(None) | np.generic):
         return repr(value)
+    if isinstance(value, np.ndarray):  # a constant to the compiler
+        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
     if hasattr(value, "identity"):
         return str(value.identity)
     raise TypeError(
@@ -83,10 +85,21 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
     )
 
 
-def _identified(dispatcher: Any) -> Any:
-    """Let Numba's cache and `identity` know a compiled function by what it does."""
-    dispatcher.identity = identity(dispatcher.py_func)
-    dispatcher._set_uuid(dispatcher.identity)
+def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
+    """Compile under IEEE rules and without the GIL; Numba's cache and `identity` know it by what it does.
+
+    What is kept on disk gets a name that goes with its identity: Numba's cache for a function does not see that a
+    function in another file, which this one calls, was edited.
+    """
+    assert isinstance(function, FunctionType)
+    name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
+    if cache:
+        source = function
+        function = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
+        function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
+    dispatcher = njit(error_model="numpy", nogil=True, cache=cache, **options)(function)
+    dispatcher.identity = name
+    dispatcher._set_uuid(name)
     return dispatcher
 
 
@@ -96,8 +109,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     Always inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at
     n = 4). Division follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
-    assert isinstance(function, FunctionType)
-    return _identified(njit(forceinline=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function))
+    return _compiled(function, forceinline=True, no_cfunc_wrapper=True)
 
 
 def shared(function: Callable[..., Any]) -> Any:
@@ -106,8 +118,10 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     is compiled once and found on disk after that.
     """
-    assert isinstance(function, FunctionType)
-    return _identified(njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True, cache=True)(function))
+    return _compiled(function, cache=True, no_cfunc_wrapper=True)
+
+
+_PLAIN = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False}
 
 
 def core(function: Callable[..., Any]) -> Any:
@@ -116,13 +130,26 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    assert isinstance(function, FunctionType)
-    options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
-    return _identified(njit(cache=True, _nrt=False, **options)(function))
+    return _compiled(function, cache=True, **_PLAIN)
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides.
+
+    Passing a few dozen arrays may cost more than the work on them.
+    """
+    return _compiled(function, cache=True, forceinline=True, **_PLAIN)
+
+
+def named(function: Any, *parts: Any) -> Any:
+    """A function whose place on disk is its own: closures of one name would share an index."""
+    text = "\n".join(str(getattr(one, "identity", one)) for one in parts)
+    function.__qualname__ += "_" + hashlib.sha256(text.encode()).hexdigest()[:12]
+    return function
 
 
 class Outside(types.ExternalFunction):
-    """A machine that steps call by its symbol, with the address of a table: compiled once for all drivers.
+    """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
     What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
     compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
@@ -138,7 +165,7 @@ class Outside(types.ExternalFunction):
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
             dispatcher = _OUTSIDE[self.symbol]
-            dispatcher.compile((types.intp,))
+            dispatcher.compile(self.sig.args)
             owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
             _LOADED[self.symbol] = owner  # of the code, which would go with it
             add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
@@ -155,11 +182,13 @@ def _machine(symbol: str) -> Outside:
 
 
 def outside(function: Callable[..., Any]) -> Outside:
-    """Make a machine of a function of one address."""
+    """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
-    dispatcher = _identified(njit(error_model="numpy", nogil=True, cache=True)(function))
+    dispatcher = _compiled(function, cache=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
-    machine = Outside(symbol, types.void(types.intp))
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
+    machine = Outside(symbol, types.void(*kinds))
     machine.identity = dispatcher.identity
     _OUTSIDE[symbol] = dispatcher
     _MACHINES[symbol] = machine
@@ -182,8 +211,7 @@ _pointer._set_uuid("pointer")  # Numba would give it a new one in every process,
 
 def routine(function: Callable[..., Any]) -> Any:
     """Compile a part of a step that the lane loop is better without: it may be called instead of inlined."""
-    assert isinstance(function, FunctionType)
-    return _identified(njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function))
+    return _compiled(function, no_cfunc_wrapper=True)
 
 
 class Driver:

@@ -98,8 +98,9 @@ class Live:
         ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
         otherwise. With ``time``, the interval since the last sample scales the drift; a time that is not after the last
         is counted in ``ignored`` and leaves the state alone. ``weight`` divides the noise variance of this sample (0:
-        do not use it), ``drift`` multiplies the drift before it. A `Bank` also takes ``prob``, prior probabilities of
-        its changes or joint events at this sample, and a ``drift`` for each change.
+        do not use it), ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk
+        trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events
+        at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
@@ -118,11 +119,12 @@ class Live:
         """One sample of which more is known than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
-            self.tracker.tell(self.lane(), prob, drift if each else None)
-        step = self._update_known(y, u, time, weight, 1.0 if each else float(drift))
-        if each or prob is not None:
-            self.tracker.tell(self.lane(), None, None)
-        return step
+            self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
+        try:
+            return self._update_known(y, u, time, weight, 1.0 if each else float(drift))
+        finally:
+            if each or prob is not None:
+                self.tracker.tell(self.lane(), self.model, None, None)
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
         interval = 1.0 if time is None else interval_of(self._last, time, self.dt)

@@ -8,13 +8,17 @@ from typing import Any, Self
 import numpy as np
 
 from driftfit import storage
-from driftfit.drivers import drivers, known_factors, output_type
+from driftfit.drivers import drivers, output_type
+from driftfit.joint import end_of, joint_tile, taken_over, trackers_of
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.outputs import joint_tile, row_model
+from driftfit.models.regression import Regression
 from driftfit.settings import whole
-from driftfit.signals import as_numbers, check_ready, factor, interval_of, noise_of
+from driftfit.shared_outputs import row_model
+from driftfit.signals import as_numbers, factor, interval_of, noise_of
+from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.trackers.base import Tracker
+from driftfit.warm import End, Run
 
 Steps = tuple[Array, Array, Array, Array]
 """(y_hat, e, s, ok), each (ny,)."""
@@ -23,66 +27,113 @@ Steps = tuple[Array, Array, Array, Array]
 class LiveOutputs:
     """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
 
-    ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. Times, weights and drifts are those of
-    `Live`.
+    ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
+    mapping from the name of each output to its own. Times and drifts are those of `Live`, weights too, or one for each
+    output; ``warm_start`` is a record or a stream of the same outputs.
     """
 
-    def __init__(self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0) -> None:
-        if whole("Live", "lag", lag, 0):
-            raise ValueError("Live: lag= is for single outputs.")
+    def __init__(self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None) -> None:
         self.model = model if model.shared else model.bind(model.m)
-        self.tracker = check_ready(tracker)
+        self.trackers = trackers_of(self.model, tracker)
         self.dt = dt
-        self._last: Any = None
+        self.lag = whole("Live", "lag", lag, 0)
+        if lag and warm_start is not None:
+            raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
+        self._last: Any = None if warm_start is None else warm_start.end().last
         self._ignored = 0
-        self._rows = row_model(self.model, tracker) if self.model.shared else self.model
-        self._tile = joint_tile(self._rows, tracker)
-        self._out = np.empty(1, output_type(self._tile, tracker.outputs))
-        self._run = drivers(self._rows.steps, tracker.steps_for(self._rows)).run
+        self._rows = row_model(self.model, self.trackers[0]) if self.model.shared else self.model
+        self._tile = joint_tile(self._rows, self.trackers, taken_over(warm_start, self._rows, self.trackers))
+        self._out = np.empty(1, output_type(self._tile, self.trackers[0].outputs))
+        self._run = drivers(self._rows.steps, self.trackers[0].steps_for(self._rows)).run
+        rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
+        self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
 
-    def update(self, y: Any, u: Any = None, time: Any = None, weight: float = 1.0, drift: float = 1.0) -> Steps:
+    def update(self, y: Any, u: Any = None, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
         """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta."""
+        ny = len(self.model.outputs)
         interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
         if not interval > 0.0:
             self._ignored += 1
-            nothing = np.full(len(self.model.outputs), np.nan)
-            return nothing, nothing, nothing, np.zeros(len(nothing), bool)
+            nothing = np.full(ny, np.nan)
+            return nothing, nothing, nothing, np.zeros(ny, bool)
+        known = self._known(interval, weight, drift)
+        step = self._step(self._tile, as_numbers("y", y), u, known, self._windows)
         self._last = self._last if time is None else time
-        known = known_factors(interval, noise_of(weight), factor("drift", drift))
-        return self._step(self._tile, as_numbers("y", y), u, known)
+        return step
+
+    def _known(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
+        """What the driver is told of one sample, (k, ny)."""
+        ny = len(self.model.outputs)
+        each = np.ndim(drift) == 1
+        known = np.ones((3, ny))
+        known[0], known[1] = interval, noise_of(weight, ny)
+        known[2] = 1.0 if each else factor("drift", drift)
+        if not each:
+            return known
+        columns = self.trackers[0].beside(self._rows, 1, None, np.asarray(drift)[None])
+        return np.vstack([known, np.repeat(columns.T, ny, axis=1)])
 
     def predict(self, u: Any = None) -> tuple[Array, Array]:
         """(y_hat, s), each (ny,): what the next outputs are expected to be; the state stays as it is."""
         missing = np.full(len(self.model.outputs), np.nan)
-        y_hat, _, s, _ = self._step(self._tile.copy(), missing, u, known_factors())
+        y_hat, _, s, _ = self._step(self._tile.copy(), missing, u, self._known(), [])
         return y_hat, s
 
-    def _step(self, tile: Array, y: Array, u: Any, known: Array) -> Steps:
+    def pass_by(self, y: Array, u: Any) -> None:
+        """Let one nominal sample pass whose outputs go to the lags and are not used."""
+        self._step(self._tile, y, u, self._known(weight=0.0), [])
+
+    def _step(self, tile: Array, y: Array, u: Any, known: Array, windows: list[Window]) -> Steps:
         """One call of the driver, or one for each row of the instant."""
         ny, m = len(self.model.outputs), self._rows.m
         if y.shape != (ny,):
             raise ValueError(f"Live.update: y must be ({ny},); got shape {y.shape}.")
         shape = (ny, m) if self.model.shared else (m,)
         inputs = np.full(shape, np.nan) if u is None else as_numbers("u", u).reshape(-1)
-        if inputs.size != ny * m if self.model.shared else inputs.size != m:
+        if inputs.size != (ny * m if self.model.shared else m):
             raise ValueError(f"Live.update: u must have shape {shape}; got shape {np.shape(u)}.")
-        if not self.model.shared:
-            lanes = np.repeat(inputs.reshape(1, m, 1), ny, axis=2)
-            self._run(tile, y[None], lanes, np.repeat(known[:, :, None], ny, axis=2), self._out)
-            return self._said()
         said = []
-        for j, row in enumerate(inputs.reshape(ny, m)):
-            same = known.copy()
-            same[0, 0] *= j == 0
-            self._run(tile, y[None, j : j + 1], row[None, :, None], same[:, :, None], self._out)
+        if self.model.shared:
+            for j, row in enumerate(inputs.reshape(ny, m)):
+                same = known[None, :, j : j + 1].copy()
+                same[0, 0] *= j == 0
+                self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
+                said.append(self._said())
+                self._push(tile, same[0], windows)
+        else:
+            self._run(tile, y[None], np.repeat(inputs.reshape(1, m, 1), ny, axis=2), known[None], self._out)
             said.append(self._said())
+            self._push(tile, known, windows)
+        self._rest(tile)
         y_hat, e, s, ok = (np.concatenate(values) for values in zip(*said, strict=True))
         return y_hat, e, s, ok
+
+    def _push(self, tile: Array, known: Array, windows: list[Window]) -> None:
+        for lane, window in enumerate(windows):
+            window.push(tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
+
+    def _rest(self, tile: Array) -> None:
+        """What was known of one sample holds for no other."""
+        if "each" in storage.fields(tile):
+            tile["each"] = 1.0
 
     def _said(self) -> Steps:
         """What the driver wrote, a number for each lane."""
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
+
+    def smooth(self) -> FixedLag:
+        """The last ``lag`` + 1 samples, oldest first, each from all samples so far: theta and std.
+
+        Each is (lag + 1, ny, n), or (lag + 1, n) where the outputs share one theta.
+        """
+        if not self._windows:
+            raise ValueError("Live.smooth: no samples are kept; say how many, as in Live(model, tracker, lag=20).")
+        found = [window.smooth(self._tile, lane) for lane, window in enumerate(self._windows)]
+        if self.model.shared:
+            ny = len(self.model.outputs)
+            return FixedLag(found[0].theta[ny - 1 :: ny], found[0].std[ny - 1 :: ny])
+        return FixedLag(np.stack([one.theta for one in found], axis=1), np.stack([one.std for one in found], axis=1))
 
     @property
     def theta(self) -> Array:
@@ -91,12 +142,18 @@ class LiveOutputs:
         return theta[0] if self.model.shared else theta
 
     @property
-    def std(self) -> Array:
-        """Their standard deviations."""
+    def cov(self) -> Array:
+        """Covariance of theta, (ny, n, n), or (n, n) where the outputs share one theta."""
         lanes = range(self._tile["theta"].shape[-1])
         states = ({name: self._tile[name][0, ..., l] for name in storage.fields(self._tile)} for l in lanes)
-        std: Array = np.sqrt([np.diag(self.tracker.cov(state)) for state in states])
-        return std[0] if self.model.shared else std
+        cov = np.array([tracker.cov(state) for tracker, state in zip(self.trackers, states, strict=True)])
+        return cov[0] if self.model.shared else cov
+
+    @property
+    def std(self) -> Array:
+        """Their standard deviations."""
+        std: Array = np.sqrt(np.einsum("...ii->...i", self.cov))
+        return std
 
     @property
     def names(self) -> tuple[Any, ...]:
@@ -108,20 +165,29 @@ class LiveOutputs:
         """Samples that came with a time not after the last."""
         return self._ignored
 
+    def end(self) -> End:
+        """Where the stream stands, for a run to begin (`warm_start`)."""
+        return end_of(self._rows, self.trackers, self._tile, self._last)
+
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file, without pickle; complete or not at all."""
-        extra = {"dt": self.dt, "last": self._last, "ignored": self._ignored}
-        header = {"model": storage.describe(self.model), "tracker": storage.describe(self.tracker), "extra": extra}
+        extra = {"dt": self.dt, "last": self._last, "ignored": self._ignored, "lag": self.lag}
+        extra["windows"] = [window.plain() for window in self._windows]
+        described = {"model": storage.describe(self.model), "trackers": [storage.describe(t) for t in self.trackers]}
         states = {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
-        storage.write(path, {"kind": "outputs", **header}, states)
+        storage.write(path, {"kind": "outputs", **described, "extra": extra}, states)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Continue from a file as if never stopped."""
         header, arrays = storage.read(path, "outputs")
-        tracker = storage.rebuild(header["tracker"], Tracker)
-        live = cls(storage.rebuild(header["model"], Model), tracker, header["extra"]["dt"])
-        live._last, live._ignored = header["extra"]["last"], header["extra"]["ignored"]
+        model, extra = storage.rebuild(header["model"], Model), header["extra"]
+        trackers = [storage.rebuild(one, Tracker) for one in header["trackers"]]
+        tracker = trackers[0] if model.shared else dict(zip(model.outputs, trackers, strict=True))
+        live = cls(model, tracker, extra["dt"], extra["lag"])
+        live._last, live._ignored = extra["last"], extra["ignored"]
+        for window, state in zip(live._windows, extra["windows"], strict=True):
+            window.restore(state)
         into = {name: live._tile[name][0] for name in storage.fields(live._tile)}
-        storage.restore(path, tracker, arrays, "state_", into)
+        storage.restore(path, trackers[0], arrays, "state_", into)
         return live

@@ -1,45 +1,44 @@
-"""Several outputs: one theta for each, or one theta that all of them measure.
+"""Several outputs, one theta for each.
 
     ARX(.., ny=2), Regression(n, ny=2)     yo_t = phi_t' theta_o,t + v_o,t     the outputs are lanes of one tile
-    Regression(n, ny=2, shared=True)       yo_t = phi_o,t' theta_t + v_o,t     rows of an instant, one after the other
+    Regression(n, ny=2, shared=True)       yo_t = phi_o,t' theta_t + v_o,t     see `driftfit.shared_outputs`
 
-Rows of one instant are successive samples between which no time passes: correcting with one row after the other is the
-correction with all of them, for independent noises of variance r / weight. What is predicted for the second output
-knows the first one already.
-
-Each output of a record is a `Track` of its own (``run["level"]``): a regression on the regressors that the joint run
-used, with everything that a Track can do.
+Each output may have settings of its own, as a mapping from its name to its tracker; all of one kind, for they share the
+compiled step. Each output of a record is a `Track` of its own (``run["level"]``): a regression on the regressors that
+the joint run used, with everything that a Track can do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Hashable, Iterator
 from functools import cached_property
-from io import StringIO
-from typing import TYPE_CHECKING, Any
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from rich.console import Console
 
-from driftfit.drivers import drivers, known_factors, make_tile, output_type
+from driftfit import storage
+from driftfit.drivers import output_type
+from driftfit.joint import Starts, drive, end_of, joint_tile, shown
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.records import Labels
-from driftfit.result import Track, root_mean_square
-from driftfit.settings import one_of
-from driftfit.signals import as_inputs, as_numbers, check_ready, factor, intervals, noise_of
+from driftfit.records import PLAIN, Labels
+from driftfit.result import Track
+from driftfit.settings import near
 from driftfit.smoothers.smoothed import Smoothed
 from driftfit.smoothers.walk import COLLECTED, collect
-from driftfit.summary import WIDTH, table_of
 from driftfit.trackers.base import Tracker
+from driftfit.warm import End, fresh_tile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.forecast import Forecast
 
-class Outputs:
+
+class Outputs(JudgedMany):
     """A record with several outputs, each with a theta of its own.
 
     Attributes
@@ -51,21 +50,17 @@ class Outputs:
         Names of the outputs; ``run[name]`` is the Track of one.
     names : tuple of tuples of str
         Names of the parameters of each output.
+    trackers : tuple of Tracker
+        The tracker of each output.
     """
 
     def __init__(
-        self,
-        model: Model,
-        tracker: Tracker,
-        y: Array,
-        u: Array,
-        time: Array | None,
-        known: Array,
-        out: Array,
-        tile: Array,
-    ) -> None:
-        self.model, self.tracker, self.y, self.u = model, tracker, y, u
+        self, model: Model, trackers: tuple[Tracker, ...], y: Array, u: Array, time: Array | None, known: Array,
+        out: Array, tile: Array, starts: Starts = (), labels: Labels = PLAIN,
+    ) -> None:  # fmt: skip
+        self.model, self.trackers, self.y, self.u = model, trackers, y, u
         self._time, self._known, self._out, self._tile = time, known, out, tile
+        self._starts, self.labels = starts, labels
         self.outputs = model.outputs
         self.names = tuple(model.names_of(output) for output in model.outputs)
 
@@ -74,7 +69,10 @@ class Outputs:
 
     def __repr__(self) -> str:
         used = ", ".join(f"{name} {int(ok)}" for name, ok in zip(self.outputs, self.ok.sum(axis=0), strict=True))
-        return f"Outputs of {len(self)} samples, used: {used}: {self.model!r}, {self.tracker!r}"
+        return f"Outputs of {len(self)} samples, used: {used}: {self.model!r}, {shown(self.trackers)}"
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(missing(name, self.outputs[0]) if not name.startswith("_") else name)
 
     def _written(self, name: str) -> Array:
         """A field of what the driver wrote, the output before the parameter."""
@@ -114,11 +112,20 @@ class Outputs:
         """Sum over the outputs: their noises are taken to be independent."""
         return sum(track.loglik for track in self)
 
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, ny, n): pointwise bands of theta at this level."""
+        low, high = zip(*(track.band(level) for track in self), strict=True)
+        return np.stack(low, axis=1), np.stack(high, axis=1)
+
+    def cov(self, t: int) -> Array:
+        """Covariances (ny, n, n) of the theta of each output after sample t."""
+        return np.array([track.cov(t) for track in self])
+
     @cached_property
     def _seen(self) -> Array:
         """What the tracker saw: the regressors, which all outputs share."""
-        steps = self.tracker.steps_for(self.model)._replace(store=collect)
-        tile = joint_tile(self.model, self.tracker)
+        steps = self.trackers[0].steps_for(self.model)._replace(store=collect)
+        tile = joint_tile(self.model, self.trackers, self._starts)
         out = np.empty(len(self), output_type(tile, COLLECTED))
         drive(self.model, steps, "std", tile, self.y, self.u, self._known, out)
         return out
@@ -127,23 +134,48 @@ class Outputs:
         """The record of one output, by name or place."""
         if output not in self.outputs and output not in range(len(self.outputs)):
             raise KeyError(f"there is no output {output!r}; there are {', '.join(self.outputs)}.")
-        lane = output if isinstance(output, int) else self.outputs.index(output)
-        name, seen = self.outputs[lane], self._seen
+        return self._tracks[output if isinstance(output, int) else self.outputs.index(output)]
+
+    @cached_property
+    def _tracks(self) -> tuple[Track, ...]:
+        return tuple(self._track(lane) for lane in range(len(self.outputs)))
+
+    def _track(self, lane: int) -> Track:
+        """One output as a regression."""
+        seen, tracker, alone = self._seen, self.trackers[lane], Regression(self.names[lane])
         phi = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
-        T = len(self)
-        known = np.broadcast_to(self._known, (T, 3)).copy()
+        known = self._known[..., lane].copy()
         known[:, 0] = seen["dt"][:, lane]
-        alone = Regression(self.names[lane])
-        return Track(
-            alone, self.tracker, self.y[:, lane], phi, self._time, known, self._out, self._tile, lane, Labels(y=name)
-        )
+        tile = fresh_tile(alone, tracker)
+        own = [name for name in storage.fields(tile) if name != "u"]
+        for name in own:
+            tile[name][0, ..., 0] = self._tile[name][0, ..., lane]
+        out = np.empty(len(self), output_type(tile, tracker.outputs, "cov" if "P" in names_of(self._out) else "std"))
+        for name in names_of(out):
+            out[name][..., 0] = self._out[name][..., lane]
+        start = {name: value for name, value in self._starts[lane].items() if name in own} if self._starts else None
+        labels = Labels(self.outputs[lane], self.names[lane], self.labels.time, {}, self.labels.zone)
+        return Track(alone, tracker, self.y[:, lane], phi, self._time, known, out, tile, 0, labels, start)
 
     def __iter__(self) -> Iterator[Track]:
-        return (self[name] for name in self.outputs)
+        return iter(self._tracks)
 
-    def smooth(self, keep: str = "std") -> dict[str, Smoothed]:
-        """The smoothed path of each output, by name."""
-        return {name: self[name].smooth(keep) for name in self.outputs}
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(zip(self.outputs, self, strict=True))
+
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
+        """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""
+        return {name: self[name].smooth(keep, order_by, undetermined) for name in self.outputs}
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
+        from driftfit.forecast import forecast_outputs
+
+        return forecast_outputs(self, h, u)
+
+    def end(self) -> End:
+        """Where the run ended, for another one to begin (`warm_start`); fields have the output as their last axis."""
+        return end_of(self.model, self.trackers, self._tile, None if self._time is None else self._time[-1])
 
     def summary(self) -> str:
         """The summaries of all outputs."""
@@ -155,148 +187,51 @@ class Outputs:
 
         return plot_outputs(self, level)
 
+    def to_table(self, kind: str = "polars") -> Any:
+        """The results as one table, a row a sample; see `driftfit.export.outputs_table`."""
+        from driftfit.export import outputs_table
 
-class Shared:
-    """A record whose outputs all measure one theta.
+        return outputs_table(self, kind)
 
-    ``theta``, ``std`` (T, n) are those after all outputs of an instant, ``prediction``, ``innovation``,
-    ``innovation_std``, ``ok`` (T, ny) those of each. ``rows`` is the Track of the T ny rows.
-    """
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the result to one file, without pickle; complete or not at all."""
+        arrays = {"y": self.y, "u": self.u, "known": self._known}
+        arrays |= {} if self._time is None else {"time": self._time}
+        arrays |= {f"out_{name}": self._out[name] for name in names_of(self._out)}
+        arrays |= {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
+        for lane, start in enumerate(self._starts):
+            arrays |= {f"start{lane}_{name}": value for name, value in start.items()}
+        header: dict[str, Any] = {"model": storage.describe(self.model)}
+        header |= {"trackers": [storage.describe(one) for one in self.trackers]}
+        header |= {"keep": "cov" if "P" in names_of(self._out) else "std", "time": self.labels.time}
+        storage.write(path, {"kind": "outputs of a record", "zone": self.labels.zone, **header}, arrays)
 
-    def __init__(self, rows: Track, model: Model, time: Array | None) -> None:
-        self.rows, self.model, self._time = rows, model, time
-        self.outputs, self.names = model.outputs, rows.names
-
-    def __len__(self) -> int:
-        return len(self.rows) // len(self.outputs)
-
-    def _by_output(self, values: Array) -> Array:
-        return values.reshape(len(self), -1)
-
-    @property
-    def theta(self) -> Array:
-        return self.rows.theta[len(self.outputs) - 1 :: len(self.outputs)]
-
-    @property
-    def std(self) -> Array:
-        std: Array = self.rows.std[len(self.outputs) - 1 :: len(self.outputs)]
-        return std
-
-    @property
-    def prediction(self) -> Array:
-        return self._by_output(self.rows.prediction)
-
-    @property
-    def innovation(self) -> Array:
-        return self._by_output(self.rows.innovation)
-
-    @property
-    def innovation_std(self) -> Array:
-        return self._by_output(self.rows.innovation_std)
-
-    @property
-    def ok(self) -> Array:
-        return self._by_output(self.rows.ok)
-
-    @property
-    def time(self) -> Array:
-        """Times given, or sample numbers."""
-        return np.arange(len(self)) if self._time is None else self._time
-
-    @property
-    def loglik(self) -> float:
-        return self.rows.loglik
-
-    def cov(self, t: int) -> Array:
-        """Covariance (n, n) of theta after all outputs of sample t."""
-        return self.rows.cov((t % len(self) + 1) * len(self.outputs) - 1)
-
-    def smooth(self, keep: str = "std") -> Smoothed:
-        """The smoothed path of the rows; take every ny-th of them, between rows of one instant theta does not move."""
-        return self.rows.smooth(keep)
-
-    def summary(self) -> str:
-        """Parameters now, and the one-step error of each output."""
-        low, high = self.rows.band(0.95)
-        table = table_of("Parameters after the last sample", "", "theta", "std", "[0.025", "0.975]")
-        for i, name in enumerate(self.names):
-            values = (self.theta[-1, i], self.std[-1, i], low[-1, i], high[-1, i])
-            table.add_row(name, *(f"{value:.4g}" for value in values))
-        errors = table_of("One-step prediction error, root mean square", *self.outputs)
-        kept = self.innovation[max(50, 5 * len(self.names)) :]
-        errors.add_row(*(f"{root_mean_square(e[np.isfinite(e)]):.5g}" for e in kept.T))
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(table, errors)
-        return text.getvalue()
-
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, predictions and innovations of the rows."""
-        return self.rows.plot(level)
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read what `save` wrote."""
+        header, arrays = storage.read(path, "outputs of a record")
+        model = storage.rebuild(header["model"], Model)
+        trackers = tuple(storage.rebuild(one, Tracker) for one in header["trackers"])
+        tile = joint_tile(model, trackers)
+        storage.restore(path, trackers[0], arrays, "state_", {n: tile[n][0] for n in storage.fields(tile)})
+        out = np.empty(len(arrays["y"]), output_type(tile, trackers[0].outputs, header["keep"]))
+        storage.restore(path, trackers[0], arrays, "out_", {name: out[name] for name in names_of(out)})
+        lanes = [f"start{lane}_" for lane in range(len(trackers))]
+        starts = [{n.removeprefix(lane): arrays[n] for n in arrays if n.startswith(lane)} for lane in lanes]
+        labels = Labels(time=header["time"], zone=header["zone"])
+        return cls(
+            model, trackers, arrays["y"], arrays["u"], arrays.get("time"), arrays["known"], out, tile,
+            starts if starts[0] else (), labels,
+        )  # fmt: skip
 
 
-def joint_tile(model: Model, tracker: Tracker) -> Array:
-    """A tile with a lane for each output."""
-    return make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)] * len(model.outputs))
+def names_of(records: Array) -> tuple[str, ...]:
+    """Fields of an array of records."""
+    return records.dtype.names or ()
 
 
-def row_model(model: Model, tracker: Tracker, m: int | None = None) -> Model:
-    """The model of one row of a shared regression on m regressors."""
-    assert isinstance(model, Regression)
-    if not tracker.covariance:
-        raise ValueError(
-            f"{type(tracker).__name__} carries no covariance, so one row of an instant would not know of the others; "
-            "use FLS, Kalman or RLS with shared=True."
-        )
-    alone = replace(model, ny=1, shared=False)
-    return alone.bind(alone.m if m is None else m)
-
-
-def drive(model: Model, steps: Any, keep: str, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-    """Run a tile of outputs: every lane gets the same inputs."""
-    ny = y.shape[1]
-    inputs = np.repeat(u[:, :, None], ny, axis=2)
-    drivers(model.steps, steps, keep).run(tile, y, inputs, np.repeat(known[:, :, None], ny, axis=2), out)
-
-
-def track_outputs(
-    model: Model, tracker: Tracker, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any, keep: str
-) -> Outputs | Shared:
-    """Record mode for a model with several outputs; see `driftfit.track`. y (T, ny); u as the model wants it."""
-    ny = len(model.outputs)
-    output = as_numbers("y", y)
-    if output.ndim != 2 or output.shape[1] != ny or len(output) == 0:
-        raise ValueError(f"y must be (T, {ny}) for the outputs {', '.join(model.outputs)}; got shape {output.shape}.")
-    one_of("track", "keep", keep, ("std", "cov"))
-    check_ready(tracker)
-    T = len(output)
-    axis, gaps = (None, 1.0) if time is None else intervals(time, dt, T)
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
-    if model.shared:
-        return _shared(model, tracker, output, u, axis, known, keep)
-    inputs = as_inputs(u, T)
-    bound = model.bind(inputs.shape[1])
-    tile = joint_tile(bound, tracker)
-    out = np.empty(T, output_type(tile, tracker.outputs, keep))
-    drive(bound, tracker.steps_for(bound), keep, tile, output, inputs, known, out)
-    return Outputs(bound, tracker, output, inputs, axis, known, out, tile)
-
-
-def _shared(model: Model, tracker: Tracker, y: Array, u: Any, axis: Array | None, known: Array, keep: str) -> Shared:
-    """Rows of one instant as successive samples between which no time passes."""
-    from driftfit.track import drive as drive_one
-
-    T, ny = y.shape
-    regressors = as_numbers("u", u)
-    if regressors.ndim != 3 or regressors.shape[:2] != (T, ny):
-        raise ValueError(
-            f"u must be (T, ny, m) = ({T}, {ny}, m) with shared=True: a row of regressors for each output; "
-            f"got shape {regressors.shape}."
-        )
-    rows = row_model(model, tracker, regressors.shape[2])
-    tile = joint_tile(rows, tracker)
-    factors = np.repeat(np.broadcast_to(known, (T, 3)), ny, axis=0)
-    factors[np.arange(T * ny) % ny > 0, 0] = 0.0
-    flat, inputs = np.ascontiguousarray(y.ravel()), np.ascontiguousarray(regressors.reshape(T * ny, -1))
-    out = drive_one(rows, tracker, tile, flat, inputs, factors, keep)
-    times = None if axis is None else np.repeat(axis, ny)
-    return Shared(Track(rows, tracker, flat, inputs, times, factors, out, tile), model, axis)
+def missing(name: str, output: str) -> str:
+    """What to say of an attribute that a run of several outputs does not have."""
+    if hasattr(Track, name):
+        return f"{name} is of one output at a time: run[{output!r}].{name}"
+    return f"a run of several outputs has no {name!r}; {near(name, [one for one in dir(Outputs) if one[0] != '_'])}"

@@ -55,7 +55,9 @@ class Records:
     """Series in flat arrays of N samples.
 
     ``y`` (N,), ``u`` (N, m), ``known`` (N, 3) or (1, 3), ``time`` (N,) or None; series k is ``length[k]`` samples from
-    ``first[k]`` on and is called ``keys[k]``. ``dropped`` counts, per key, rows that never became samples.
+    ``first[k]`` on and is called ``keys[k]``. ``dropped`` counts, per key, rows that never became samples. ``drifts``
+    (N, k) are factors of the drift for each parameter or change, until the tracker has made columns of ``known`` of
+    them.
     """
 
     keys: tuple[Hashable, ...]
@@ -67,6 +69,7 @@ class Records:
     time: Array | None = None
     labels: Labels = PLAIN
     dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+    drifts: Array | None = None
 
     def part(self, k: int) -> tuple[Array, Array, Array | None, Array]:
         """(y, u, time, known) of series k, as views."""
@@ -91,8 +94,9 @@ def one_series(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> 
     output = as_output(y)
     T = len(output)
     axis, gaps = (None, 1.0) if time is None else intervals(time, dt, T)
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
-    return Records((0,), np.array([0]), np.array([T]), output, as_inputs(u, T), known, axis)
+    common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
+    known = known_factors(gaps, noise_of(weights, T), factor("drift", common, T))
+    return Records((0,), np.array([0]), np.array([T]), output, as_inputs(u, T), known, axis, drifts=drifts)
 
 
 def rows(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Records:
@@ -101,10 +105,15 @@ def rows(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record
     if output.ndim != 2 or output.size == 0:
         raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
     units, T = output.shape
-    known, axis = _known_of_rows(units, T, time, dt, weights, drift)
+    each = as_numbers("drift", drift) if np.ndim(drift) == 3 else None
+    if each is not None and each.shape[:2] != (units, T):
+        raise ValueError(
+            f'by="row": drift with a column for each parameter must be ({units}, {T}, n); got shape {each.shape}.'
+        )
+    known, axis = _known_of_rows(units, T, time, dt, weights, drift if each is None else 1.0)
     return Records(
         tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
-        _inputs_of_rows(u, units, T), known, axis,
+        _inputs_of_rows(u, units, T), known, axis, drifts=None if each is None else each.reshape(units * T, -1),
     )  # fmt: skip
 
 

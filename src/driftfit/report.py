@@ -68,9 +68,14 @@ def report(run: Track, path: str | PathLike[str], title: str | None = None) -> N
     OSError
         If it cannot be written.
     """
+    check_path(path).write_text(page(run, title), encoding="utf-8")
+
+
+def check_path(path: str | PathLike[str]) -> Path:
+    """Where a page goes; ValueError where the name is not that of a page."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"report: the page is HTML, so its name ends in .html; got {str(path)!r}.")
-    Path(path).write_text(page(run, title), encoding="utf-8")
+    return Path(path)
 
 
 def page(run: Track, title: str | None = None) -> str:
@@ -81,13 +86,18 @@ def page(run: Track, title: str | None = None) -> str:
         f"<h1>{escape(heading)}</h1>",
         f'<p class="soft">{escape(_subtitle(run, facts))}</p>',
         _verdict(said, health),
-        _section("Parameters over time", _figure(_parameters(run), run, PARAMETERS)),
-        _section("Parameters", _parameter_table(facts, said) + _system_table(run)),
-        _section("Predictions", _comparison(said) + _figure(_signals(run), run, SIGNALS)),
-        _section("Diagnostics", _checks(health) + _figure(draw_diagnosis(health), run, DIAGNOSTICS)),
-        _section("Settings, and what was left out", _settings(run, facts)),
-        _section("How to read this", READING),
+        section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
+        section("Parameters", _parameter_table(facts, said) + _system_table(run)),
+        section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
+        section("Diagnostics", _checks(health) + picture(draw_diagnosis(health), run, DIAGNOSTICS)),
+        section("Settings, and what was left out", _settings(run, facts)),
+        section("How to read this", READING),
     ]
+    return document(heading, sections)
+
+
+def document(heading: str, sections: Sequence[str]) -> str:
+    """Sections as one page."""
     body = "\n".join(sections)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -113,7 +123,7 @@ def _subtitle(run: Track, facts: Summary) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
     return f"<section><h2>{escape(title)}</h2>\n{body}</section>"
 
 
@@ -128,7 +138,7 @@ def _verdict(said: Verdict, health: Diagnosis) -> str:
     return f'<div class="verdict">{lines}</div>'
 
 
-def _table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """A table; cells are HTML already."""
     top = "".join(f"<th>{head}</th>" for head in heads)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
@@ -153,7 +163,7 @@ def _parameter_table(facts: Summary, said: Verdict) -> str:
         p = "" if test is None else escape(p_text(test.p_own))
         rows.append((escape(f"{row.name} {row.unit}".strip()), *cells, p, moved))
     caption = f"After the last sample; the range is that of the path after the first {facts.burn} samples."
-    return _table(caption, heads, rows)
+    return table(caption, heads, rows)
 
 
 def _system_table(run: Track) -> str:
@@ -169,7 +179,7 @@ def _system_table(run: Track) -> str:
     for k, t in enumerate(at):
         gains = (f"{v:.4g} +- {s:.2g}" for v, s in zip(gain.value[k], gain.std[k], strict=True))
         rows.append((escape(run.time_text(int(t))), *gains, f"{pole.value[k]:.4g} +- {pole.std[k]:.2g}"))
-    return _table("The system behind the parameters: steady-state gain; a pole below 1 is stable.", heads, rows)
+    return table("The system behind the parameters: steady-state gain; a pole below 1 is stable.", heads, rows)
 
 
 def _comparison(said: Verdict) -> str:
@@ -178,7 +188,7 @@ def _comparison(said: Verdict) -> str:
         ratio = f"{rival.rms / said.rms:.3f}" if said.rms > 0.0 else ""
         rows.append((rival.name, f"{rival.rms:.5g}", ratio, escape(p_text(rival.p))))
     caption = f"One-step prediction error, root mean square, on {said.scored} samples that all could predict."
-    return _table(caption, ("", "error", "over this run", "p, no better"), rows)
+    return table(caption, ("", "error", "over this run", "p, no better"), rows)
 
 
 def _checks(health: Diagnosis) -> str:
@@ -188,8 +198,8 @@ def _checks(health: Diagnosis) -> str:
         state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
         rows.append((check.name, f"{check.value:.4g}", low, high, "not known" if np.isnan(check.value) else state))
     told = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
-    table = _table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
-    return table + (f"<ul>{told}</ul>" if told else "")
+    listed = table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
+    return listed + (f"<ul>{told}</ul>" if told else "")
 
 
 def _settings(run: Track, facts: Summary) -> str:
@@ -206,7 +216,7 @@ def _settings(run: Track, facts: Summary) -> str:
     return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs if value)}</dl>"
 
 
-def _parameters(run: Track) -> Figure:
+def parameter_figure(run: Track) -> Figure:
     n = len(run.names)
     columns = 1 if n <= 3 else 2
     rows = -(-n // columns)
@@ -232,7 +242,7 @@ def _signals(run: Track) -> Figure:
     return figure
 
 
-def _figure(figure: Figure, run: Track, caption: str) -> str:
+def picture(figure: Figure, run: Track, caption: str) -> str:
     return f"<figure>{svg(figure, len(run) > LONG)}<figcaption>{escape(caption)}</figcaption></figure>\n"
 
 

@@ -284,6 +284,10 @@ class Track(Judged):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file, without pickle; complete or not at all."""
+        storage.write(path, *self.written())
+
+    def written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """(header, arrays): what `save` writes."""
         header = {
             "kind": "track",
             "model": storage.describe(self.model),
@@ -297,12 +301,16 @@ class Track(Judged):
         arrays |= {f"out_{name}": self._written(name) for name in _names(self._out)}
         arrays |= {f"state_{name}": self._tile[name][0, ..., self._lane] for name in storage.fields(self._tile)}
         arrays |= {f"start_{name}": value for name, value in (self._start or {}).items()}
-        storage.write(path, header, arrays)
+        return header, arrays
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read what `save` wrote."""
-        header, arrays = storage.read(path, "track")
+        return cls.from_written(path, *storage.read(path, "track"))
+
+    @classmethod
+    def from_written(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        """The inverse of `written`; ``path`` is for the message of an error."""
         model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
         tile = fresh_tile(model, tracker)
         state = {name: tile[name][0, ..., 0] for name in storage.fields(tile)}

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from datetime import timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.settings import missing_settings
-from driftfit.trackers.base import Tracker
+
+if TYPE_CHECKING:
+    from driftfit.trackers.base import Tracker
 
 
 def check_ready(tracker: Tracker) -> Tracker:
@@ -48,7 +50,8 @@ def as_output(y: Any) -> Array:
     if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
     if array.ndim != 1:
-        raise ValueError(f"y must have one axis, (T,); got shape {array.shape}.")
+        hint = " Several outputs are for a model with ny=; elsewhere take one column." if array.ndim == 2 else ""
+        raise ValueError(f"y must have one axis, (T,); got shape {array.shape}.{hint}")
     if len(array) == 0:
         raise ValueError("y is empty: there is nothing to track.")
     return array

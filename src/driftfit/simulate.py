@@ -9,7 +9,10 @@ The output lags that are not known yet are the predictions themselves, so that t
 `ahead` starts from the outputs up to t at every t, with theta_t and P_t as they were then: nothing looks ahead but the
 inputs. `simulate` sees no output at all. q is the drift that the tracker assumes per sample where it says so, else 0;
 r is what makes the first step the variance that the run reported. First-order in the parameter errors.
-Cost: O(T k n^2) for `ahead`, O(h n^2) for `simulate`. Models: ARX and Regression.
+Cost: O(T k n^2) for `ahead`, O(h n^2) for `simulate`.
+
+That is for ARX and Regression. Other models that say how they run forward (`Model.play`), as Hammerstein-Wiener, are
+drawn from (`driftfit.judges.draws`).
 """
 
 from __future__ import annotations
@@ -41,9 +44,16 @@ class Prediction(NamedTuple):
     """(T,): standard deviation from the parameters alone, the band of the mean."""
     y_std: Array
     """(T,): with the noise, the band of the output."""
+    paths: Array | None = None
+    """(D, T): outputs that were drawn, for models whose predictions bend in their parameters."""
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high) of the output, (T,) each."""
+        """(low, high) of the output, (T,) each: normal, or quantiles of the drawn outputs."""
+        if self.paths is not None:
+            known = np.isfinite(self.paths).all(axis=0)
+            ends = np.quantile(np.where(known, self.paths, 0.0), [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
+            low, high = np.where(known, ends, np.nan)
+            return low, high
         half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
         return self.y_hat - half, self.y_hat + half
 
@@ -54,31 +64,39 @@ def ahead(run: Track, k: int) -> Prediction:
     Raises
     ------
     ValueError
-        If k is below 1, or the model is neither ARX nor Regression.
+        If k is below 1, the model cannot be run forward, or theta moves along a slope.
     """
-    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     whole("ahead", "k", k, 1)
+    if getattr(run.tracker, "differences", 1) > 1:
+        raise ValueError(
+            "ahead: predictions over a record hold theta, which moves along its slope here; run.forecast follows it."
+        )
+    if not isinstance(run.model, ARX | Regression):
+        from driftfit.judges.draws import ahead_by_draws
+
+        return ahead_by_draws(run, k)
+    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     T, theta, cov = len(run), run.theta, covariances(run)
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
     a = theta[:, :na]
-    lags = [_moved(y, i) for i in range(na)]
+    lags = [moved(y, i) for i in range(na)]
     slopes = [np.zeros_like(theta) for _ in range(na)]
     psi, energy, r = [np.ones(T)], np.zeros(T), np.full(T, np.nan)
     for j in range(1, k + 1):
-        phi = np.column_stack([*lags, _moved(U, -j)])
+        phi = np.column_stack([*lags, moved(U, -j)])
         y_hat = np.einsum("ti,ti->t", phi, theta)
         S = phi + sum((a[:, i, None] * slopes[i] for i in range(na)), np.zeros_like(theta))
-        q = _drift(run, r)
+        q = drift(run, r)
         of_theta = np.einsum("ti,tij,tj->t", S, cov, S) + j * np.einsum("ti,tij,tj->t", S, q, S)
         if j == 1:
-            r = _filled(np.maximum(_moved(_known(run.innovation_std) ** 2, -1) - of_theta, 0.0))
+            r = _filled(np.maximum(moved(_known(run.innovation_std) ** 2, -1) - of_theta, 0.0))
         energy = energy + psi[-1] ** 2
         psi.append(sum((a[:, i] * psi[-1 - i] for i in range(min(na, len(psi)))), np.zeros(T)))
         lags, slopes = [y_hat, *lags][:na], [S, *slopes][:na]
-    whole_time = _unbroken(run, na, k)
+    whole_time = unbroken(run, na, k)
     with np.errstate(invalid="ignore"):
         found = (y_hat, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
-    return Prediction(*(np.where(whole_time, _moved(part, k), np.nan) for part in found))
+    return Prediction(*(np.where(whole_time, moved(part, k), np.nan) for part in found))
 
 
 def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
@@ -87,7 +105,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     Parameters
     ----------
     run : Track
-        Of ARX or Regression.
+        Of a model that can be run forward: ARX, Regression, HammersteinWiener, or your own with `play`.
     u : (h,), (h, m), or None without inputs
         Inputs. Before them the system is at rest: inputs and outputs are zero.
     at : int
@@ -98,15 +116,19 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     Raises
     ------
     ValueError
-        If u does not fit the model, or the model is neither ARX nor Regression.
+        If u does not fit the model, or the model cannot be run forward.
     """
     h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
     inputs = as_inputs(u, h)
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
+    given = np.zeros(0) if y is None else np.asarray(y, float)
+    if not isinstance(run.model, ARX | Regression):
+        from driftfit.judges.draws import simulate_by_draws
+
+        return simulate_by_draws(run, inputs, at, given)
     na, U = input_regressors(run.model, inputs, rest=0.0)
     (theta,), (cov,) = taken(run, at)
-    given = np.zeros(0) if y is None else np.asarray(y, float)
     r = noise_at(run, at)
     out, S, energy = np.zeros(h), np.zeros((h, run.model.n)), np.zeros(h)
     psi = run.model.noise_response(theta, h)
@@ -134,7 +156,7 @@ def noise_at(run: Track, at: int) -> float:
     _, U = input_regressors(run.model, run.u[: t + 1])
     na = run.model.na if isinstance(run.model, ARX) else 0
     phi = np.concatenate([[run.y[t - i] if t >= i else np.nan for i in range(1, na + 1)], U[t]])
-    q = _drift(run, np.full(1, run.innovation_std[t] ** 2))[0]
+    q = drift(run, np.full(1, run.innovation_std[t] ** 2))[0]
     r = run.innovation_std[t] ** 2 - phi @ (before + q) @ phi
     return float(r) if np.isfinite(r) and r > 0.0 else float(run.innovation_std[t] ** 2)
 
@@ -146,11 +168,11 @@ def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int,
         return 0, np.hstack([u, *one])
     if not isinstance(model, ARX) or len(model.outputs) > 1:
         raise ValueError(f"predictions over a record are for ARX and Regression with one output; got {model!r}.")
-    columns = [_moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
+    columns = [moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
     return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
 
 
-def _moved(values: Array, by: int, rest: float = np.nan) -> Array:
+def moved(values: Array, by: int, rest: float = np.nan) -> Array:
     """Values (T, ..) so many samples later (earlier where negative)."""
     out = np.full(values.shape, rest)
     T = len(values)
@@ -166,12 +188,14 @@ def _known(values: Array) -> Array:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _drift(run: Track, r: Array) -> Array:
-    """q per sample, (1, n, n) or (T, n, n); zero where the tracker does not describe a random walk."""
+def drift(run: Track, r: Array) -> Array:
+    """q per sample, (1, n, n) or (T, n, n); zero where theta itself does not walk at random."""
     n = len(run.names)
     try:
         walk = run.tracker.random_walk(run.model)
     except ValueError:
+        return np.zeros((1, n, n))
+    if walk.slopes:
         return np.zeros((1, n, n))
     scale = np.ones(1) if walk.r is not None else np.where(np.isfinite(r), r, 0.0)
     return np.asarray(walk.q * scale[:, None, None])
@@ -183,7 +207,7 @@ def _filled(values: Array) -> Array:
     return np.where(place >= 0, values[place], np.nan)
 
 
-def _unbroken(run: Track, na: int, k: int) -> Array:
+def unbroken(run: Track, na: int, k: int) -> Array:
     """Samples whose k steps, and the lags before them, have no gap in time."""
     gaps = np.broadcast_to(run._known[:, 0], len(run)) > GAP
     total = np.concatenate([[0], np.cumsum(gaps)])

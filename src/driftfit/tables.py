@@ -35,7 +35,8 @@ def read_records(
     """
     inputs = _names("u", u)
     axis = None if time is None else _name("time", time)
-    factors = [name for name in (weights, drift) if isinstance(name, str)]
+    each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
+    factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
     wanted = Wanted(tuple(dict.fromkeys([_name("y", y), *inputs, *factors])), axis, _names("by", by))
     columns, failed = read(data, wanted)
     keys, code = _codes(columns)
@@ -51,12 +52,13 @@ def read_records(
     known = known_factors(
         1.0 if times is None else _gaps(times, first, dt),
         _factor(weights, values, noise_of),
-        _factor(drift, values, drift_of),
+        _factor(1.0 if each else drift, values, drift_of),
     )
+    drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
     signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
     labels = Labels(y, inputs, axis, dict(units or {}), columns.zone, {}, wanted.by)
     named = tuple(keys[k] for k in there)
-    return Records(named, first, length[there], values[y], signals, known, times, labels, dropped), failed
+    return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
 
 
 def _name(argument: str, value: Any) -> str:

@@ -112,9 +112,10 @@ def track(
         Nominal interval in the unit of ``time``: 1 by default, required for datetimes.
     weights : number or (T,)
         The noise variance of a sample is r / weight; 0 marks a sample that is not to be used.
-    drift : number or (T,)
-        Known factors of the drift before each sample, such as 100 where a set-point was changed. For a `Bank` also
-        (T, changes): a factor for each change.
+    drift : number or (T,), or (T, n), with by="row" (units, T) or (units, T, n), or names of columns
+        Known factors of the drift before each sample, such as 100 where a set-point was changed; 0 says that nothing
+        moves. With a column for each parameter, `FLS` has a weight of its own for every step and parameter, mu /
+        drift, `Kalman` and `ExtendedKalman` a drift of their own. For a `Bank` a column for each change.
     units : mapping from names of columns to their units, such as {"flow": "l/min"}
         Carried to summary, plots and exports.
     keep : "std" or "cov"
@@ -127,7 +128,8 @@ def track(
     Returns
     -------
     Track, or a Fleet (from key to Track) for several series or several trackers. A model with several outputs (``ny``)
-    takes y (T, ny) and gives `driftfit.outputs.Outputs`, or `driftfit.outputs.Shared` where they share one theta.
+    takes y (T, ny), or as many names, and gives `driftfit.outputs.Outputs`, or `driftfit.shared_outputs.Shared` where
+    they share one theta; ``tracker`` may then map the name of each output to its own, and weights may be (T, ny).
 
     Raises
     ------
@@ -136,42 +138,29 @@ def track(
         there, cells that are not numbers, files that cannot be read. Missing and non-finite data never raise.
     """
     if len(model.outputs) > 1:
-        other = (data, by, units, warm_start)
-        return cast("Track", _several_outputs(model, tracker, y, u, time, dt, weights, drift, keep, other))
+        if prob is not None:
+            raise ValueError("track: prob= is for one series and one tracker.")
+        from driftfit.track_outputs import track_outputs
+
+        run = track_outputs(model, tracker, y, u, data, time, by, dt, weights, drift, units, keep, warm_start)
+        return cast("Track", run)
     one_of("track", "keep", keep, ("std", "cov"))
-    each = data is None and np.ndim(drift) == 2 and by is None
-    records, failed = _records(y, u, data, time, by, dt, weights, 1.0 if each else drift, units)
+    records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
     if by is None and isinstance(tracker, Tracker):
-        if each or prob is not None:
-            T = len(records.y)
-            columns = tracker.beside(T, prob, drift if each else None)
-            records = replace(records, known=np.hstack([np.broadcast_to(records.known, (T, 3)), columns]))
-        return _one(bound, _checked(tracker, keep), records, keep, warm_start, dt)
-    if each or prob is not None:
-        raise ValueError("track: prob= and a drift for each change are for one series and one tracker.")
+        records = with_drifts(bound, [_checked(tracker, keep)], records, prob)
+        return _one(bound, tracker, records, keep, warm_start, dt)
+    if prob is not None:
+        raise ValueError("track: prob= is for one series and one tracker.")
     if by is None and not isinstance(tracker, Tracker):
         names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
         records = records.repeated(names)
     trackers = _per_series(tracker, records.keys)
     for one in set(trackers):
         _checked(one, keep)
+    records = with_drifts(bound, trackers, records)
     return run_fleet(bound, trackers, records, keep, failed, warm_start, dt)
-
-
-def _several_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any, keep: str, other: Any
-) -> Any:
-    """A record with several outputs, of one tracker."""
-    from driftfit.outputs import track_outputs
-
-    if any(value is not None for value in other) or not isinstance(tracker, Tracker):
-        raise ValueError(
-            "track: several outputs are followed by one tracker on arrays, y (T, ny); data=, by=, units= and "
-            "warm_start= are for single outputs."
-        )
-    return track_outputs(model, tracker, y, u, time, dt, weights, drift, keep)
 
 
 def _records(
@@ -189,6 +178,17 @@ def _records(
     if units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
     return (rows if by == "row" else one_series)(y, u, time, dt, weights, drift), {}
+
+
+def with_drifts(model: Model, trackers: Sequence[Tracker], records: Records, prob: Any = None) -> Records:
+    """The records with what is known beside interval, noise and drift as columns of ``known``."""
+    if records.drifts is None and prob is None:
+        return records
+    N = len(records.y)
+    columns, *others = (one.beside(model, N, prob, records.drifts) for one in dict.fromkeys(trackers))
+    if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
+        raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
+    return replace(records, known=np.hstack([np.broadcast_to(records.known, (N, 3)), columns]), drifts=None)
 
 
 def _checked(tracker: Tracker, keep: str) -> Tracker:

@@ -19,15 +19,15 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from driftfit.drivers import known_factors
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.records import one_series
 from driftfit.settings import one_of, whole
-from driftfit.signals import as_inputs, as_output, factor, intervals, noise_of
+from driftfit.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tuning.intervals import intervals_of
 from driftfit.tuning.knobs import find_knobs
@@ -154,6 +154,11 @@ def tune(
     order_by : (T,)
         Tune for ``run.smooth(order_by=...)``: theta walks along this variable instead of along time.
 
+    Returns
+    -------
+    Tuned. A model with several outputs gives `driftfit.tuning.outputs.TunedOutputs`, one for each output (where they
+    share one theta: one `Tuned` for all).
+
     Warns
     -----
     UserWarning
@@ -170,7 +175,22 @@ def tune(
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
-    record = _record(model, y, u, time, dt, weights, drift)
+    if len(model.outputs) > 1:
+        from driftfit.tuning.outputs import tune_outputs
+
+        options = (method, groups, h, bounds, level, order_by)
+        known = {"time": time, "dt": dt, "weights": weights, "drift": drift}
+        found = tune_outputs(model, tracker, y, u, known, lambda record: _tuned(record, tracker, *options))
+        return cast("Tuned", found)
+    return _tuned(
+        _record(model, tracker, y, u, time, dt, weights, drift), tracker, method, groups, h, bounds, level, order_by
+    )
+
+
+def _tuned(
+    record: Record, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
+) -> Tuned:
+    """Tune a checked record."""
     if order_by is not None:
         record = along(record, tracker, order_by)
     knobs = find_knobs(record, tracker, groups, bounds)
@@ -205,14 +225,12 @@ def _warn(tuned: Tuned) -> None:
             f"tune: {', '.join(stuck)} ended at a bound of the search. The record does not determine it in that "
             "direction, and the noise variance may be wrong; give bounds=(low, high) to search further.",
             UserWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 
-def _record(model: Model, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record:
-    output = as_output(y)
-    T = len(output)
-    inputs = as_inputs(u, T)
-    gaps = 1.0 if time is None else intervals(time, dt, T)[1]
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
-    return Record(model.bind(inputs.shape[1]), output, inputs, known)
+def _record(model: Model, tracker: Tracker, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record:
+    records = one_series(y, u, time, dt, weights, drift)
+    bound = model.bind(records.u.shape[1])
+    records = with_drifts(bound, [tracker], records)
+    return Record(bound, records.y, records.u, records.known)

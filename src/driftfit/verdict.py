@@ -12,9 +12,9 @@ Two questions that have different answers:
 A parameter is named as one that moves where the joint test rejects, and its own still does when what was named before
 it is taken into account (`driftfit.judges.attribute`).
 
-The test takes the noise to be uncorrelated, as one-step errors of a complete model are. A model without enough lags
-has correlated noise, which is hard to tell from a drifting intercept; then the verdict says so, and ``lags=`` allows
-for it. Not for smooth fast oscillations: a parameter that swings many times within the record leaves little trace in a
+A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The test finds from
+the record how many lags of correlation it must allow for, ``lags=`` sets them, and the verdict says so. Not for smooth
+fast oscillations: a parameter that swings many times within the record leaves little trace in a
 cumulated score. Cost: three constant fits, O(T n^2).
 """
 
@@ -31,7 +31,7 @@ from driftfit.compare import errors
 from driftfit.judges.attribute import Attribution, attribute
 from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.paired import Paired, paired
-from driftfit.judges.seen import Seen, regressors
+from driftfit.judges.regressors import Rows, regressors
 from driftfit.judges.whiteness import whiteness
 from driftfit.result import Track, root_mean_square
 from driftfit.settings import whole
@@ -148,10 +148,10 @@ class Verdict:
     def _caution(self) -> str:
         better = [rival.name for rival in self.rivals if rival.rms < self.rms]
         told = f"Lower error than this run: {', '.join(better)}. " if better else ""
-        if self.correlated and self.lags == 0:
+        if self.correlated:
             told += (
                 "The residuals of constant coefficients are correlated: a drift does that, and so does a model with "
-                "too few lags. Try one more lag, or verdict(lags=10)."
+                f"too few lags. The test allows for {self.lags} lags of correlation; try one more lag in the model."
             )
         return told.strip()
 
@@ -187,7 +187,7 @@ def p_equals(p: float) -> str:
     return f"p {p_text(p)}" if p < 1e-4 else f"p = {p_text(p)}"
 
 
-def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
+def verdict(run: Track, level: float = 0.05, lags: int | None = None) -> Verdict:
     """Judge a run.
 
     Parameters
@@ -196,8 +196,9 @@ def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
         What `track` returned.
     level : number
         Error rate of "the parameters move".
-    lags : int
-        Lags of correlation of the noise to allow for; 0 for a model whose one-step errors are white.
+    lags : int or None
+        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        one-step errors are known to be white.
 
     Raises
     ------
@@ -206,12 +207,13 @@ def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"verdict: level must be between 0 and 1, such as 0.05; got {level!r}.")
-    whole("verdict", "lags", lags, 0)
-    seen = regressors(run)
-    test = constancy(seen.phi, seen.y, lags)
+    if lags is not None:
+        whole("verdict", "lags", lags, 0)
+    rows = regressors(run)
+    test = constancy(rows.phi, rows.y, lags)
     drifts = bool(test.p_joint < level)
-    steps = attribute(seen.phi, seen.y, test, level, lags) if drifts else None
-    parameters = tuple(_moved(run, seen, test, steps, i) for i in range(len(test.p)))
+    steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
+    parameters = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
     own, *others, scored = errors(run)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
@@ -223,19 +225,19 @@ def verdict(run: Track, level: float = 0.05, lags: int = 0) -> Verdict:
         parameters=parameters,
         rms=root_mean_square(own[scored]),
         rivals=rivals,
-        samples=len(seen.y),
+        samples=len(rows.y),
         scored=int(scored.sum()),
         correlated=bool(whiteness(test.fit.residual).p < CORRELATED),
-        lags=lags,
+        lags=test.lags,
     )
 
 
-def _moved(run: Track, seen: Seen, test: Constancy, steps: Attribution | None, i: int) -> Moved:
+def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
     name, at = run.model.names[i], steps.first(i) if steps else None
     own = float(test.p_own[i] if steps is None else steps.p[i])
     if steps is None or at is None:
-        sample, sides = int(seen.at[min(int(test.at[i]), len(seen.at) - 1)]) if len(seen.at) else 0, (np.nan,) * 3
+        sample, sides = int(rows.at[min(int(test.at[i]), len(rows.at) - 1)]) if len(rows.at) else 0, (np.nan,) * 3
     else:
-        sample, sides = int(seen.at[at]), (float(steps.before[i]), float(steps.after[i]), float(steps.std[i]))
+        sample, sides = int(rows.at[at]), (float(steps.before[i]), float(steps.after[i]), float(steps.std[i]))
     when = run.time_text(sample)
     return Moved(name, float(test.L[i]), float(test.p[i]), own, at is not None, sample, when, *sides)

@@ -18,7 +18,7 @@ from driftfit.models.base import Model
 from driftfit.signals import interval_of
 from driftfit.trackers.base import Tracker
 
-_LEFT = ("interval", "noise", "drift", "F")
+_LEFT = ("interval", "noise", "drift", "each", "F")
 """Fields that stay behind: what an operator set for the stream, and the diffuse likelihood of the run before."""
 
 
@@ -54,7 +54,7 @@ def carried(run: Run, model: Model, tracker: Tracker) -> dict[str, Array]:
             f"warm_start: the run before was made by {type(end.tracker).__name__}, this one is by "
             f"{type(tracker).__name__}; start from its estimates instead, with theta0= and p0=."
         )
-    if (model.n, model.m, model.steps) != (end.model.n, end.model.m, end.model.steps):
+    if not model.follows(end.model):
         raise ValueError(f"warm_start: the run before followed {end.model!r}, this one follows {model!r}.")
     before, now = end.tracker.state_for(end.model), tracker.state_for(model)
     changed = {name for name, value in now.items() if not _same(before.get(name), value)}

@@ -20,7 +20,8 @@ import numpy as np
 from driftfit.blocks.paths import Blocks, blocks_of
 from driftfit.drivers import LARGEST
 from driftfit.kernel import Array
-from driftfit.models.hammerstein_wiener_steps import GRID, WIDER, envelope
+from driftfit.models.block_curve import FAR, WIDER
+from driftfit.models.block_memory import GRID
 
 if TYPE_CHECKING:
     from driftfit.result import Track
@@ -50,10 +51,10 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
     result.v[:] = inputs(found, run.u[:, 0])
     levels = np.sum(found.model.out.value(run.y) * found.d, axis=1)
     result.w[:begin] = np.where(np.isfinite(levels[:begin]), levels[:begin], 0.0)
-    grid = _Grid(found, run.y[:begin])
+    grid = _Grid(found, run.y)
     radius = found.radius
     for t in range(begin, T):
-        grid.include(run.y[t - 1])
+        grid.upto(t)
         a = found.a[t - 1]
         if radius[t - 1] >= 1.0:
             a, result.stable[t] = reflected(a), False
@@ -90,41 +91,56 @@ def reflected(a: Array) -> Array:
     return np.asarray(np.poly(moved).real[1:])
 
 
+def believed(y: Array) -> tuple[Array, Array]:
+    """Least and largest output up to each sample, (T,), as `driftfit.models.block_curve` believes them."""
+    known = np.abs(y) < LARGEST
+    seen = y[known]
+    low, high = seen.copy(), seen.copy()
+    if len(seen) > 2:
+        middle = np.median(np.stack([seen[:-2], seen[1:-1], seen[2:]]), axis=0)
+        bottom, top = np.minimum.accumulate(middle), np.maximum.accumulate(middle)
+        margin = FAR * (top - bottom)
+        bottom, top = bottom - margin, top + margin
+        low[2:], high[2:] = np.maximum(seen[2:], bottom), np.minimum(seen[2:], top)
+        low[:2], high[:2] = np.nan, np.nan
+    last = np.cumsum(known)  # of the known ones, how many up to each sample
+    none = [np.nan]
+    return (
+        np.concatenate([none, np.fmin.accumulate(low)])[last],
+        np.concatenate([none, np.fmax.accumulate(high)])[last],
+    )
+
+
 class _Grid:
-    """The functions of the output block over the outputs seen so far."""
+    """The functions of the output block over the outputs believed so far."""
 
     def __init__(self, found: Blocks, y: Array) -> None:
         self.basis = found.model.out
-        seen = y[np.abs(y) < LARGEST]
-        self.low = float(seen.min()) if seen.size else -1.0
-        self.high = float(seen.max()) if seen.size else 1.0
-        self._lay()
+        self.low, self.high = believed(y)
+        self.y = np.empty(0)
 
-    def _lay(self) -> None:
-        margin = WIDER * max(self.high - self.low, 1e-9)
-        low, high = (
-            np.maximum(self.low - margin, self.basis.limits[0]),
-            np.minimum(self.high + margin, self.basis.limits[1]),
-        )
-        self.y = np.linspace(low, high, GRID)
-        self.curve = np.ascontiguousarray(self.basis.value(self.y).T)
-        self.level = np.empty(GRID)
-
-    def include(self, y: float) -> None:
-        """Widen the grid for an output that it does not hold."""
-        if abs(y) < LARGEST and not self.low <= y <= self.high:
-            outside = not self.y[0] <= y <= self.y[-1]
-            self.low, self.high = min(self.low, y), max(self.high, y)
-            if outside:
-                self._lay()
+    def upto(self, t: int) -> None:
+        """Lay the grid for the outputs before sample t, if it does not hold them."""
+        low, high = float(self.low[t - 1]), float(self.high[t - 1])
+        low, high = (low, high) if np.isfinite(low) and np.isfinite(high) else (-1.0, 1.0)
+        if not self.y.size or low < self.y[0] or high > self.y[-1]:
+            margin = WIDER * max(high - low, 1e-9)
+            bottom, top = self.basis.limits
+            self.y = np.linspace(max(low - margin, bottom), min(high + margin, top), GRID)
+            self.curve = self.basis.value(self.y)
 
     def invert(self, d: Array, w: float) -> tuple[float, bool]:
         """(y, whether F increases), polished by Newton's method where it does."""
-        rising = envelope(np.ascontiguousarray(d), self.curve, self.level)
-        y = float(np.interp(w, self.level, self.y))
-        if rising and self.level[0] < w < self.level[-1]:
+        level = self.curve @ d
+        rising = bool((np.diff(level) > 0.0).all())
+        if not rising:
+            half = GRID // 2
+            level[half:] = np.maximum.accumulate(level[half:])
+            level[: half + 1] = np.minimum.accumulate(level[half::-1])[::-1]
+        y = float(np.interp(w, level, self.y))
+        if rising and level[0] < w < level[-1]:
             for _ in range(3):
                 slope = float(self.basis.derivative(y) @ d)
                 y += (w - float(self.basis.value(y) @ d)) / slope if slope > 0.0 else 0.0
             y = float(np.clip(y, self.y[0], self.y[-1]))
-        return y, bool(rising)
+        return y, rising

@@ -15,8 +15,8 @@ import numpy as np
 from driftfit.blocks.diagnostics import LEAST, excitation_of
 from driftfit.drivers import known_factors
 from driftfit.kernel import Array
+from driftfit.models.block_memory import MINIMAL
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.models.hammerstein_wiener_steps import MINIMAL
 from driftfit.records import PLAIN
 from driftfit.result import Track
 from driftfit.settings import whole
@@ -80,9 +80,9 @@ def hand_off(
     bound = before.model
     ends, own = before.end().state, tracker.state_for(bound)
     lags = {name: ends[name] for name in bound.memory() if name not in own}
-    cells = np.array(ends["cells"])
-    cells[MINIMAL] = 1.0
-    start = {**lags, "cells": cells}
+    blocks = np.array(ends["blocks"])
+    blocks[MINIMAL] = 1.0
+    start = {**lags, "blocks": blocks}
     tile = fresh_tile(bound, tracker, start)
     rest = slice(last + 1, None)
     known = known_factors()

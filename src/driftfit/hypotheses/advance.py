@@ -6,11 +6,12 @@ no leaf is dropped. The reduction that was planned waits for the next sample tha
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from driftfit.hypotheses.forecast import expect, expect_together, simple
+from driftfit.hypotheses.forecast import expect, expect_together
 from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
 from driftfit.hypotheses.forget import plain as walks
 from driftfit.hypotheses.grow import grow
@@ -52,7 +53,7 @@ from driftfit.hypotheses.plan import (
     number,
 )
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, histories, refilter
-from driftfit.kernel import Array, core, floats, kernel, outside, wholes
+from driftfit.kernel import Array, core, floats, kernel, outside, part, wholes
 
 LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
     range(13)
@@ -74,7 +75,7 @@ HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
 
 
-@core
+@part
 def reduce(
     A: Array, B: Array, T: Array, T2: Array, many: Array, now: Array, prior: Array, row: Array, knobs: Array,
     bases: Array, links: Array, group: Array, n: int, na: int, Hm: int, unknown: bool, Q: Array, sizes: Array, c: Array,
@@ -86,11 +87,13 @@ def reduce(
     parent, event, start, order = links[0], links[1], links[2], links[3]
     now[KEPT] = 1.0
     full = kind == REFILTER and many[STORED] >= int(knobs[DEPTH])
+    alone = kind in (CUT, BEAM)  # the plan has put them in order
     if kind == REFILTER and not full:
         for l in range(L):
-            group[l] = l
-        many[GROUPS] = L
-    alone = kind != INTERACT and not full and sort(group, L, many[GROUPS], start, order) == many[GROUPS]
+            order[l] = l
+        many[GROUPS], alone = L, True
+    elif kind in (MERGE, HYBRID):
+        alone = sort(group, L, many[GROUPS], start, order) == many[GROUPS]
     if not alone and not expanded:
         write_out(T, L, H, Hm, parent, event, T2)
         flip(many)
@@ -99,7 +102,7 @@ def reduce(
         many[STORED] -= 1
         L = refilter(
             root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
-            now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, Qt, X,
+            now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt, X,
         )  # fmt: skip
         histories(A, L, int(knobs[DEPTH]), H, Hm, T)
         return int(L)
@@ -109,23 +112,20 @@ def reduce(
     G = many[GROUPS]
     if alone:
         pick(T, expanded, H, Hm, parent, event, order, G, T2)
-        take(B, order, G, len(A), A)
+        kept = take(B, order, G, len(A), unknown, bases, A)
     else:
-        combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
-    kept = 0.0
-    for l in range(L):
-        kept += B[WEIGHT, l] if group[l] >= 0 else 0.0
+        kept = combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
     now[KEPT] = min(kept, 1.0)
     return int(G)
 
 
-@core
+@part
 def flip(many: Array) -> None:
     """The two tables of the past change places."""
     many[FLIPPED] = 1 - many[FLIPPED]
 
 
-@core
+@part
 def plan(
     B: Array, many: Array, now: Array, knobs: Array, bases: Array, links: Array, group: Array, slots: Array,
     loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array, sensors: Array, phi: Array,
@@ -140,13 +140,13 @@ def plan(
             B, L, many[HELD], knobs, loss, P, row, same, Q, maps, theta0, sensors, phi, now[LAST], now[R], unknown, na,
             links[1], stamps, float(many[CLOCK]), decided, parts, group, X,
         )  # fmt: skip
-        many[GROUPS] = number(group, L)
+        many[GROUPS] = number(group, L, links[3])
     elif kind == MERGE:
         many[GROUPS] = merge(B, L, group, slots)
     elif kind == BEAM:
-        many[GROUPS] = beam(B, L, knobs, links[0], links[1], Hm, group, X)
+        many[GROUPS] = beam(B, L, knobs, links, Hm, group, X)
     elif kind == HYBRID:
-        many[GROUPS] = hybrid(B, L, knobs, bases, group, slots, X)
+        many[GROUPS] = hybrid(B, L, knobs, bases, group, slots, links[3], X)
 
 
 @core
@@ -161,13 +161,13 @@ def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) 
             B[at, l] = y if seen else y_hat[l]
 
 
-@core
+@part
 def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
     decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lag_prob: Array, theta: Array, cov: Array,
-    na: int, unknown: bool, same: bool,
+    na: int, unknown: bool, same: bool, plain: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
     The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`.
@@ -180,7 +180,7 @@ def advance(
     noise, still = now[IN_NOISE], now[IN_DT] == 0.0
     told, first = given[0] == given[0], many[FLOORS] == 0
     row = given if told else initial if first else P[0]
-    alike = same or told
+    alike = same or told or first
     now[EVIDENCE] = 0.0
     for k in range(len(decided)):
         decided[k, 0] = -1.0
@@ -190,25 +190,25 @@ def advance(
 
     # forecast: every leaf with all that may happen to it
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
-    h, y_hat, factor = X[tri + 3 * n], X[tri + 3 * n + 1], X[tri + 3 * n + 2]
+    expected, factor = X[tri + 3 * n : tri + 3 * n + 2], X[tri + 3 * n + 2]
+    h, y_hat = expected[0], expected[1]
     scratch = X[tri + 3 * n + 3 :]
     expanded = many[EXPANDED] > 0
     priors(T, event, expanded, first, alike, L, P, row, prior)
     if still:
         standstill(prior, L, Hm)
     variance_factor(B, L, unknown, factor)
-    plain = na == 0 and simple(maps, sensors)
     if plain:
         now[Y_HAT], now[S2] = expect_together(
-            B[WEIGHT], L, factor, prior, phi, theta, cov, Qt, sensors, now[R] * noise, scratch
+            B[WEIGHT], L, factor, prior, alike, phi, theta, cov, Qt, sensors, now[R] * noise, scratch
         )
     if not plain or now[IN_OK] == 0.0:
-        regressors(phi, B, L, n, na, Z)
+        regressors(phi, B, L, min(L, 1), n, na, Z)
         if walks(maps):
             blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
         else:
             average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
-        spread(C, Z, m, L, g, h, y_hat)
+        spread(C, Z, m, L, g, expected)
         widen_by_lags(B, L, L, n, na, m, h)
     if not plain:
         now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
@@ -231,17 +231,18 @@ def advance(
                 for l in range(K):
                     prior[e, l] = 1.0 if e == l else 0.0
         else:
-            priors(T, event, True, first, alike, K, P, row, prior)
-            if still:
-                standstill(prior, K, Hm)
+            if not alike or kind == REFILTER:
+                priors(T, event, many[EXPANDED] == 0, first, alike, K, P, row, prior)
+                if still:
+                    standstill(prior, K, Hm)
         L = grow(
             A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], na, Qt, maps, theta0,
-            sensors, prior, own, bases, parent, event, X,
+            sensors, prior, own, alike, bases, parent, event, X,
         )  # fmt: skip
         gone = normalise(B, L)
         many[PARENTS], many[LEAVES] = K, L
         if gone == gone:
-            now[EVIDENCE] = gone
+            now[EVIDENCE] = gone - math.log(now[KEPT])
             for i in range(n):
                 theta0[BEFORE, i] = phi[i]
             if many[HELD] < len(stamps):
@@ -287,7 +288,7 @@ def advance(
         now[LAST] = now[IN_Y]
 
 
-@core
+@part
 def store(sample: Array, now: Array, phi: Array) -> None:
     sample[Y], sample[NOISE], sample[TIME] = now[IN_Y], now[IN_NOISE], now[IN_TIME]
     for i in range(len(phi)):
@@ -331,8 +332,8 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
         for j in range(i + 1):
             B[at, 0] = P[i, j]
             at += 1
-    for row in range(len(T)):
-        T[row, 0] = 1.0 if row % (H + 1) == H else 0.0
+    for at in range(T.shape[1]):
+        T[0, at] = 1.0 if at % (H + 1) == H else 0.0
     many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
@@ -344,7 +345,7 @@ def trace(P: Array) -> float:
     return total
 
 
-@core
+@part
 def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
     row = (clock - 1) % len(ring)
@@ -363,9 +364,10 @@ shapes have one type of record and one driver. Row k of the table says where, in
 """
 GIVEN, FACTORS = PACKED.index("given"), PACKED.index("factors")
 PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
-BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, ROWS = range(PLACES, PLACES + 10)
+BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
 """Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
-and whether the noise is unknown and events are independent; and how many rows there are.
+and whether the noise is unknown and events are independent; of PLAIN whether all leaves have one regressor, all changes
+are walks and all sensors differ in their noise alone; and how many rows there are.
 """
 
 
@@ -407,7 +409,7 @@ def bank(table: int) -> None:
         packed(t, 12), packed(t, 13), packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
         packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
         packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
-        floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,
+        floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0,
     )  # fmt: skip
     head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
     note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 27))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.hypotheses.forget import plain
 from driftfit.hypotheses.leaves import total
-from driftfit.kernel import Array, core
+from driftfit.kernel import Array, core, part
 
 FACTOR, VALUE, FROZEN, WIDTH, CLEANS = range(5)
 """Columns of the table of sensors."""
@@ -59,19 +58,10 @@ def expect(
     return mean, variance if noise < np.inf else np.inf
 
 
-@core
-def simple(maps: Array, sensors: Array) -> bool:
-    """Whether all changes are walks and all sensors differ in their noise alone."""
-    other = 0
-    for j in range(len(sensors)):
-        other += 1 if sensors[j, VALUE] != 0.0 or sensors[j, FROZEN] > 0.0 else 0
-    return other == 0 and plain(maps)
-
-
-@core
+@part
 def expect_together(
-    w: Array, L: int, factor: Array, prior: Array, phi: Array, theta: Array, P: Array, Q: Array, sensors: Array,
-    r: float, X: Array,
+    w: Array, L: int, factor: Array, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
+    sensors: Array, r: float, X: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
 
@@ -84,12 +74,20 @@ def expect_together(
     rest = 0.0
     for i in range(Hd):
         share[i] = 0.0
-    for e in range(len(prior)):
+    unit = 0.0
+    if alike:
         for l in range(L):
-            part[l] = w[l] * (factor[l] * prior[e, l])
-        f = total(part, L)
-        share[e // Hm] += f
-        rest += f * sensors[e % Hm, FACTOR]
+            part[l] = w[l] * factor[l]
+        unit = total(part, L)
+    for i in range(Hd):
+        for j in range(Hm):
+            f = unit * prior[i * Hm + j, 0]
+            if not alike:
+                for l in range(L):
+                    part[l] = w[l] * (factor[l] * prior[i * Hm + j, l])
+                f = total(part, L)
+            share[i] += f
+            rest += f * sensors[j, FACTOR]
     mean, wide = 0.0, 0.0
     for i in range(n):
         g = 0.0

@@ -19,18 +19,20 @@ import math
 
 import numpy as np
 
-from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE, WIDTH
+from driftfit.eights import WIDTH, fill, load, minus, over, plus, store, times
+from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE
+from driftfit.hypotheses.forecast import WIDTH as STUCK_WIDTH
 from driftfit.hypotheses.forget import apply
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.kernel import Array, core, log
+from driftfit.kernel import Array, core, log, part
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
 """S never falls below this share of nu times the mean square of y: the data's own rounding."""
 
 
-@core
+@part
 def develop(
     A: Array, K: int, n: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array, m: Array, g: Array,
     h: Array,
@@ -50,66 +52,53 @@ def develop(
             apply(C, m, c * Hm, (c + 1) * Hm, c, maps, places, Q, g, h)
         return K
     for c in range(len(Q)):
-        keep, block = maps[c, 0], slice(c * K, (c + 1) * K)
-        for k in range(Q.shape[1]):
-            q, to = Q[c, k], C[k, block]
-            for l in range(K):
-                to[l] = keep * A[first + k, l] + q
-        for i in range(n):
-            to = m[i, block]
-            for l in range(K):
-                to[l] = A[FIRST + i, l]
-            if maps[c, 1] > 0.0:
-                to[:] = places[0, i]
+        keep, reset = fill(maps[c, 0]), maps[c, 1] > 0.0
+        for l in range(0, K, WIDTH):
+            for k in range(Q.shape[1]):
+                store(C, k, c * K + l, plus(times(keep, load(A, first + k, l)), fill(Q[c, k])))
+            for i in range(n):
+                store(m, i, c * K + l, fill(places[0, i]) if reset else load(A, FIRST + i, l))
         apply(C, m, c * K, (c + 1) * K, c, maps, places, Q, g, h)
     return K * len(Q)
 
 
-@core
+@part
 def correct(
-    B: Array, block: slice, n: int, C: Array, m: Array, g: Array, h: Array, y_hat: Array, y: float, noise: float,
+    B: Array, at: int, columns: int, n: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
     X: Array,
 ) -> None:  # fmt: skip
-    """The data in a block of columns; innovations and their variances go to the first two rows of X."""
-    eps, s, gain, k = X[0], X[1], X[2], X[3]
-    columns, row, at = block.stop - block.start, FIRST + n, 0
-    for l in range(columns):
-        s[l] = h[l] + noise
-        eps[l] = y - y_hat[l]
-        gain[l] = 1.0 / s[l]
-    for i in range(n):
-        mean = B[FIRST + i, block]
-        for l in range(columns):
-            k[l] = gain[l] * g[i, l]
-            mean[l] = m[i, l] + k[l] * eps[l]
-        for j in range(i + 1):
-            to = B[row + at, block]
-            for l in range(columns):
-                to[l] = C[at, l] - k[l] * g[j, l]
-            at += 1
+    """The data in the columns from ``at``; innovations and their variances go to the first two rows of X."""
+    for l in range(0, columns, WIDTH):
+        s = plus(load(expected, 0, l), fill(noise))
+        eps, gain, entry = minus(fill(y), load(expected, 1, l)), over(fill(1.0), s), 0
+        store(X, 0, l, eps)
+        store(X, 1, l, s)
+        for i in range(n):
+            k = times(gain, load(g, i, l))
+            store(B, FIRST + i, at + l, plus(load(m, i, l), times(k, eps)))
+            for j in range(i + 1):
+                store(B, FIRST + n + entry, at + l, minus(load(C, entry, l), times(k, load(g, j, l))))
+                entry += 1
 
 
 @core
-def leave(B: Array, block: slice, n: int, C: Array, m: Array) -> None:
+def leave(B: Array, at: int, columns: int, n: int, C: Array, m: Array) -> None:
     """A sensor that says nothing of theta."""
-    for i in range(n):
-        to = B[FIRST + i, block]
-        for l in range(len(to)):
-            to[l] = m[i, l]
-    for k in range(len(C)):
-        to = B[FIRST + n + k, block]
-        for l in range(len(to)):
-            to[l] = C[k, l]
+    for l in range(0, columns, WIDTH):
+        for i in range(n):
+            store(B, FIRST + i, at + l, load(m, i, l))
+        for k in range(n * (n + 1) // 2):
+            store(B, FIRST + n + k, at + l, load(C, k, l))
 
 
-@core
+@part
 def gaussian(eps: Array, s: Array, columns: int, out: Array) -> None:
     """log N(eps; 0, s)."""
     for l in range(columns):
         out[l] = -0.5 * (LOG_2PI + log(s[l]) + eps[l] * eps[l] / s[l])
 
 
-@core
+@part
 def student(nus: Array, scales: Array, eps: Array, s: Array, fade: float, least: float, out: Array) -> None:
     """Log density with unknown variance; nu and S take the sample in."""
     before, ratio = np.nan, 0.0
@@ -140,102 +129,106 @@ def frozen(nus: Array, scales: Array, y: float, last: float, width: float, r: fl
 @core
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
-    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array,
-    parent: Array, event: Array, X: Array,
+    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, alike: bool,
+    bases: Array, parent: Array, event: Array, X: Array,
 ) -> int:  # fmt: skip
-    """The children of K leaves, with their weights not normalised; returns how many there are."""
+    """The children of K leaves, with their weights not normalised; returns how many there are. ``alike`` says that the
+    prior is the same for all leaves.
+    """
     n, Hd, Hm = len(phi), len(Q), len(sensors)
     tri = n * (n + 1) // 2
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
-    h, y_hat, likely = X[tri + 3 * n], X[tri + 3 * n + 1], X[tri + 3 * n + 2]
+    expected, likely = X[tri + 3 * n : tri + 3 * n + 2], X[tri + 3 * n + 2]
     scratch = X[tri + 3 * n + 3 :]
-    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, h)
-    regressors(phi, A, K, n, na, Z)
-    for i in range(n):
-        for c in range(1, columns // K):
-            to = Z[i, c * K : (c + 1) * K]
-            for l in range(K):
-                to[l] = Z[i, l]
-    spread(C, Z, m, columns, g, h, y_hat)
-    widen_by_lags(A, K, columns, n, na, m, h)
+    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, expected[0])
+    regressors(phi, A, K, columns // K, n, na, Z)
+    spread(C, Z, m, columns, g, expected)
+    widen_by_lags(A, K, columns, n, na, m, expected[0])
     for j in range(Hm):
-        block = slice(j * columns, (j + 1) * columns)
-        inherit(A, K, B, block, unknown, bases)
+        at = j * columns
+        if unknown:
+            inherit(A, K, B, NU, at, columns)
+            inherit(A, K, B, S, at, columns)
+        nus, scales = B[NU, at : at + columns], B[S, at : at + columns]
         if sensors[j, FROZEN] > 0.0:
-            leave(B, block, n, C, m)
-            frozen(B[NU, block], B[S, block], y, last, sensors[j, WIDTH], r, unknown, likely)
+            leave(B, at, columns, n, C, m)
+            frozen(nus, scales, y, last, sensors[j, STUCK_WIDTH], r, unknown, likely)
         else:
-            correct(B, block, n, C, m, g, h, y_hat, y - sensors[j, VALUE], sensors[j, FACTOR] * r * noise, scratch)
+            noise_j = sensors[j, FACTOR] * r * noise
+            correct(B, at, columns, n, C, m, g, expected, y - sensors[j, VALUE], noise_j, scratch)
             if unknown:
-                student(B[NU, block], B[S, block], scratch[0], scratch[1], fade, least, likely)
+                student(nus, scales, scratch[0], scratch[1], fade, least, likely)
             else:
                 gaussian(scratch[0], scratch[1], columns, likely)
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
-            remember(A, K, B, block, n, na, y - sensors[j, VALUE], y_hat, own_lags)
-            shift_covariance(A, K, B, block, n, na, own_lags, m, h, r, X[len(X) - na :])
-        name(B, block, K, j, Hd, Hm, own, prior, likely, bases, parent, event)
+            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], own_lags)
+            block, spare = slice(at, at + columns), X[len(X) - na :]
+            shift_covariance(A, K, B, block, n, na, own_lags, m, expected[0], r, spare)
+        weigh(A, K, B, at, columns, j, Hm, own, alike, prior, likely, parent, event)
+        encode(A, K, B, at, columns, j, Hd, Hm, bases, event)
     return int(columns * Hm)
 
 
 @core
-def inherit(A: Array, K: int, B: Array, block: slice, unknown: bool, bases: Array) -> None:
-    """What children have of their parents: log w, age, nu and S, and the codes that are kept."""
-    for row in range(LOG, FIRST):
-        needed = row in (LOG, AGE) or (unknown and row in (NU, S))
-        coded = (row == CODE and bases[0] > 1.0) or (row == SENSORS and bases[1] > 1.0)
-        if needed or coded or (row == CHANGES and bases[2] > 1.0):
-            for at in range(block.start, block.stop, K):
-                to = B[row, at : at + K]
-                for l in range(K):
-                    to[l] = A[row, l]
+def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None:
+    """A row of children as their parents have it."""
+    for c in range(at, at + columns, K):
+        for l in range(K):
+            B[row, np.uint64(c + l)] = A[row, l]
 
 
 @core
-def remember(A: Array, K: int, B: Array, block: slice, n: int, na: int, y: float, y_hat: Array, own: bool) -> None:
+def remember(
+    A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, y_hat: Array, own: bool
+) -> None:
     """Output lags of the children: the parent's, one later, and y or what the leaf expected."""
     first = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
-        for at in range(block.start, block.stop, K):
-            to = B[first + i, at : at + K]
+        for c in range(at, at + columns, K):
             for l in range(K):
-                to[l] = A[first + i - 1, l]
-    to = B[first, block]
-    for l in range(len(to)):
-        to[l] = y_hat[l] if own else y
+                B[first + i, np.uint64(c + l)] = A[first + i - 1, l]
+    for l in range(columns):
+        B[first, np.uint64(at + l)] = y_hat[l] if own else y
+
+
+@part
+def weigh(
+    A: Array, K: int, B: Array, at: int, columns: int, j: int, Hm: int, own: bool, alike: bool, prior: Array,
+    likely: Array, parents: Array, events: Array,
+) -> None:  # fmt: skip
+    """Weights and ages of the children under sensor j, whose children they are, and by which event."""
+    if own:
+        for l in range(K):
+            B[LOG, at + l] = A[LOG, l] + (likely[l] if l % Hm == j else -np.inf)
+            B[AGE, at + l] = 0.0 if l >= Hm else A[AGE, l] + 1.0
+            parents[at + l], events[at + l] = l, l // Hm * Hm + j
+        return
+    for c in range(columns // K):
+        to, e = at + c * K, c * Hm + j
+        chances = prior[e]
+        if alike:
+            toll = log(chances[0]) if chances[0] > 0.0 else -np.inf
+            for l in range(K):
+                B[LOG, np.uint64(to + l)] = A[LOG, l] + (toll + likely[np.uint64(c * K + l)])
+        else:
+            for l in range(K):
+                toll = log(chances[l]) if chances[l] > 0.0 else -np.inf
+                B[LOG, np.uint64(to + l)] = A[LOG, l] + (toll + likely[np.uint64(c * K + l)])
+        for l in range(K):
+            B[AGE, np.uint64(to + l)] = 0.0 if c > 0 else A[AGE, l] + 1.0
+            parents[np.uint64(to + l)], events[np.uint64(to + l)] = l, e
 
 
 @core
-def name(
-    B: Array, block: slice, K: int, j: int, Hd: int, Hm: int, own: bool, prior: Array, likely: Array, bases: Array,
-    parents: Array, events: Array,
-) -> None:  # fmt: skip
-    """Weights, codes and ages of the children under sensor j. ``bases`` limits the three codes; 1 keeps none."""
-    weight, age = B[LOG, block], B[AGE, block]
-    parent, event = parents[block], events[block]
-    for c in range(len(weight) // K):
-        here = slice(c * K, (c + 1) * K)
-        w, far, old, of, to = weight[here], likely[here], age[here], parent[here], event[here]
-        if own:
-            for l in range(K):
-                to[l] = l // Hm * Hm + j
-                w[l] += far[l] if l % Hm == j else -np.inf
-                old[l] = 0.0 if l >= Hm else old[l] + 1.0
-        else:
-            e = c * Hm + j
-            for l in range(K):
-                chance = prior[e, l]
-                w[l] += log(chance) + far[l] if chance > 0.0 else -np.inf
-                to[l] = e
-            for l in range(K):
-                old[l] = 0.0 if c > 0 else old[l] + 1.0
-        for l in range(K):
-            of[l] = l
-    for l in range(len(weight)):
-        at = block.start + l
-        if bases[0] > 1.0:
-            B[CODE, at] = (B[CODE, at] * (Hd * Hm) + event[l]) % bases[0]
-        if bases[1] > 1.0:
-            B[SENSORS, at] = (B[SENSORS, at] * Hm + j) % bases[1]
-        if bases[2] > 1.0:
-            B[CHANGES, at] = (B[CHANGES, at] * Hd + event[l] // Hm) % bases[2]
+def encode(
+    A: Array, K: int, B: Array, at: int, columns: int, j: int, Hd: int, Hm: int, bases: Array, events: Array
+) -> None:
+    """The codes of the children; ``bases`` limits the three codes, and 1 keeps none."""
+    for k in range(3):
+        row, base = (CODE, SENSORS, CHANGES)[k], bases[k]
+        if base > 1.0:
+            for l in range(columns):
+                e = events[at + l]
+                digits, digit = ((Hd * Hm, e), (Hm, j), (Hd, e // Hm))[k]
+                B[row, at + l] = (A[row, l % K] * digits + digit) % base

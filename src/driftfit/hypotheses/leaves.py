@@ -18,7 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.kernel import Array, core, exp, kernel, log
+from driftfit.eights import WIDTH, fill, load, minus, plus, store, sum_of, times
+from driftfit.kernel import Array, core, exp, kernel, log, part
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -39,17 +40,32 @@ def total(x: Array, count: int) -> float:
     return (a + c) + (b + d)
 
 
+@kernel
+def largest(x: Array, count: int) -> float:
+    """Largest of the first entries, in four interleaved parts."""
+    a, b, c, d = -np.inf, -np.inf, -np.inf, -np.inf
+    whole = count // 4 * 4
+    for l in range(0, whole, 4):
+        a = x[l] if x[l] > a else a
+        b = x[l + 1] if x[l + 1] > b else b
+        c = x[l + 2] if x[l + 2] > c else c
+        d = x[l + 3] if x[l + 3] > d else d
+    for l in range(whole, count):
+        a = x[l] if x[l] > a else a
+    return max(max(a, b), max(c, d))
+
+
 @core
 def normalise(B: Array, L: int) -> float:
-    """Weights from their logarithms; returns log sum, or NaN where no leaf is possible."""
-    top = -np.inf
-    for l in range(L):
-        top = max(top, B[LOG, l])
+    """Weights from their logarithms, zeros beyond; returns log sum, or NaN where no leaf is possible."""
+    top = largest(B[LOG], L)
     if not abs(top) < np.inf:
         return np.nan
     for l in range(L):
         far = B[LOG, l] - top
         B[WEIGHT, l] = exp(far) if far > -700.0 else 0.0
+    for l in range(L, min(L + WIDTH, B.shape[1])):
+        B[WEIGHT, l] = 0.0
     mass = total(B[WEIGHT], L)
     gone = top + log(mass)
     each = 1.0 / mass
@@ -66,24 +82,25 @@ def variance_factor(B: Array, L: int, unknown: bool, out: Array) -> None:
         out[l] = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
 
 
-@core
+@part
 def mixture(B: Array, L: int, n: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
-    C = FIRST + n
-    w, factor, part = B[WEIGHT], X[n], X[n + 1]
-    variance_factor(B, L, unknown, factor)
+    variance_factor(B, L, unknown, X[n])
     for i in range(n):
-        for l in range(L):
-            part[l] = w[l] * B[FIRST + i, l]
-        theta[i] = total(part, L)
-        for l in range(L):
-            X[i, l] = B[FIRST + i, l] - theta[i]
-    at = C
+        sums = fill(0.0)
+        for l in range(0, L, WIDTH):
+            sums = plus(sums, times(load(B, WEIGHT, l), load(B, FIRST + i, l)))
+        theta[i] = sum_of(sums)
+        for l in range(0, L, WIDTH):
+            store(X, i, l, minus(load(B, FIRST + i, l), fill(theta[i])))
+    at = FIRST + n
     for i in range(n):
         for j in range(i + 1):
-            for l in range(L):
-                part[l] = w[l] * (B[at, l] * factor[l] + X[i, l] * X[j, l])
-            P[i, j] = total(part, L)
+            sums = fill(0.0)
+            for l in range(0, L, WIDTH):
+                inner = times(load(B, at, l), load(X, n, l))
+                sums = plus(sums, times(load(B, WEIGHT, l), plus(inner, times(load(X, i, l), load(X, j, l)))))
+            P[i, j] = sum_of(sums)
             at += 1
 
 
@@ -105,7 +122,7 @@ def priors(
             for last in range(H):
                 if P[last, e] > 0.0:
                     for l in range(L):
-                        prior[e, l] += P[last, e] * T[last, l]
+                        prior[e, l] += P[last, e] * T[l, last]
         else:
             for l in range(L):
                 prior[e, l] = P[event[l], e]
@@ -123,7 +140,7 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
             prior[j, l] = share
 
 
-@core
+@part
 def increments(
     Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
 ) -> None:
@@ -134,40 +151,40 @@ def increments(
         for k in range(Q.shape[1]):
             out[i, k] = Q[i, k] * span
         for k in range(n):
-            unit = (1.0 if unknown else r) / c[k] if c[k] > 0.0 else 0.0
-            out[i, k * (k + 1) // 2 + k] += sizes[i, k] * unit * span
+            if sizes[i, k] > 0.0 and c[k] > 0.0:
+                out[i, k * (k + 1) // 2 + k] += sizes[i, k] * ((1.0 if unknown else r) / c[k]) * span
 
 
 @core
-def regressors(phi: Array, B: Array, L: int, n: int, na: int, Z: Array) -> None:
+def regressors(phi: Array, B: Array, L: int, copies: int, n: int, na: int, Z: Array) -> None:
     """The regressor of every leaf: phi, with the leaf's own output lags where it keeps some."""
     lags = FIRST + n + n * (n + 1) // 2
-    for i in range(n):
-        if i < na:
+    for i in range(na):
+        for at in range(0, copies * L, L):
             for l in range(L):
-                Z[i, l] = B[lags + i, l]
-        else:
-            for l in range(L):
-                Z[i, l] = phi[i]
+                Z[i, at + l] = B[lags + i, l]
+    for i in range(na, n):
+        for l in range(copies * L):
+            Z[i, l] = phi[i]
 
 
 @core
-def spread(C: Array, Z: Array, m: Array, L: int, g: Array, h: Array, y: Array) -> None:
-    """g = C z, h = z' C z, y = z' m for every leaf; C is a lower triangle."""
+def spread(C: Array, Z: Array, m: Array, L: int, g: Array, expected: Array) -> None:
+    """g = C z, and the rows h = z' C z and y = z' m of ``expected``, for every leaf; C is a lower triangle."""
     n = len(Z)
-    for l in range(L):
-        h[l] = 0.0
-        y[l] = 0.0
-    for i in range(n):
-        for l in range(L):
-            g[i, l] = 0.0
-        for j in range(n):
-            at = i * (i + 1) // 2 + j if j <= i else j * (j + 1) // 2 + i
-            for l in range(L):
-                g[i, l] += C[at, l] * Z[j, l]
-        for l in range(L):
-            h[l] += Z[i, l] * g[i, l]
-            y[l] += Z[i, l] * m[i, l]
+    for l in range(0, L, WIDTH):
+        h, y = fill(0.0), fill(0.0)
+        for i in range(n):
+            z, sums, row = load(Z, i, l), fill(0.0), i * (i + 1) // 2
+            for j in range(i + 1):
+                sums = plus(sums, times(load(C, row + j, l), load(Z, j, l)))
+            for j in range(i + 1, n):
+                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(Z, j, l)))
+            store(g, i, l, sums)
+            h = plus(h, times(z, sums))
+            y = plus(y, times(z, load(m, i, l)))
+        store(expected, 0, l, h)
+        store(expected, 1, l, y)
 
 
 @core

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.eights import WIDTH
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import forget, plan
 from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED
+from driftfit.hypotheses.forecast import FROZEN, VALUE
 from driftfit.hypotheses.leaves import FIRST
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.kernel import Array
@@ -36,10 +38,12 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     places[forget.MEAN], places[forget.CAP] = theta0, np.inf
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
+    parents, children = room(max(shape.parents, K // (Hd * Hm)), Hd, Hm)
+    past = -(-W * (H + 1) // WIDTH) * WIDTH
     refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
     return {
-        "A": np.zeros((rows, shape.parents)), "B": np.zeros((rows, K)), "T": np.zeros((W * (H + 1), K)),
-        "T2": np.zeros((W * (H + 1), K)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, K)),
+        "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
+        "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
         "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
         "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
         "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
@@ -49,7 +53,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "chain": chain, "initial": initial, "given": np.full(H, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, 1)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
         "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
@@ -66,13 +70,24 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
         into.append(array.ravel().view(np.float64))
     table[core.THETA, 1] = n
     table[core.FLAGS] = na, unknown, alike
+    walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
+    noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    table[core.PLAIN] = na == 0 and walks and noises
     memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 64), "table": table, "flat": np.zeros(1)}
+    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+
+
+def room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
+    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
+    blocks = (parents, parents * Hd, parents * Hd * Hm)
+    up = [-(-size // WIDTH) * WIDTH for size in blocks]
+    most = max(blocks[2] - size + whole for size, whole in zip(blocks, up, strict=True))
+    return up[0], -(-most // WIDTH) * WIDTH
 
 
 def _padded(x: Array, least: int) -> Array:
     """With zeros up to one of few sizes."""
     size = least
     while size < len(x):
-        size *= 4
+        size *= 2
     return np.concatenate([x, np.zeros(size - len(x))])

@@ -18,9 +18,9 @@ import math
 import numpy as np
 
 from driftfit.hypotheses.lags import merge_covariance
-from driftfit.hypotheses.leaves import FIRST, LOG, NU, WEIGHT, S, normalise
+from driftfit.hypotheses.leaves import CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.hypotheses.past import average
-from driftfit.kernel import Array, core
+from driftfit.kernel import Array, core, kernel, part
 
 
 @core
@@ -123,13 +123,17 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 def combine(
     B: Array, group: Array, L: int, G: int, n: int, na: int, unknown: bool, A: Array, start: Array, order: Array,
     share: Array, T: Array, T2: Array,
-) -> None:  # fmt: skip
-    """A leaf in A, and a column of the table, for every group that `sort` put in order; T is that of the leaves."""
+) -> float:  # fmt: skip
+    """A leaf in A, and a row of the table, for every group that `sort` put in order; T is that of the leaves. Returns
+    the mass that is left.
+    """
+    kept = 0.0
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
         mass = 0.0
         for l in members:
             mass += B[WEIGHT, l]
+        kept += mass
         for at in range(len(members)):
             part[at] = B[WEIGHT, members[at]] / mass
         if len(members) == 1:
@@ -139,16 +143,28 @@ def combine(
             match(B, members, n, na, unknown, part, A, k)
             A[LOG, k] = math.log(mass)
         average(T, members, part, T2, k)
-    normalise(A, G)
+    return kept
 
 
-@core
-def take(B: Array, order: Array, G: int, rows: int, A: Array) -> None:
-    """Leaves that are kept as they are."""
+@part
+def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
+    """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
     for row in range(rows):
-        for k in range(G):
-            A[row, k] = B[row, order[k]]
-    normalise(A, G)
+        if used(row, unknown, bases):
+            for k in range(G):
+                A[row, k] = B[row, order[k]]
+    kept = 0.0
+    for k in range(G):
+        kept += B[WEIGHT, order[k]]
+    return kept
+
+
+@kernel
+def used(row: int, unknown: bool, bases: Array) -> bool:
+    """Whether leaves need the row: the weight follows from its logarithm, and not all reductions need all codes."""
+    coded = row in (CODE, SENSORS, CHANGES)
+    base = bases[0 if row == CODE else 1 if row == SENSORS else 2]
+    return row != WEIGHT and (unknown or (row not in (NU, S))) and (base > 1.0 or not coded)
 
 
 @core
@@ -174,5 +190,4 @@ def mix(
         match(B, order[:count], n, na, unknown, share[:count], A, e)
         average(T, order[:count], share[:count], T2, e)
         A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
-    normalise(A, H)
     return H

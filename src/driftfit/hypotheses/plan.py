@@ -6,9 +6,12 @@ not used leaves the mixture as it is.
 
 from __future__ import annotations
 
+import numpy as np
+
+from driftfit.eights import WIDTH, fill, load, plus, reaches, sum_of
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.hypotheses.lookahead import expected_risk
-from driftfit.kernel import Array, core
+from driftfit.kernel import Array, core, kernel, part
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
@@ -16,61 +19,80 @@ KIND, LEAVES, DEPTH, TAU, WAIT, LIFE, BEST, CAP, PRIOR = range(9)
 """Entries of the vector of settings of a reduction."""
 
 
+FEW = 64
+"""As many entries are compared each with each; among more, and among ties, the bound is searched."""
+
+
+@kernel
+def reached(V: Array, row: int, count: int, value: float) -> float:
+    """How many entries of a row are at least ``value``."""
+    sums = fill(0.0)
+    for l in range(0, count, WIDTH):
+        sums = plus(sums, reaches(load(V, row, l), fill(value)))
+    return float(sum_of(sums))
+
+
 @core
-def kth_largest(x: Array, count: int, k: int) -> float:
-    """The k-th largest of the first entries (k from 1), which are put out of order; linear on average."""
-    low, high = 0, count - 1
-    while low < high:
-        pivot = x[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while x[i] > pivot:
-                i += 1
-            while x[j] < pivot:
-                j -= 1
-            if i <= j:
-                x[i], x[j] = x[j], x[i]
-                i += 1
-                j -= 1
-        if k - 1 <= j:
-            high = j
-        elif k - 1 >= i:
-            low = i
-        else:
+def bound(V: Array, row: int, count: int, M: int) -> float:
+    """The M-th largest entry of a row, or any number between it and the next; 0 if no more than M are positive.
+
+    By bisection of the bits, which are in the order of the numbers: a dozen counts, each without branches,
+    are faster than a selection that jumps about.
+    """
+    low, high = np.int64(1), np.int64(0x7FF0000000000000)
+    if reached(V, row, count, np.int64(low).view(np.float64)) <= M:
+        return 0.0
+    while high - low > 1:
+        middle = (low + high) // 2
+        many = reached(V, row, count, np.int64(middle).view(np.float64))
+        low = middle if many >= M else low
+        high = high if many >= M else middle
+        if many == M:
             break
-    return float(x[k - 1])
+    return float(np.int64(low).view(np.float64))
 
 
-@core
-def heaviest(value: Array, count: int, M: int, group: Array, scratch: Array) -> int:
-    """Number the M largest positive values in their order, ties by their order; -1 for the rest. Returns how many."""
-    positive = 0
+@part
+def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array) -> int:
+    """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
+    many. What follows in the row, up to the next eight, must be zero.
+    """
+    value, over, G = V[row], 0, 0
+    if count <= FEW:
+        for l in range(count):
+            keep = 1 if value[l] > 0.0 and reached(V, row, count, value[l]) <= M else 0
+            group[l], order[G] = G if keep > 0 else -1, l
+            G += keep
+        if G == M:
+            return G
+        G = 0
+    least = bound(V, row, count, M)
     for l in range(count):
-        scratch[l] = value[l]
-        positive += 1 if value[l] > 0.0 else 0
-    bound = 0.0
-    if positive > M:
-        bound = kth_largest(scratch, count, M)
-    above = 0
+        over += 1 if value[l] > least else 0
+    ties = M - over if least > 0.0 else 0
     for l in range(count):
-        above += 1 if value[l] > bound else 0
-    ties = M - above if positive > M else 0
-    G = 0
-    for l in range(count):
-        tie = value[l] == bound and ties > 0 and value[l] > 0.0
-        ties -= 1 if tie else 0
-        if value[l] > bound or tie:
-            group[l] = G
-            G += 1
-        else:
-            group[l] = -1
+        tie = 1 if value[l] == least and ties > 0 else 0
+        keep = tie + (1 if value[l] > least else 0)
+        ties -= tie
+        group[l], order[G] = G if keep > 0 else -1, l
+        G += keep
     return G
 
 
-@core
-def beam(B: Array, L: int, knobs: Array, parent: Array, event: Array, Hm: int, group: Array, X: Array) -> int:
+@kernel
+def clear(V: Array, row: int, count: int) -> None:
+    """Zeros after the first entries, up to the next eight."""
+    for l in range(count, min(count + WIDTH, V.shape[1])):
+        V[row, l] = 0.0
+
+
+@part
+def beam(B: Array, L: int, knobs: Array, links: Array, Hm: int, group: Array, X: Array) -> int:
     """The heaviest leaves; the young are protected, and jumps of all but the best parent may be left out."""
     w, value, mass = B[WEIGHT], X[0], X[1]
+    parent, event, M = links[0], links[1], int(knobs[LEAVES])
+    if knobs[LIFE] <= 0.0 and knobs[BEST] <= 0.0:
+        return int(heaviest(B, WEIGHT, L, M, group, links[3]))
     top = 0
     for l in range(L):
         value[l] = w[l]
@@ -89,7 +111,8 @@ def beam(B: Array, L: int, knobs: Array, parent: Array, event: Array, Hm: int, g
         for l in range(L):
             value[l] = 0.0 if event[l] >= Hm and parent[l] != best else value[l]
     value[top] = 4.0
-    return int(heaviest(value, L, int(knobs[LEAVES]), group, X[2]))
+    clear(X, 0, L)
+    return int(heaviest(X, 0, L, M, group, links[3]))
 
 
 @core
@@ -110,7 +133,7 @@ def merge(B: Array, L: int, group: Array, slots: Array) -> int:
 
 
 @core
-def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, X: Array) -> int:
+def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
     cap, size = knobs[CAP], len(slots)
     mass, key, renumber = X[0], X[1], X[3]
@@ -134,7 +157,8 @@ def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Ar
     if G > M:
         for k in range(G):
             slots[k] = 0
-        G2 = heaviest(mass, G, M, slots, X[2])
+        clear(X, 0, G)
+        G2 = heaviest(X, 0, G, M, slots, order)
         for k in range(G):
             renumber[k] = slots[k]
         for l in range(L):
@@ -205,11 +229,11 @@ def decide(
 
 
 @core
-def number(group: Array, L: int) -> int:
+def number(group: Array, L: int, order: Array) -> int:
     """Groups of single leaves in their order."""
     G = 0
     for l in range(L):
-        if group[l] >= 0:
-            group[l] = G
-            G += 1
+        keep = group[l] >= 0
+        group[l], order[G] = G if keep else -1, l
+        G += 1 if keep else 0
     return G

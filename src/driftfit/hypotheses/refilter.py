@@ -21,7 +21,7 @@ Y, NOISE, TIME = 0, 1, 2
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
     r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
-    row: Array, bases: Array, parent: Array, event: Array, prior: Array, Qt: Array, X: Array,
+    row: Array, bases: Array, parent: Array, event: Array, prior: Array, na: int, own: bool, Qt: Array, X: Array,
 ) -> int:  # fmt: skip
     """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
     H, n = len(row), places.shape[1]
@@ -44,20 +44,24 @@ def refilter(
         for k in range(tri):
             Qt[e, k] = 0.0
     root[LOG, 0] = 0.0
-    floor(root, 1, B, samples[0], r, unknown, fade, least, Qt, maps, places, sensors, prior, bases, parent, event, X)
+    L = min(D, 1)
+    floor(
+        root, L, B, samples[0], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
+        event, X,
+    )  # fmt: skip
     for k in range(len(root)):
         root[k, 0] = B[k, 0]
         A[k, 0] = B[k, 0]
     root[LOG, 0], A[LOG, 0], A[CODE, 0] = 0.0, 0.0, 0.0
-    L = 1
     for at in range(1, D):
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
         increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
         L = floor(
-            A, L, B, samples[at], r, unknown, fade, least, Qt, maps, places, sensors, prior, bases, parent, event, X
-        )
+            A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
+            event, X,
+        )  # fmt: skip
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):
@@ -71,27 +75,27 @@ def refilter(
 @core
 def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
     """The table of the past for the leaves of the new tree: what happened in the D - 1 floors that it has."""
-    block = H + 1
-    for row in range(len(T)):
-        for l in range(L):
-            T[row, l] = 0.0
+    block, width = H + 1, T.shape[1]
     for l in range(L):
+        for at in range(width):
+            T[l, at] = 0.0
         code, quiet = int(A[CODE, l]), 1.0
-        for k in range(min(D - 1, len(T) // block)):
+        for k in range(min(D - 1, width // block)):
             e = code % H
             code //= H
             quiet *= 1.0 if e < Hm else 0.0
-            T[k * block + e, l], T[k * block + H, l] = 1.0, quiet
+            T[l, k * block + e], T[l, k * block + H] = 1.0, quiet
 
 
 @core
 def floor(
-    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, Q: Array,
-    maps: Array, places: Array, sensors: Array, prior: Array, bases: Array, parent: Array, event: Array, X: Array,
+    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, na: int, Q: Array,
+    maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,
+    X: Array,
 ) -> int:  # fmt: skip
     return int(
         grow(
-            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, 0, Q, maps,
-            places, sensors, prior, False, bases, parent, event, X,
+            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, na, Q, maps,
+            places, sensors, prior, own, not own, bases, parent, event, X,
         )
     )  # fmt: skip

@@ -94,7 +94,7 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
         if event.kind == "change":
             which[event.date] = bank.change_names.index(event.name)
     time = seen["dt"][:, 0] * known[:, 2]
-    r = np.where(ok, noise * known[:, 1], np.inf) * faults(bank, run, events)
+    r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
     C0 = np.diag(WIDE * unit) if bank.p0 is None else np.asarray(_full(bank, n)) * relative
     m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
     return Problem(phi, seen["y"][:, 0].copy(), r, np.array(steps)[which] * time[:, None, None], m0, C0)

@@ -59,7 +59,7 @@ def holm(p: Array, level: float) -> Array:
     return rejected
 
 
-def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int = 0) -> Attribution:
+def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
     """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
     steps: list[Step] = []

@@ -19,7 +19,8 @@ Zero drift lies on the boundary of "q >= 0", which spoils likelihood-ratio tests
 Which parameter moves is asked of A_T^-1 S_t, the path of the estimates: a move of one parameter shows in the scores of
 all whose regressors are correlated with its own, but there only in its own row.
 
-``lags`` > 0 replaces V by the Bartlett estimate with so many lags, for models whose noise is correlated.
+Where scores are correlated V is the Bartlett estimate with ``lags`` lags, which are found from the record
+(`driftfit.judges.bandwidth`) unless they are given; none where scores are white.
 
 Departures: bounded scores (Huber 1964), so that outliers do not hide a drift; the null from the record (the idea of
 Hansen 2000, with the distribution inverted instead of simulated). Cost: O(T n^2), and an eigenvalue problem of at most
@@ -32,6 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.judges.bandwidth import automatic, parts
 from driftfit.judges.quadratic import tail
 from driftfit.kernel import Array
 
@@ -76,6 +78,8 @@ class Constancy(NamedTuple):
     path: Array
     """(N, n): standardised path of each estimate; about +-3 is far."""
     fit: Fit
+    lags: int
+    """Lags of correlation that were allowed for."""
 
 
 def robust_fit(phi: Array, y: Array) -> Fit:
@@ -96,7 +100,7 @@ def robust_fit(phi: Array, y: Array) -> Fit:
     return Fit(theta, residual, scale, psi, (np.abs(residual) <= CLIP * scale).astype(float))
 
 
-def constancy(phi: Array, y: Array, lags: int = 0) -> Constancy:
+def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     """Test whether y (N,) on phi (N, n) has constant coefficients; ``lags`` as in the module."""
     N, n = phi.shape
     size: Array = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.zeros(n)
@@ -106,6 +110,7 @@ def constancy(phi: Array, y: Array, lags: int = 0) -> Constancy:
     fit = robust_fit(X, y)
     if not fit.scale > 1e-10 * np.sqrt(np.mean(y * y)):
         return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
+    lags = automatic(X, fit.psi, _piecewise(X, y)) if lags is None else lags
     scores = X * fit.psi[:, None]
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
@@ -124,13 +129,18 @@ def constancy(phi: Array, y: Array, lags: int = 0) -> Constancy:
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
     at, z = _dates(path, std.T)
-    return Constancy(L, p, p_own, joint, p_joint, at, z, fit._replace(theta=fit.theta / size))
+    return Constancy(L, p, p_own, joint, p_joint, at, z, fit._replace(theta=fit.theta / size), lags)
 
 
 def _nothing(N: int, n: int) -> Constancy:
     unknown = np.full(n, np.nan)
     fit = Fit(unknown, np.full(N, np.nan), float("nan"), np.full(N, np.nan), np.zeros(N))
-    return Constancy(unknown, unknown, unknown, np.nan, np.nan, np.zeros(n, int), np.full((N, n), np.nan), fit)
+    return Constancy(unknown, unknown, unknown, np.nan, np.nan, np.zeros(n, int), np.full((N, n), np.nan), fit, 0)
+
+
+def _piecewise(X: Array, y: Array) -> Array:
+    """Bounded residuals of coefficients that are fitted in each part of the record by itself."""
+    return np.concatenate([robust_fit(X[part], y[part]).psi for part in parts(*X.shape)])
 
 
 def _summed(scores: Array, lags: int) -> Array:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
+    from driftfit.judges.many import ManyDiagnoses, ManyVerdicts
     from driftfit.kernel import Array
     from driftfit.result import Track
     from driftfit.simulate import Prediction
@@ -15,10 +17,36 @@ if TYPE_CHECKING:
     from driftfit.verdict import Verdict
 
 
+class JudgedMany:
+    """Questions to many runs at once, by key: a fleet, or the outputs of one record; see `driftfit.judges.many`."""
+
+    def _runs(self) -> dict[Hashable, Track]:
+        raise NotImplementedError
+
+    def verdict(self, level: float = 0.05, lags: int | None = None) -> ManyVerdicts:
+        """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
+        from driftfit.judges.many import verdicts
+
+        return verdicts(self._runs(), level, lags)
+
+    def diagnose(self) -> ManyDiagnoses:
+        """What `Track.diagnose` says of each, and how often each number is out of bounds."""
+        from driftfit.judges.many import diagnoses
+
+        return diagnoses(self._runs())
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """Write one self-contained HTML page: all of them in one table, the clearest with pictures."""
+        from driftfit.report import check_path
+        from driftfit.report_many import page_of_many
+
+        check_path(path).write_text(page_of_many(self._runs(), title, getattr(self, "failed", {})), encoding="utf-8")
+
+
 class Judged:
     """Questions to a run. Each is a module of its own, imported when it is asked."""
 
-    def verdict(self, level: float = 0.05, lags: int = 0) -> Verdict:
+    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
         """Is the time variation real, which parameters move, and does following them pay? See `driftfit.verdict`."""
         from driftfit.verdict import verdict
 

@@ -7,6 +7,10 @@ was below a sample before. Of the two sums W - 1 terms are the same, X, and one 
 
 (for |sum g|: X ~ N(0, W - 1), old and new ~ N(0, 1)). A limit for one false alarm in N samples has P(begins) = 1 / N.
 Counting samples above the limit instead, as if they were independent, is wrong by the length of an alarm.
+
+The same for one Gaussian sequence z with variance 1 and correlation rho from one sample to the next:
+
+    P(begins) = P(z_(t-1) <= c, z_t > c) = E [ 1(x <= c) P(rho x + sqrt(1 - rho^2) w > c) ],    x, w ~ N(0, 1)
 """
 
 from __future__ import annotations
@@ -46,6 +50,20 @@ def mean_limit(W: int, every: float) -> float:
         return float(np.sum(weight * inside * (1.0 - inside)))
 
     return _solve(begins, float(np.sqrt(W)), 12.0 * np.sqrt(W) + 12.0, every)
+
+
+def normal_limit(rho: float, every: float) -> float:
+    """c for z of variance 1 whose neighbours have the correlation ``rho``, 0 <= rho < 1."""
+    rho = min(rho, 1.0 - 1e-9)
+    spread = np.sqrt(1.0 - rho * rho)
+
+    def begins(c: float) -> float:
+        # most of what is about to exceed the limit is within a few spreads of it
+        x = np.unique(np.concatenate([np.linspace(-9.0, c, NODES), c - spread * np.linspace(0.0, 9.0, NODES)]))
+        inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * special.ndtr((rho * x - c) / spread)
+        return float(np.trapezoid(inside, x))
+
+    return _solve(begins, 0.0, 12.0, every)
 
 
 def _solve(begins: Callable[[float], float], start: float, high: float, every: float) -> float:

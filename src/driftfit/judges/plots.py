@@ -92,7 +92,7 @@ def _quantiles(axis: Axes, said: Diagnosis) -> None:
 def _excitation(axis: Axes, said: Diagnosis) -> None:
     excited = said.excited
     if len(excited.at):
-        time = said.run.time[said.seen.at[excited.at]]
+        time = said.run.time[said.rows.at[excited.at]]
         values = np.maximum(excited.eigenvalues, 1e-12)
         for i in range(values.shape[1]):
             last = i in (0, values.shape[1] - 1)
@@ -108,7 +108,7 @@ def _paths(axis: Axes, said: Diagnosis) -> None:
         inner = slice(len(path) // 20, len(path) - len(path) // 20)
         for i, name in enumerate(said.run.model.names):
             colour = COLOURS[i % len(COLOURS)]
-            axis.plot(said.run.time[said.seen.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
+            axis.plot(said.run.time[said.rows.at][inner], path[inner, i], lw=1.1, color=colour, label=name)
         axis.axhspan(-3.0, 3.0, color=GREY, alpha=0.2, lw=0)
         if path.shape[1] <= 8:
             axis.legend(fontsize=7, ncols=2, frameon=False)

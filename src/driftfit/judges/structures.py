@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.fleet import run_fleet
-from driftfit.judges.seen import constant_least_squares
+from driftfit.judges.constants import constant_least_squares
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model

@@ -171,6 +171,25 @@ class ARX(Model):
         """How many entries of phi, from its first, are past outputs: a bank of hypotheses cleans them leaf by leaf."""
         return self.na
 
+    @property
+    def reach(self) -> int:
+        return max(self.na, *(nb + nk - 1 for nb, nk in self.lags), 0)
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        p, h = y.shape[1], noise.shape[1]
+        out = np.concatenate([y, np.zeros((len(theta), h))], axis=1)
+        for k in range(h):
+            t, at = p + k, self.na
+            total = noise[:, k] + (theta[:, -1] if self.intercept else 0.0)
+            for i in range(self.na):
+                total = total + theta[:, i] * out[:, t - 1 - i]
+            for j, (nb, nk) in enumerate(self.lags):
+                for i in range(nb):
+                    total = total + theta[:, at + i] * u[:, t - nk - i, j]
+                at += nb
+            out[:, t] = total
+        return out[:, p:]
+
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of 1 / A(z) to an impulse, (h,)."""
         A, _ = self.polynomials(theta)

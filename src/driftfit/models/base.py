@@ -77,3 +77,43 @@ class Model(Settings, ABC):
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
         response: Array = np.eye(1, h)[0]
         return response
+
+    @property
+    def reach(self) -> int:
+        """How many past samples the regressors of a sample hold; a model that can be run forward says so."""
+        return 0
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back among the lags.
+
+        Parameters
+        ----------
+        theta : (D, n)
+            A system a row.
+        y : (D, p)
+            Outputs before, p at least `reach`.
+        u : (D or 1, p + h, m)
+            Inputs before, and at the h samples that are asked for.
+        noise : (D, h)
+            Noises of the equation.
+        span : (low, high), a number or (D,) each
+            Outputs that were seen, for a model that has to be inverted.
+
+        ValueError for a model that does not say how.
+        """
+        raise ValueError(
+            f"{type(self).__name__} does not say how it runs forward, so nothing can be simulated; a model of your own "
+            "does with the methods `reach` and `play` (driftfit.models.base)."
+        )
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """Slope against y of what the model is fitted to, at outputs y (...): what turns its errors into those of y."""
+        return np.ones(np.shape(y))
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """By what the noise variance of a tracker is multiplied at an output."""
+        return 1.0
+
+    def follows(self, other: Model) -> bool:
+        """Whether the memory of the other model is that of this one, so that a run can go on from it."""
+        return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -46,12 +46,20 @@ __all__ = [
 
 
 def basis_of(value: Any) -> Basis | None:
-    """A basis, or what `Basis.plain` wrote of one; None is the identity."""
+    """A basis, what `Basis.plain` wrote of one, or its words ("legendre", 4, -2, 2); None is the identity."""
     if value is None or isinstance(value, Basis):
         return value
     if isinstance(value, Mapping) and value.get("class") in _kinds():
         return _kinds()[value["class"]].from_settings(dict(value["settings"]))
-    raise ValueError(f"a block takes one of {', '.join(_kinds())}, or None for the identity; got {value!r}.")
+    words = tuple(value) if isinstance(value, (tuple, list)) else (value,)
+    kind = {name.lower(): kind for name, kind in _kinds().items()}.get(str(words[0]).replace("-", "").lower())
+    if kind is None or kind is Functions or len(words) < 2:
+        raise ValueError(
+            f"a block takes one of {', '.join(_kinds())}, or None for the identity; on the command line "
+            "polynomial/DEGREE, legendre/DEGREE/LOW/HIGH, chebyshev/DEGREE/LOW/HIGH, piecewise-linear/KNOT/.., "
+            f"bspline/DEGREE/KNOT/.. or dead-zone/U_MAX; got {value!r}."
+        )
+    return kind.from_words(words[1:])
 
 
 def _kinds() -> dict[str, type[Basis]]:
@@ -99,6 +107,10 @@ class _Orthogonal(Basis):
 
     degree: int
     range: Any
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words[0], words[1:])
 
     def __post_init__(self) -> None:
         self._set("degree", whole(type(self).__name__, "degree", self.degree, 1))

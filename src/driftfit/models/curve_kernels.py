@@ -1,7 +1,8 @@
-"""The compiled functions of all bases that the library brings, behind one pair for every kind.
+"""The compiled functions of all bases that the library brings, behind one for every kind.
 
-``values(x, p, out)`` and ``slopes(x, p, out)`` fill ``out`` (n,) with the functions and their derivatives at x; p[0] is
-the code of the kind and the rest its own numbers. One pair means one compilation for every combination of bases.
+`every` fills ``out`` (n,) and ``slopes`` (n,) with the functions and their derivatives at x; p[0] is the code of the
+kind and the rest its own numbers, which is what the parts take. Steps call it as the machine `evaluate`, with addresses
+of p, out and slopes, whose elements stand ``stride`` numbers apart: it is compiled once.
 
 B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs stands at
 the end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
@@ -9,9 +10,11 @@ the end of their numbers [degree, count, knots.., scratch.., values at the ancho
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from driftfit.kernel import Array, kernel, shared
+from driftfit.kernel import Array, floats, kernel, outside
 
 POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE = range(6)
 
@@ -161,35 +164,38 @@ def spline_slopes(x: float, p: Array, out: Array) -> None:
                 out[k - 2] -= slope
 
 
-@shared
-def values(x: float, p: Array, out: Array) -> None:
+@kernel
+def every(x: float, p: Array, out: Array, slopes: Array) -> None:
+    """The functions of a basis and their derivatives."""
     code, own = p[0], p[1:]
     if code == POWERS:
         powers(x, own, out)
+        power_slopes(x, own, slopes)
     elif code == LEGENDRE:
         legendre(x, own, out)
+        legendre_slopes(x, own, slopes)
     elif code == CHEBYSHEV:
         chebyshev(x, own, out)
+        chebyshev_slopes(x, own, slopes)
     elif code == HINGES:
         hinges(x, own, out)
+        hinge_slopes(x, own, slopes)
     elif code == SPLINES:
         splines(x, own, out)
+        spline_slopes(x, own, slopes)
     else:
         dead_zone(x, own, out)
+        dead_zone_slopes(x, own, slopes)
 
 
-@shared
-def slopes(x: float, p: Array, out: Array) -> None:
-    code, own = p[0], p[1:]
-    if code == POWERS:
-        power_slopes(x, own, out)
-    elif code == LEGENDRE:
-        legendre_slopes(x, own, out)
-    elif code == CHEBYSHEV:
-        chebyshev_slopes(x, own, out)
-    elif code == HINGES:
-        hinge_slopes(x, own, out)
-    elif code == SPLINES:
-        spline_slopes(x, own, out)
-    else:
-        dead_zone_slopes(x, own, out)
+def machine_of(function: Any) -> Any:
+    """``evaluate(x, p, count, out, slopes, n, stride)`` of a kernel (x, p, out, slopes)."""
+
+    def machine_evaluate(x: float, p: int, count: int, out: int, slopes: int, n: int, stride: int) -> None:
+        function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
+
+    machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a place on disk of its own
+    return outside(machine_evaluate)
+
+
+evaluate = machine_of(every)

@@ -1,7 +1,7 @@
 """Static curves f(x) = sum_k c_k f_k(x): what every basis offers, and functions of your own.
 
-A basis gives `value(x)` and `derivative(x)`, (..., n) each, and the compiled ``values(x, p, out)``, ``slopes(x, p,
-out)`` for steps. Its numbers p (``parameters``) live in the record, so that another range needs no other code.
+A basis gives `value(x)` and `derivative(x)`, (..., n) each, and for steps the machine ``evaluate``.
+Its numbers p (``parameters``) live in the record, so that another range needs no other code.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
@@ -21,23 +21,25 @@ from driftfit.models import curve_kernels
 from driftfit.settings import Settings, numbers, whole
 
 
-class Curves(NamedTuple):
-    """The compiled functions of a basis: ``values(x, p, out)`` and ``slopes(x, p, out)`` fill ``out`` (n,)."""
-
-    values: Any
-    slopes: Any
-
-
 @lru_cache
-def fill(function: Any) -> Driver:
-    """A compiled loop of a basis function over an array."""
+def _over(evaluate: Any) -> Driver:
+    """A compiled loop of ``evaluate`` over an array."""
 
     @Driver
-    def each(x: Array, p: Array, out: Array) -> None:
+    def each(x: Array, p: Array, out: Array, slopes: Array) -> None:
+        n = out.shape[1]
         for i in range(x.shape[0]):
-            function(x[i], p, out[i])
+            evaluate(x[i], p.ctypes.data, p.shape[0], out[i].ctypes.data, slopes[i].ctypes.data, n, 1)
 
     return each
+
+
+def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> tuple[Array, Array]:
+    """The functions of a machine at x (k,), and their derivatives, (k, n) each; its numbers p may be written to."""
+    evaluate.load()
+    out, slopes = np.empty((2, len(x), n))
+    _over(evaluate)(np.ascontiguousarray(x), p, out, slopes)
+    return out, slopes
 
 
 class Basis(Settings, ABC):
@@ -54,9 +56,9 @@ class Basis(Settings, ABC):
         """Number of functions."""
 
     @property
-    def curves(self) -> Curves:
-        """The compiled functions."""
-        return Curves(curve_kernels.values, curve_kernels.slopes)
+    def evaluate(self) -> Any:
+        """The machine that evaluates the functions and their derivatives; see `curve_kernels`."""
+        return curve_kernels.evaluate
 
     @property
     def own_numbers(self) -> Array:
@@ -85,17 +87,25 @@ class Basis(Settings, ABC):
 
     def value(self, x: Any) -> Array:
         """The functions at x (...), as (..., n)."""
-        return self._at(self.curves.values, x)
+        return self._at(x)[0]
 
     def derivative(self, x: Any) -> Array:
         """Their derivatives at x (...), as (..., n)."""
-        return self._at(self.curves.slopes, x)
+        return self._at(x)[1]
 
-    def _at(self, function: Any, x: Any) -> Array:
+    def _at(self, x: Any) -> tuple[Array, Array]:
         points = np.asarray(x, dtype=float)
-        out = np.empty((points.size, self.n))
-        fill(function)(np.ascontiguousarray(points.ravel()), self.parameters.copy(), out)
-        return out.reshape(*points.shape, self.n)
+        out, slopes = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
+        shape = (*points.shape, self.n)
+        return out.reshape(shape), slopes.reshape(shape)
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        """The basis from its numbers one after the other, as on the command line."""
+        try:
+            return cls(*words)
+        except TypeError:
+            raise ValueError(f"{cls.__name__}: {len(words)} numbers were given, {words!r}; that is too many.") from None
 
     def plain(self) -> dict[str, Any]:
         """The basis as plain data; see `basis_of`."""
@@ -137,8 +147,8 @@ class Functions(Basis):
                 raise ValueError(f"Functions: {len(self.labels)} labels were given for {self.n} functions.")
 
     @property
-    def curves(self) -> Curves:
-        return Curves(_compiled(self.values), _compiled(self.slopes))
+    def evaluate(self) -> Any:
+        return _together(self.values, self.slopes)
 
     @property
     def parameters(self) -> Array:
@@ -156,6 +166,19 @@ class Functions(Basis):
 def _compiled(function: Callable[..., Any]) -> Any:
     """A function of the user's as a kernel."""
     return function if hasattr(function, "identity") else kernel(getattr(function, "py_func", function))
+
+
+@lru_cache
+def _together(values: Any, slopes: Any) -> Any:
+    """The machine of two functions of the user's."""
+    first, second = _compiled(values), _compiled(slopes)
+
+    @kernel
+    def both(x: float, p: Array, out: Array, slopes: Array) -> None:
+        first(x, p, out)
+        second(x, p, slopes)
+
+    return curve_kernels.machine_of(both)
 
 
 def _place(function: Any) -> str:

@@ -36,10 +36,11 @@ import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
 from driftfit.kernel import Array
-from driftfit.models import hammerstein_wiener_steps as steps
 from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
+from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
+from driftfit.models.hammerstein_wiener_steps import FLOOR, build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -140,14 +141,27 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        return steps.memory(
-            self.structure, self.nk, self.into.parameters, self.out.parameters, self.out.limits, self.output_noise
-        )
+        bases = self.into.parameters, self.out.parameters
+        return {"blocks": memory(self.structure, self.nk, *bases, self.out.limits, self.output_noise)}
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Where everything stands in the memory of the steps."""
+        bases = self.into.parameters, self.out.parameters
+        return places_of(self.structure, self.nk, *bases, self.linear, self.into.adaptive)
 
     @property
     def steps(self) -> ModelSteps:
-        adaptive = self.into.adaptive
-        return steps.build(self.structure, self.nk, self.into.curves, self.out.curves, self.linear, adaptive)
+        return build(self.into.evaluate, self.out.evaluate, self.places)
+
+    @property
+    def reach(self) -> int:
+        return max(self.na, self.nb + self.nk - 1)
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        from driftfit.models.hammerstein_wiener_forward import play
+
+        return play(self, theta, y, u, noise, span)
 
     def touched(self, t: int, signal: str) -> range:
         """The samples that cannot be used when "y" or "u" is missing at t."""
@@ -178,12 +192,37 @@ class HammersteinWiener(Model):
             found: Array = np.log(np.maximum(self.slope(theta, y), FLATTEST))
         return found
 
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of w to one equation error: that of 1 / A(z)."""
+        response: Array = np.eye(1, h)[0]
+        for t in range(1, h):
+            lags = response[max(t - self.na, 0) : t][::-1]
+            response[t] = -theta[: len(lags)] @ lags
+        return response
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """F'(y), at least 1e-3: an equation error moves y by its reciprocal."""
+        found: Array = np.maximum(self.slope(theta, y), FLATTEST)
+        return found
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """1, or sigma^2 (1 + sum_i a_i^2) F'(y)^2 + 1e-4 under ``output_noise``."""
+        if self.output_noise is None:
+            return 1.0
+        energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + FLOOR)
+
+    def follows(self, other: Model) -> bool:
+        return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
+
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
         for what, basis, data in (("u", self.into, u[:, 0]), ("y", self.out, y)):
-            seen = data[np.abs(data) < LARGEST]
+            if basis.n == 1 and not np.isfinite(basis.expected).any():
+                continue
+            seen = data if abs(data.sum()) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
             low, high = basis.expected
-            outside = int(np.sum((seen < low) | (seen > high)))
+            outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
                 warnings.warn(
@@ -192,7 +231,7 @@ class HammersteinWiener(Model):
                     UserWarning,
                     stacklevel=4,
                 )
-            size = float(np.sqrt(np.mean(seen * seen))) if seen.size else 0.0
+            size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
                 warnings.warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "

@@ -5,12 +5,9 @@ on its own coefficients is evaluated anew for all lags. The output is predicted 
 
     g_1(y) + sum_k d_k g_k(y) = -(phi' theta over all columns but those of the present output)
 
-on a grid over the outputs seen so far, widened by a fifth; the grid is laid anew when an output leaves it. Where the
-estimate does not increase, its monotone envelope (running maximum from the middle outwards, running minimum inwards) is
-solved instead and ``RISING`` is 0; elsewhere Newton's method finishes what the grid began.
-
-The work is done by two functions of one lane's arrays with bounds at run time. They are compiled once for each pair of
-kinds of basis, whatever the orders: unrolled for every model they took longer to compile than the tracker.
+with `driftfit.models.block_curve`. The steps that drivers are compiled with only hand a lane over to two machines,
+which are compiled once for all trackers: a call of a machine that knows its orders is as fast as code in the midst of a
+driver. With orders at run time one machine would do for all models, but took three times as long a sample.
 """
 
 from __future__ import annotations
@@ -21,301 +18,359 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, kernel, shared
+from driftfit.kernel import Array, State, core, floats, kernel, named, outside, part
 from driftfit.models.arx import GAP
-from driftfit.models.block_products import Structure
-from driftfit.models.curves import Curves
+from driftfit.models.block_curve import believe, inverse_of, laying
+from driftfit.models.block_memory import (
+    ADAPTIVE,
+    CURVE,
+    D_NOW,
+    DT,
+    F_PAST,
+    FACTOR,
+    G_PAST,
+    GIVEN,
+    H_PAST,
+    IDENTITY,
+    INTO,
+    MINIMAL,
+    N_IN,
+    N_OUT,
+    NA,
+    NB,
+    NK,
+    OK,
+    OUT,
+    PREDICTED,
+    RAW,
+    SEEN,
+    SPARE,
+    STARTED,
+    TRIAL,
+    TRIAL_BEND,
+    U_PAST,
+    VARIANCE,
+    N,
+    Places,
+    U,
+    Y,
+)
+from driftfit.models.curve_kernels import POWERS
+from driftfit.models.curve_kernels import evaluate as built_in
 
-GRID = 64
-"""Points of the grid on which the output block is inverted."""
-WIDER = 0.2
-"""Share of the range of the outputs by which the grid goes beyond it, at both ends."""
-NEWTON = 4
-"""Steps after the grid: the first is good to 1e-3 of the range at least, and each doubles the digits."""
 INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
-EXACT = 4e-16
-"""Relative error of the level at which Newton's method stops."""
 FLOOR = 1e-4
 """Least variance of the equation error under measurement noise."""
 
-# places in `cells`: the grid, what was seen, where the output block is defined, results, sigma^2 or 0
-LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE = range(13)
+
+@lru_cache
+def values_of(evaluate: Any, numbers: int, following: int, count: int) -> Any:
+    """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes."""
+
+    def values(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
+        own, L = p[numbers], m.shape[1]
+        base, size = m.ctypes.data, 8 * L
+        evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
+
+    found = part(named(values, evaluate, numbers))
+    if evaluate is not built_in:
+        return found
+
+    def powers_first(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
+        if m[p[numbers], 0] != POWERS:
+            found(m, p, x, at, slopes)
+        else:
+            power, k = 1.0, 0.0
+            for i in range(p[count]):
+                k += 1.0
+                m[slopes + i, 0] = k * power
+                power = power * x
+                m[at + i, 0] = power
+
+    return part(named(powers_first, evaluate, numbers))
 
 
-def memory(
-    structure: Structure, delay: int, into: Any, out: Any, limits: tuple[float, float], sigma: float | None
-) -> dict[str, Any]:
-    """Fields of the record; ``into`` and ``out`` are the numbers of the bases."""
-    na, nb, n_in, n_out, _ = structure
-    cells = np.zeros(13)
-    cells[[LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED]] = np.inf, -np.inf, *limits, 1.0, np.nan
-    cells[VARIANCE] = 0.0 if sigma is None else sigma * sigma
-    return {
-        "f_lag": np.full((n_in, nb + delay), np.nan), "u_past": np.full(nb + delay, np.nan),
-        "g_lag": np.full((n_out, max(na, 1)), np.nan), "h_lag": np.full((n_out, max(na, 1)), np.nan),
-        "g_now": np.zeros(n_out), "h_now": np.zeros(n_out), "d_now": np.eye(1, n_out)[0], "f_now": np.zeros(n_in),
-        "into": into, "out": out, "curve": np.zeros((n_out, GRID)), "level": np.zeros(GRID),
-        "cells": cells,
-    }  # fmt: skip
+def input_values(evaluate: Any) -> Any:
+    """Those of the input block."""
+    return values_of(evaluate, INTO, OUT, N_IN)
 
 
-@shared
-def past(theta: Array, phi: Array, d: Array, minimal: bool, na: int, nb: int, n_in: int, n_out: int) -> float:
-    """-(phi' theta) without the columns of the present output; also fills d."""
-    at_d = na + nb
-    at_bc = at_d + n_out - 1
-    at_ad = at_bc + nb * (n_in - 1)
+def output_values(evaluate: Any) -> Any:
+    """Those of the output block."""
+    return values_of(evaluate, OUT, CURVE, N_OUT)
+
+
+@lru_cache
+def level_of(evaluate: Any) -> Any:
+    """A part (m, p, y) that says the level of the output block at y, and its slope; it fills trial and trial_bend."""
+    fill_trial = output_values(evaluate)
+
+    def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:
+        n_out, d, g, h = p[N_OUT], p[D_NOW], p[TRIAL], p[TRIAL_BEND]
+        fill_trial(m, p, y, g, h)
+        value, slope = m[g, 0], m[h, 0]
+        for k in range(1, n_out):
+            value += m[d + k, 0] * m[g + k, 0]
+            slope += m[d + k, 0] * m[h + k, 0]
+        return value, slope
+
+    found = part(named(at_output, evaluate))
+    if evaluate is not built_in:
+        return found
+
+    def horner_first(m: Array, p: Places, y: float) -> tuple[float, float]:
+        if m[p[OUT], 0] != POWERS:
+            return found(m, p, y)  # type: ignore[no-any-return]
+        value, slope = 0.0, 0.0
+        for k in range(p[N_OUT] - 1, -1, -1):
+            slope = slope * y + value
+            value = value * y + (m[p[D_NOW] + k, 0] if k > 0 else 1.0)
+        return value * y, slope * y + value
+
+    return part(named(horner_first, evaluate))
+
+
+@part
+def shift(m: Array, at: int, width: int, rows: int) -> None:
+    """Every row of an array to the place of the next."""
+    for i in range(at + width * rows - 1, at + width - 1, -1):
+        m[i, 0] = m[i - width, 0]
+
+
+@part
+def past(m: Array, p: Places, theta: Array, phi: Array) -> float:
+    """-(phi' theta) without the columns of the present output; also fills d_now."""
+    at_d, n, others, d = p[NA] + p[NB], p[N], p[N_OUT] - 1, p[D_NOW]
+    for k in range(others):
+        m[d + 1 + k, 0] = theta[at_d + k, 0]
+    one, other = 0.0, 0.0
+    for i in range(at_d):
+        one -= theta[i, 0] * phi[i, 0]
+    i = at_d + others
+    while i + 1 < n:
+        one -= theta[i, 0] * phi[i, 0]
+        other -= theta[i + 1, 0] * phi[i + 1, 0]
+        i += 2
+    if i < n:
+        one -= theta[i, 0] * phi[i, 0]
+    return one + other
+
+
+@core
+def minimal_past(m: Array, p: Places, theta: Array, phi: Array) -> float:
+    """The same where theta is xi."""
+    na, nb, more_in, more_out = p[NA], p[NB], p[N_IN] - 1, p[N_OUT] - 1
+    x_c, d = na + nb, p[D_NOW] + 1
+    x_d, at_bc = x_c + more_in, x_c + more_out
+    at_ad = at_bc + nb * more_in
     total = 0.0
-    if not minimal:
-        for k in range(n_out - 1):
-            d[k + 1] = theta[at_d + k]
-        for i in range(at_d):
-            total -= theta[i] * phi[i]
-        for i in range(at_bc, phi.shape[0]):
-            total -= theta[i] * phi[i]
-        return total
-    x_c, x_d = na + nb, na + nb + n_in - 1
-    for k in range(n_out - 1):
-        d[k + 1] = theta[x_d + k]
+    for k in range(more_out):
+        m[d + k, 0] = theta[x_d + k, 0]
     for i in range(na):
-        column = phi[i]
-        for k in range(n_out - 1):
-            column += d[k + 1] * phi[at_ad + k * na + i]
-        total -= theta[i] * column
+        column = phi[i, 0]
+        for k in range(more_out):
+            column += m[d + k, 0] * phi[at_ad + k * na + i, 0]
+        total -= theta[i, 0] * column
     for j in range(nb):
-        column = phi[na + j]
-        for k in range(n_in - 1):
-            column += theta[x_c + k] * phi[at_bc + k * nb + j]
-        total -= theta[na + j] * column
-    for i in range(x_d + n_out - 1, theta.shape[0]):
-        total -= theta[i]
+        column = phi[na + j, 0]
+        for k in range(more_in):
+            column += theta[x_c + k, 0] * phi[at_bc + k * nb + j, 0]
+        total -= theta[na + j, 0] * column
+    for i in range(at_ad + na * more_out, p[N]):
+        total -= theta[x_d + more_out, 0] * phi[i, 0]
     return total
 
 
-@shared
-def envelope(d: Array, curve: Array, level: Array) -> bool:
-    """Levels of the output block on the grid, made monotone; returns whether they were."""
-    n_out, grid = curve.shape
-    for i in range(grid):
-        level[i] = curve[0, i]
-    for k in range(1, n_out):
-        for i in range(grid):
-            level[i] += d[k] * curve[k, i]
-    least = np.inf
-    for i in range(grid - 1):
-        least = min(least, level[i + 1] - level[i])
-    if least > 0.0:
-        return True
-    for i in range(grid // 2, grid - 1):
-        level[i + 1] = max(level[i + 1], level[i])
-    for i in range(grid // 2, 0, -1):
-        level[i - 1] = min(level[i - 1], level[i])
-    return False
-
-
-@shared
-def noise_factor(theta: Array, d: Array, slopes: Array, lagged: Array, na: int, n_out: int, variance: float) -> float:
+@core
+def noise_factor(m: Array, p: Places, theta: Array) -> float:
     """sigma^2 sum_i a_i^2 F'(y_(t-i))^2 + floor, a_0 = 1, from the estimates before the sample."""
+    n_out, d = p[N_OUT], p[D_NOW]
     total = 0.0
-    for i in range(na + 1):
+    for i in range(p[NA] + 1):
         slope = 0.0
         for k in range(n_out):
-            slope += d[k] * (slopes[k] if i == 0 else lagged[k, i - 1])
-        weight = 1.0 if i == 0 else theta[i - 1]
+            slope += m[d + k, 0] * m[p[H_PAST] + i * n_out + k, 0]
+        weight = 1.0 if i == 0 else theta[i - 1, 0]
         total += weight * weight * slope * slope
-    factor = variance * total + FLOOR
+    factor = m[VARIANCE, 0] * total + FLOOR
     return factor if factor < LARGEST else 1.0
 
 
-def _named(function: Any, *parts: Any) -> Any:
-    """A shared function whose place on disk is its own: closures of one name would share an index."""
-    function.__qualname__ += "_" + "_".join(str(part.identity)[:12] for part in parts)
-    return shared(function)
+@core
+def forget(m: Array, p: Places) -> None:
+    """All lags are missing."""
+    for i in range(p[F_PAST], p[SPARE]):
+        m[i, 0] = np.nan
 
 
-@lru_cache
-def inverse_of(out: Curves) -> Any:
-    """A shared function that inverts the output block on the grid."""
-    g, slopes = out.values, out.slopes
-
-    def solve(
-        right: float, g_now: Array, h_now: Array, d_now: Array, numbers: Array, curve: Array, level: Array,
-        cells: Array,
-    ) -> float:  # fmt: skip
-        """The output at which the estimated output block has the value ``right``, within the grid."""
-        if not (cells[STEP] > 0.0 and abs(right) < LARGEST):
-            return np.nan
-        n_out, grid = curve.shape
-        rising = envelope(d_now, curve, level)
-        cells[RISING] = 1.0 if rising else 0.0
-        if right < level[0]:
-            return float(cells[LOW])
-        if right >= level[grid - 1]:
-            return float(cells[LOW] + (grid - 1) * cells[STEP])
-        below, above = 0, grid - 1
-        while above - below > 1:
-            middle = (below + above) // 2
-            if level[middle] <= right:
-                below = middle
-            else:
-                above = middle
-        low = cells[LOW] + below * cells[STEP]
-        high = low + cells[STEP]
-        y = low + cells[STEP] * (right - level[below]) / (level[below + 1] - level[below])
-        if rising:
-            for _ in range(NEWTON):
-                g(y, numbers, g_now)
-                slopes(y, numbers, h_now)
-                value, slope = 0.0, 0.0
-                for k in range(n_out):
-                    value += d_now[k] * g_now[k]
-                    slope += d_now[k] * h_now[k]
-                if not slope > 0.0 or abs(right - value) <= EXACT * (1.0 + abs(right)):
-                    break
-                y = min(max(y + (right - value) / slope, low), high)
-        return float(y)
-
-    return _named(solve, g, slopes)
-
-
-@lru_cache
-def _lane_steps(into: Curves, out: Curves) -> tuple[Any, Any]:
-    """``regress`` and ``push`` of one lane, for one pair of kinds of basis."""
-    f, g, slopes = into.values, out.values, out.slopes
-    inverse = inverse_of(out)
-
-    def lane_regress(
-        u: float, y: float, dt: float, orders: tuple[int, int, int, int, int], theta: Array,
-        phi: Array, f_lag: Array, u_past: Array, g_lag: Array, h_lag: Array, g_now: Array, h_now: Array, d_now: Array,
-        f_now: Array, into: Array, out: Array, curve: Array,
-        level: Array, cells: Array,
-    ) -> tuple[float, float, float]:  # fmt: skip
-        """Fill phi; returns (z, dt, factor of the noise variance)."""
-        na, nb, nk, linear, adaptive = orders
-        n_in, n_out, depth = f_lag.shape[0], g_lag.shape[0], u_past.shape[0]
-        at_d = na + nb
-        at_bc = at_d + n_out - 1
-        at_ad = at_bc + nb * (n_in - 1)
-        if dt > GAP:
-            for j in range(depth):
-                u_past[j] = np.nan
-                for k in range(n_in):
-                    f_lag[k, j] = np.nan
-            for i in range(g_lag.shape[1]):
-                for k in range(n_out):
-                    g_lag[k, i] = np.nan
-        for j in range(depth - 1, 0, -1):
-            u_past[j] = u_past[j - 1]
-            for k in range(n_in):
-                f_lag[k, j] = f_lag[k, j - 1]
-        u_past[0] = u
-        for j in range(depth if adaptive > 0 else 1):
-            f(u_past[j], into, f_now)
-            for k in range(n_in):
-                f_lag[k, j] = f_now[k]
-        started = 1.0
+@part
+def fill(m: Array, p: Places, phi: Array) -> None:
+    """phi from the lags, but for the columns of the present output."""
+    na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
+    f, g, at = p[F_PAST] + p[NK] * n_in, p[G_PAST] + n_out, na
+    for k in range(n_in):
         for j in range(nb):
-            phi[na + j] = -f_lag[0, nk + j]
-            for k in range(n_in - 1):
-                phi[at_bc + k * nb + j] = -f_lag[k + 1, nk + j]
+            phi[at + j, 0] = -m[f + j * n_in + k, 0]
+        at = at + nb + n_out - 1 if k == 0 else at + nb
+    for k in range(n_out):
+        start = 0 if k == 0 else at + (k - 1) * na
         for i in range(na):
-            phi[i] = g_lag[0, i]
-            for k in range(n_out - 1):
-                phi[at_ad + k * na + i] = g_lag[k + 1, i]
-        for i in range(at_ad + na * (n_out - 1), phi.shape[0]):
-            phi[i] = 1.0
-        for i in range(phi.shape[0]):
-            if i < at_d or i >= at_bc:
-                started = started if abs(phi[i]) < LARGEST else cells[STARTED]
-        cells[STARTED] = started
-        right = past(theta, phi, d_now, cells[MINIMAL] > 0.0, na, nb, n_in, n_out)
-        if linear > 0:
-            cells[PREDICTED] = right
-        else:
-            cells[PREDICTED] = inverse(right, g_now, h_now, d_now, out, curve, level, cells)
-        seen = abs(y) < LARGEST
-        point = y if seen else cells[PREDICTED]
-        g(point, out, g_now)
-        variance = cells[VARIANCE]
-        if variance > 0.0:
-            slopes(point, out, h_now)
-        for k in range(n_out):
-            seen = seen and abs(g_now[k]) < LARGEST
-        for k in range(n_out - 1):
-            phi[at_d + k] = g_now[k + 1]
-        cells[RAW] = y if seen else np.nan
-        if seen:
-            cells[LOWEST] = min(cells[LOWEST], y)
-            cells[HIGHEST] = max(cells[HIGHEST], y)
-        factor = noise_factor(theta, d_now, h_now, h_lag, na, n_out, variance) if variance > 0.0 else 1.0
-        return -g_now[0] if seen else np.nan, dt if started > 0.0 else 0.0, factor
+            phi[start + i, 0] = m[g + i * n_out + k, 0]
+    for i in range(at + (n_out - 1) * na, p[N]):
+        phi[i, 0] = 1.0
 
-    def lane_push(
-        seen: bool, ok: bool, orders: tuple[int, int, int, int, int], theta: Array, g_lag: Array, h_lag: Array,
-        g_now: Array, h_now: Array, into: Array, out: Array, curve: Array, cells: Array, n_in: int,
-    ) -> None:  # fmt: skip
-        """The present output among the lags (a missing one stays missing), thresholds, and the grid."""
-        na, nb, _, linear, adaptive = orders
-        n_out, grid = curve.shape
-        for k in range(n_out):
-            for i in range(g_lag.shape[1] - 1, 0, -1):
-                g_lag[k, i] = g_lag[k, i - 1]
-                h_lag[k, i] = h_lag[k, i - 1]
-            g_lag[k, 0] = g_now[k] if seen else np.nan
-            h_lag[k, 0] = h_now[k]
-        if adaptive > 0 and ok:
-            x_c, at_bc = na + nb, na + nb + n_out - 1
-            for k in range(2):
-                total, size = 0.0, 0.0
-                for j in range(nb):
-                    size += theta[na + j] * theta[na + j]
-                    total += theta[na + j] * theta[at_bc + k * nb + j] if cells[MINIMAL] == 0.0 else 0.0
-                threshold = total / size if cells[MINIMAL] == 0.0 else theta[x_c + k]
-                if abs(threshold) < LARGEST:
-                    top, bottom = INSIDE * into[3] * (1 - k), -INSIDE * into[3] * k
-                    into[1 + k] = min(max(threshold, bottom), top)
-        if linear == 0 and cells[LOWEST] <= cells[HIGHEST]:
-            last = cells[LOW] + (grid - 1) * cells[STEP]
-            short = cells[LOWEST] < cells[LOW] and cells[LOW] > cells[BOTTOM]
-            if cells[STEP] == 0.0 or short or (cells[HIGHEST] > last and last < cells[TOP]):
-                width = cells[HIGHEST] - cells[LOWEST]
-                margin = WIDER * (width if width > 0.0 else max(abs(cells[HIGHEST]), 1.0))
-                cells[LOW] = max(cells[LOWEST] - margin, cells[BOTTOM])
-                cells[STEP] = (min(cells[HIGHEST] + margin, cells[TOP]) - cells[LOW]) / (grid - 1)
-                for i in range(grid):
-                    g(min(cells[LOW] + i * cells[STEP], cells[TOP]), out, h_now)
-                    for k in range(n_out):
-                        curve[k, i] = h_now[k]
 
-    return _named(lane_regress, f, g, slopes), _named(lane_push, g)
+@core
+def complete(p: Places, phi: Array) -> bool:
+    """Whether all lags are there."""
+    at_d = p[NA] + p[NB]
+    missing = 0
+    for i in range(p[N]):
+        if i < at_d or i >= at_d + p[N_OUT] - 1:
+            missing += 0 if abs(phi[i, 0]) < LARGEST else 1
+    return missing == 0
+
+
+@core
+def thresholds(m: Array, p: Places, theta: Array) -> None:
+    """The coefficients of a dead zone, fed back."""
+    na, nb = p[NA], p[NB]
+    x_c, at_bc, into = na + nb, na + nb + p[N_OUT] - 1, p[INTO]
+    for k in range(2):
+        total, size = 0.0, 0.0
+        for j in range(nb):
+            size += theta[na + j, 0] * theta[na + j, 0]
+            total += theta[na + j, 0] * theta[at_bc + k * nb + j, 0] if m[MINIMAL, 0] == 0.0 else 0.0
+        threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[x_c + k, 0]
+        if abs(threshold) < LARGEST:
+            top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
+            m[into + 1 + k, 0] = min(max(threshold, bottom), top)
 
 
 @lru_cache
-def build(structure: Structure, nk: int, into: Curves, out: Curves, linear: bool, adaptive: bool) -> ModelSteps:
-    """The steps of one structure; ``linear`` says that the output block is the identity."""
-    na, nb, n_in, _, _ = structure
-    lane_regress, lane_push = _lane_steps(into, out)
-    orders = (na, nb, nk, int(linear), int(adaptive))
+def _regress_work(into: Any, out: Any) -> Any:
+    """What ``regress`` does, for the functions of both bases."""
+    input_at, output_at = input_values(into), output_values(out)
+    invert = inverse_of(level_of(out))
+
+    def regress_work(m: Array, p: Places, theta: Array, phi: Array) -> None:
+        n_in, n_out, depth = p[N_IN], p[N_OUT], p[NB] + p[NK]
+        f, g, h, spare, u_past = p[F_PAST], p[G_PAST], p[H_PAST], p[SPARE], p[U_PAST]
+        if m[DT, 0] > GAP:
+            forget(m, p)
+        if p[ADAPTIVE] > 0:
+            shift(m, u_past, 1, depth)
+            m[u_past, 0] = m[U, 0]
+            for j in range(depth):
+                input_at(m, p, m[u_past + j, 0], f + j * n_in, spare)
+        else:
+            shift(m, f, n_in, depth)
+            input_at(m, p, m[U, 0], f, spare)
+        fill(m, p, phi)
+        if m[STARTED, 0] == 0.0 and complete(p, phi):
+            m[STARTED, 0] = 1.0
+        right = minimal_past(m, p, theta, phi) if m[MINIMAL, 0] > 0.0 else past(m, p, theta, phi)
+        y, at_d = m[Y, 0], p[NA] + p[NB]
+        seen = abs(y) < LARGEST
+        if seen:  # before the prediction, which nothing waits for then
+            output_at(m, p, y, g, h)
+            for k in range(n_out):
+                seen = seen and abs(m[g + k, 0]) < LARGEST
+                if k > 0:
+                    phi[at_d + k - 1, 0] = m[g + k, 0]
+        m[RAW, 0] = y if seen else np.nan
+        if seen:
+            believe(m, y)
+        predicted = right if p[IDENTITY] > 0 else invert(m, p, right)
+        m[PREDICTED, 0] = predicted
+        if not abs(y) < LARGEST:
+            output_at(m, p, predicted, g, h)
+            for k in range(1, n_out):
+                phi[at_d + k - 1, 0] = m[g + k, 0]
+        m[FACTOR, 0] = noise_factor(m, p, theta) if m[VARIANCE, 0] > 0.0 else 1.0
+        m[Y, 0] = -m[g, 0] if seen else np.nan
+        m[DT, 0] = m[DT, 0] if m[STARTED, 0] > 0.0 else 0.0
+
+    return part(named(regress_work, into, out))
+
+
+@lru_cache
+def _regress(into: Any, out: Any, p: tuple[int, ...], lanes: bool) -> Any:
+    """The machine of ``regress``."""
+    work, orders = _regress_work(into, out), np.array(p)
+
+    def machine_regress(blocks: int, theta: int, phi: int, L: int) -> None:
+        stride = L if lanes else 1  # which the compiler knows
+        work(floats(blocks, 1, stride), orders, floats(theta, 1, stride), floats(phi, 1, stride))
+
+    return outside(named(machine_regress, lanes, p, into, out))
+
+
+@lru_cache
+def _push_work(out: Any) -> Any:
+    """What ``push`` does: the present output among the lags (missing stays missing), thresholds, the grid."""
+    lay = laying(output_values(out))
+
+    def push_work(m: Array, p: Places, theta: Array) -> None:
+        rows, n_out, g = 1 + max(p[NA], 1), p[N_OUT], p[G_PAST]
+        if not m[SEEN, 0] > 0.0:
+            for k in range(n_out):
+                m[g + k, 0] = np.nan
+        shift(m, g, n_out, rows)
+        if m[VARIANCE, 0] > 0.0:
+            shift(m, p[H_PAST], n_out, rows)
+        if p[ADAPTIVE] > 0 and m[OK, 0] > 0.0:
+            thresholds(m, p, theta)
+        if p[IDENTITY] == 0:
+            lay(m, p)
+
+    return part(named(push_work, out))
+
+
+@lru_cache
+def _push(out: Any, p: tuple[int, ...], lanes: bool) -> Any:
+    """The machine of ``push``."""
+    work, orders = _push_work(out), np.array(p)
+
+    def machine_push(blocks: int, theta: int, L: int) -> None:
+        stride = L if lanes else 1
+        work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
+
+    return outside(named(machine_push, lanes, p, out))
+
+
+@lru_cache
+def build(into: Any, out: Any, p: tuple[int, ...]) -> ModelSteps:
+    """The steps for the machines of two bases."""
+    regress_one, push_one = _regress(into, out, p, False), _push(out, p, False)
+    regress_lane, push_lane = _regress(into, out, p, True), _push(out, p, True)
 
     @kernel
     def regress(s: State, l: int) -> None:
-        s.cells[GIVEN, l] = s.noise[l]
-        s.y[l], s.dt[l], factor = lane_regress(
-            s.u[0, l], s.y[l], s.dt[l], orders, s.theta[:, l], s.phi[:, l], s.f_lag[:, :, l],
-            s.u_past[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l], s.g_now[:, l], s.h_now[:, l], s.d_now[:, l],
-            s.f_now[:, l], s.into[:, l], s.out[:, l],
-            s.curve[:, :, l], s.level[:, l], s.cells[:, l],
-        )  # fmt: skip
-        s.noise[l] *= factor
+        s.blocks[GIVEN, l], s.blocks[U, l], s.blocks[Y, l], s.blocks[DT, l] = s.noise[l], s.u[0, l], s.y[l], s.dt[l]
+        at, L = 8 * l, s.y.shape[0]
+        blocks, theta, phi = s.blocks.ctypes.data + at, s.theta.ctypes.data + at, s.phi.ctypes.data + at
+        if L == 1:
+            regress_one(blocks, theta, phi, L)
+        else:
+            regress_lane(blocks, theta, phi, L)
+        s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
+        s.noise[l] *= s.blocks[FACTOR, l]
 
     @kernel
     def push(s: State, l: int) -> None:
-        s.noise[l] = s.cells[GIVEN, l]
-        s.y_hat[l] = s.cells[PREDICTED, l]
-        lane_push(
-            s.seen[l] > 0.0, s.ok[l] > 0.0, orders, s.theta[:, l], s.g_lag[:, :, l], s.h_lag[:, :, l],
-            s.g_now[:, l], s.h_now[:, l], s.into[:, l], s.out[:, l], s.curve[:, :, l], s.cells[:, l], n_in,
-        )  # fmt: skip
+        s.noise[l] = s.blocks[GIVEN, l]
+        s.y_hat[l] = s.blocks[PREDICTED, l]
+        s.blocks[SEEN, l], s.blocks[OK, l] = s.seen[l], s.ok[l]
+        at, L = 8 * l, s.y.shape[0]
+        if L == 1:
+            push_one(s.blocks.ctypes.data + at, s.theta.ctypes.data + at, L)
+        else:
+            push_lane(s.blocks.ctypes.data + at, s.theta.ctypes.data + at, L)
 
-    return ModelSteps(regress, push)
+    def ready(L: int) -> None:
+        for machine in (into, out, *((regress_one, push_one) if L == 1 else (regress_lane, push_lane))):
+            machine.load()
+
+    return ModelSteps(regress, push, ready)

@@ -52,6 +52,20 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept, len(self.outputs))
 
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Responses (h, ny, ny) of the outputs to one noise of each, for theta (ny, n)."""
+        ny, na = len(self.outputs), self.na
+        lags = np.asarray(theta)[:, : ny * na].reshape(ny, ny, na)
+        response = np.zeros((h, ny, ny))
+        response[0] = np.eye(ny)
+        for k in range(1, h):
+            for i in range(min(na, k)):
+                response[k] += lags[:, :, i] @ response[k - 1 - i]
+        return response
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
+
     def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
         raise ValueError("polynomials: A(z) of several outputs is a matrix; take it from run.theta by run.names.")
 
@@ -91,7 +105,8 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int)
         for o in range(ny):  # lane o follows output o
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
-            fill = s.y_hat[o] if s.valid[o] > 0.0 and s.filled[o, l] < na else np.nan
+            informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
+            fill = s.y_hat[o] if s.valid[o] > 0.0 and informed and s.filled[o, l] < na else np.nan
             s.filled[o, l] = 0.0 if s.seen[o] > 0.0 else s.filled[o, l] + 1.0
             if na > 0:
                 s.y_lag[o, 0, l] = s.y[o] if s.seen[o] > 0.0 else fill

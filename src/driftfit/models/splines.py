@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.models import curve_kernels
-from driftfit.models.curves import Basis, fill
+from driftfit.models.curves import Basis, values_and_slopes
 from driftfit.settings import numbers, whole
 
 
@@ -36,6 +36,10 @@ class PiecewiseLinear(Basis):
     knots: Any
 
     code: ClassVar[int] = curve_kernels.HINGES
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words)
 
     def __post_init__(self) -> None:
         self._set("knots", knots_of("PiecewiseLinear", self.knots, 1))
@@ -66,6 +70,10 @@ class BSpline(Basis):
 
     code: ClassVar[int] = curve_kernels.SPLINES
 
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words[0], words[1:])
+
     def __post_init__(self) -> None:
         self._set("degree", whole("BSpline", "degree", self.degree, 1))
         self._set("knots", knots_of("BSpline", self.knots, 2))
@@ -89,9 +97,8 @@ class BSpline(Basis):
     def own_numbers(self) -> Array:
         ends = np.pad(self.knots, self.degree, mode="edge")
         p = np.concatenate([[self.degree, len(ends)], ends, np.zeros(self.degree + 1 + self.n)])
-        at_anchor = np.empty((1, self.n))
-        fill(curve_kernels.splines)(np.array([self.anchor]), p.copy(), at_anchor)
-        p[-self.n :] = at_anchor[0]
+        coded = np.concatenate([[float(self.code)], p])
+        p[-self.n :] = values_and_slopes(self.evaluate, np.array([self.anchor]), coded, self.n)[0][0]
         return p
 
     @property

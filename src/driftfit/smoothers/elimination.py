@@ -1,7 +1,7 @@
 """The fast path of the exact smoother: elimination of one increment at a time, a refinement, and a test of both.
 
 For a diagonal q, with U, z the information on theta_t (U theta = z), the increment of parameter i before sample t has
-variance g = q_i drift_t, and leaves
+variance g = q_i drift_t each_ti^2, and leaves
 
     f = 1 / (1 + g U_ii);   a_i = f,  a_j = -g f U_ji;   b = g f z_i
     U_jk <- U_jk + a_j U_ik,  U_ij <- f U_ij;   z_j <- z_j + a_j z_i,  z_i <- f z_i          forwards
@@ -45,15 +45,16 @@ def smooth(walk: Walk) -> Path | None:
     T, n = walk.phi.shape
     work = workspace(n).copy()
     a, b = np.empty((T, n, n)), np.empty((T, n))
-    q = np.diag(walk.q).copy()
-    least = forwards(work, walk.phi, walk.y, walk.weight, walk.drift, q, a, b)
+    q, each = np.diag(walk.q).copy(), walk.each if len(walk.each) else np.ones((1, n))
+    moved = walk.drift, np.ascontiguousarray(each), q
+    least = forwards(work, walk.phi, walk.y, walk.weight, *moved, a, b)
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
     work["C"], work["theta"] = C, C @ work["z"][0]
     theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
-    backwards(work, walk.phi, walk.weight, walk.drift, q, a, b, theta, var, left)
-    cost = residuals(work, walk.phi, walk.y, walk.weight, walk.drift, q, a, b, theta)
+    backwards(work, walk.phi, walk.weight, *moved, a, b, theta, var, left)
+    cost = residuals(work, walk.phi, walk.y, walk.weight, *moved, a, b, theta)
     work["theta"] = C @ work["z"][0]
     correct(work, a, b, theta)
     correction = work["correction"][0] / np.maximum(work["size"][0], 1e-300)
@@ -86,14 +87,17 @@ def workspace(n: int) -> Array:
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def forwards(work: Array, phi: Array, y: Array, weight: Array, drift: Array, q: Array, a: Array, b: Array) -> float:
+def forwards(
+    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array
+) -> float:
     """Eliminate every increment; leaves the last U and z in the work space and returns the least f."""
     s = work[0]
     n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
     least = 1.0
     for t in range(phi.shape[0]):
         for i in range(n):
-            g = q[i] * drift[t]
+            g = q[i] * drift[t] * each[t * many, i] ** 2
             f = 1.0 / (1.0 + g * s.U[i, i])
             least = min(least, f)
             for j in range(n):
@@ -123,12 +127,13 @@ def forwards(work: Array, phi: Array, y: Array, weight: Array, drift: Array, q: 
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def backwards(
-    work: Array, phi: Array, weight: Array, drift: Array, q: Array, a: Array, b: Array,
+    work: Array, phi: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
     theta: Array, var: Array, left: Array,
 ) -> None:  # fmt: skip
     """theta, variances and 1 - leverage, from the last theta and C in the work space."""
     s = work[0]
     n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
     for t in range(phi.shape[0] - 1, -1, -1):
         h = 0.0
         for j in range(n):
@@ -144,7 +149,7 @@ def backwards(
             for j in range(n):
                 x += a[t, i, j] * s.theta[j]
             s.theta[i] = x
-            own = q[i] * drift[t] * a[t, i, i]
+            own = q[i] * drift[t] * each[t * many, i] ** 2 * a[t, i, i]
             for j in range(n):
                 total = 0.0
                 for k in range(n):
@@ -160,17 +165,19 @@ def backwards(
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def residuals(
-    work: Array, phi: Array, y: Array, weight: Array, drift: Array, q: Array, a: Array, b: Array, theta: Array
-) -> float:
+    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
+    theta: Array,
+) -> float:  # fmt: skip
     """The forward pass of the refinement: b of the residuals; returns the cost of the path."""
     s = work[0]
     n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
     cost = 0.0
     for i in range(n):
         s.z[i] = 0.0
     for t in range(phi.shape[0]):
         for i in range(n):
-            g = q[i] * drift[t]
+            g = q[i] * drift[t] * each[t * many, i] ** 2
             x = theta[t, i] - theta[t - 1, i] if t > 0 else 0.0
             shift = x / g if g > 0.0 else 0.0
             cost += x * shift

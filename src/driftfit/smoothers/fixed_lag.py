@@ -15,12 +15,13 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.smoothers import two_filters
+from driftfit.smoothers import slopes, two_filters
 from driftfit.smoothers.walk import Walk
+from driftfit.storage import fields
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.information import triangular_root
 
-SAMPLES = ("phi", "y", "weight", "drift")
+SAMPLES = ("phi", "y", "weight", "drift", "each", "trend")
 
 
 class FixedLag(NamedTuple):
@@ -36,35 +37,45 @@ class Window:
     """The last ``lag`` + 1 samples of a stream, and what is known from before them."""
 
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
+        if getattr(model, "output_noise", None) is not None:
+            raise ValueError(
+                "Live: lag= does not know what the measurement noise of the model adds to each sample; smooth the "
+                "record, or leave output_noise out."
+            )
         prior = tracker.random_walk(model)
         n, r = model.n, 1.0 if prior.r is None else prior.r
         p0 = None if prior.p0 is None else prior.p0 / r
         self.walk = Walk(
             np.zeros((lag + 1, n)), np.zeros(lag + 1), np.zeros(lag + 1), np.zeros(lag + 1),
-            prior.q / r, prior.theta0, p0, prior.r,
+            prior.q / r, prior.theta0, p0, prior.r, np.ones((lag + 1, n)), np.zeros((lag + 1) * prior.slopes),
         )  # fmt: skip
-        self.G = triangular_root(self.walk.q)
+        G = triangular_root(self.walk.q)
+        self.G = slopes.root(G) if prior.slopes else G
         self.count = 0
         self.drifts = not prior.at_first_sample and p0 is not None
-        self.before = two_filters.workspace(n, 2).copy()
+        self.before = two_filters.workspace(len(self.G), 2).copy()
         self.before["G"] = self.G[:, :, None]
         if p0 is not None:
-            rows, values, _ = two_filters.start(self.walk, np.ones(n), np.eye(n))
-            self._filter(0, rows, values)
+            begin = two_filters.start(self.walk, np.ones(n), np.eye(n))
+            self._filter(0, begin.rows, begin.values)
 
     def _filter(self, count: int, rows: Array, values: Array) -> None:
         """Move what is known from before the window over its first ``count`` samples."""
-        walk, n = self.walk, len(self.G)
-        drift = np.sqrt(np.append(walk.drift[:count], 0.0))
+        walk = self._first(count)
+        drift = np.sqrt(np.append(walk.drift, 0.0))
         filters, _ = two_filters.compiled()
-        scratch = np.zeros(1, two_filters.block_type(n))
+        scratch = np.zeros(1, two_filters.block_type(len(self.G)))
         self.before["S"][..., 1] = self.before["d"][..., 1] = 0.0
-        filters(
-            self.before, walk.phi[:count], walk.y[:count], np.sqrt(walk.weight[:count]), drift, rows, values, scratch
-        )
+        changes = two_filters.changes(walk)
+        filters(self.before, walk.phi, walk.y, np.sqrt(walk.weight), drift, *changes, rows, values, scratch)
 
-    def push(self, tile: Array, known: tuple[float, float, float]) -> None:
-        """Take in the sample that the tile has just seen; ``known`` as the tile was given it."""
+    def _first(self, count: int) -> Walk:
+        """The first ``count`` samples of the window as a problem."""
+        walk = self.walk._replace(**{name: getattr(self.walk, name)[:count] for name in SAMPLES})
+        return slopes.expanded(walk) if len(self.walk.trend) else walk
+
+    def push(self, tile: Array, known: tuple[float, float, float], lane: int = 0) -> None:
+        """Take in the sample that a lane of the tile has just seen; ``known`` as the lane was given it."""
         s, walk = tile[0], self.walk
         if self.count == len(walk.y):
             self._filter(1, np.zeros((0, len(self.G))), np.zeros(0))
@@ -72,28 +83,35 @@ class Window:
                 values = getattr(walk, name)
                 values[:-1] = values[1:]
             self.count -= 1
-        k, dt = self.count, float(s["dt"][0])
+        k, dt = self.count, float(s["dt"][lane])
         _, noise, factor = known
-        walk.phi[k], walk.y[k] = s["phi"][:, 0], s["y"][0]
-        walk.weight[k] = s["ok"][0] / noise
+        walk.phi[k], walk.y[k] = s["phi"][:, lane], s["y"][lane]
+        walk.weight[k] = s["ok"][lane] / noise
         walk.drift[k] = dt * factor if self.drifts else 0.0
+        walk.each[k] = s["each"][:, lane] if "each" in fields(tile) else 1.0
+        walk.trend[k : k + 1] = dt if self.drifts else 0.0
         self.drifts = self.drifts or dt > 0.0
         self.count += 1
 
-    def smooth(self, tile: Array) -> FixedLag:
-        """Smooth the window; the tile says which directions have been seen, and the noise variance."""
-        n = len(self.G)
+    def smooth(self, tile: Array, lane: int = 0) -> FixedLag:
+        """Smooth the window; a lane of the tile says which directions have been seen, and the noise variance."""
+        N, walk = len(self.G), self._first(self.count)
         rows, values = self.before["S"][0, ..., 0], self.before["d"][0, :, 0]
-        hidden = np.zeros(n, bool)
-        rank = int(tile["rank"][0, 0])
-        if rank < n:
-            unseen = two_filters.unspanned(tile["V"][0, :rank, :, 0], np.ones(n))
+        hidden = np.zeros(N, bool)
+        rank = int(tile["known" if len(walk.trend) else "rank"][0, lane])
+        if rank < N:
+            unseen = two_filters.unspanned(tile["V"][0, :rank, :, lane], np.ones(N))
+            values = np.append(values, unseen @ walk.theta0)
             hidden = two_filters.undetermined(unseen)
-            rows, values = np.vstack([rows, unseen]), np.append(values, unseen @ self.walk.theta0)
-        samples = {name: getattr(self.walk, name)[: self.count] for name in SAMPLES}
-        path, _ = two_filters.meeting(self.walk._replace(**samples), self.G, rows, values)
-        r = float(tile["scale"][0, 0]) if self.walk.r is None else self.walk.r
-        return FixedLag(path.theta, np.sqrt(r * np.where(hidden, np.inf, path.var)))
+            if len(walk.trend):
+                time = float(tile["tau"][0, lane]) + np.cumsum(walk.trend) - walk.trend.sum()
+                hidden = slopes.undetermined(unseen, time)
+                unseen = slopes.moved(unseen, float(time[0]))
+            rows = np.vstack([rows, unseen])
+        path, _ = two_filters.meeting(walk, self.G, rows, values)
+        r, n = float(tile["scale"][0, lane]) if walk.r is None else walk.r, self.walk.phi.shape[1]
+        var = np.where(hidden, np.inf, path.var)
+        return FixedLag(path.theta[:, :n], np.sqrt(r * var[:, :n]))
 
     def plain(self) -> dict[str, Any]:
         """The state as plain data."""

@@ -26,7 +26,7 @@ from driftfit.kernel import Array
 from driftfit.settings import numbers, whole
 from driftfit.smoothers import exact
 from driftfit.smoothers.smoothed import Smoothed
-from driftfit.smoothers.walk import Walk, walk_of
+from driftfit.smoothers.walk import Path, Walk, walk_of
 
 if TYPE_CHECKING:
     from driftfit.result import Track
@@ -90,7 +90,7 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
         path = exact.smooth(weighted)
     return Huber(
         Smoothed(weighted, path, run), delta, np.where(walk.weight > 0.0, held, 0.0), np.array(costs[1:]),
-        certificate(walk, path.theta, delta),
+        certificate(walk, path, delta),
     )  # fmt: skip
 
 
@@ -99,13 +99,14 @@ def spread_of(smoothed: Smoothed) -> float:
     return float(median_abs_deviation(smoothed.loo, scale="normal", nan_policy="omit"))
 
 
-def certificate(walk: Walk, theta: Array, delta: float) -> float:
-    """The larger of both conditions' remainders, relative to the data's pull and to theta."""
+def certificate(walk: Walk, path: Path, delta: float) -> float:
+    """The larger of both conditions' remainders, relative to the data's pull and to what walks."""
+    theta, walks = path.theta, path.slope if len(walk.trend) else path.theta
     root = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan))
     residual = walk.residual(theta)
     psi = np.nan_to_num(np.clip(root * residual, -delta, delta) / root)
     pull = walk.pull(psi)
-    moved = np.diff(theta, axis=0) - walk.drift[1:, None] * (pull[1:] @ walk.q)
+    moved = np.diff(walks, axis=0) - walk.moves(pull)
     whole_pull = np.sum(np.abs(walk.phi) * (walk.weight * np.abs(walk.y))[:, None], axis=0)
     first = np.max(np.abs(pull[0]) / np.maximum(whole_pull, 1e-300)) if walk.p0 is None else 0.0
-    return float(max(first, np.max(np.abs(moved), initial=0.0) / max(np.abs(theta).max(), 1e-300)))
+    return float(max(first, np.max(np.abs(moved), initial=0.0) / max(np.abs(walks).max(), 1e-300)))

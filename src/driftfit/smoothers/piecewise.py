@@ -47,15 +47,15 @@ class Segments:
 
             known &= faults(run.tracker, run, run.hypotheses.events()) == 1.0  # type: ignore[arg-type]
         self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
+        self._weight = 1.0 / seen["used_noise"][:, 0]
         self._solve(r)
 
     def _solve(self, r: float | None) -> None:
         n, thetas, covs, rest, free = self._phi.shape[1], [], [], 0.0, 0
-        weight = np.broadcast_to(1.0 / self.run._known[:, 1], len(self._ok))
         used = []
         for a, b in zip(self.bounds[:-1], self.bounds[1:], strict=True):
             rows = np.flatnonzero(self._ok[a:b]) + a
-            root = np.sqrt(weight[rows])
+            root = np.sqrt(self._weight[rows])
             A, d = self._phi[rows] * root[:, None], self._y[rows] * root
             theta, _, rank, _ = np.linalg.lstsq(A, d, rcond=None)
             thetas.append(theta)

@@ -35,6 +35,8 @@ class Smoothed:
         is shrunk by 1 - leverage. NaN where there is no sample; loo also where a sample alone determines a direction.
     leverage : (T,)
         Share of a sample in its own fit, in [0, 1].
+    press, alone : float, int
+        Weighted mean square of ``loo``, and how many samples it leaves out because they alone determine a direction.
     cost, measurement_cost, dynamic_cost : float
         The least J, and its two parts: weighted squared residuals, and the rest.
     r : float
@@ -98,6 +100,21 @@ class Smoothed:
     def std(self) -> Array:
         return np.sqrt(self.r * self._path.var)
 
+    @property
+    def slope(self) -> Array:
+        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        return self._of_slopes(self._path.slope)
+
+    @cached_property
+    def slope_std(self) -> Array:
+        """Standard deviation of the slope, (T, n)."""
+        return np.sqrt(self.r * self._of_slopes(self._path.slope_var))
+
+    def _of_slopes(self, values: Array) -> Array:
+        if not len(self.walk.trend):
+            raise ValueError("slope: theta itself walks at random here; FLS(mu, differences=2) gives it a slope.")
+        return values
+
     @cached_property
     def leverage(self) -> Array:
         leverage: Array = 1.0 - self._path.c**2
@@ -111,6 +128,15 @@ class Smoothed:
     def loo(self) -> Array:
         c = np.where(self._path.c > ALONE, self._path.c, np.nan)
         return self._scaled(self._path.rho / c)
+
+    @cached_property
+    def press(self) -> float:
+        terms = self.walk.weight * self.loo**2
+        return float(np.nanmean(terms)) if np.isfinite(terms).any() else float("nan")
+
+    @cached_property
+    def alone(self) -> int:
+        return int(np.count_nonzero((self.walk.weight > 0.0) & np.isnan(self.loo)))
 
     def _scaled(self, values: Array) -> Array:
         """Values in units of y; NaN where there is no sample."""
@@ -162,7 +188,8 @@ def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
         return exact.smooth(walk, keep)
     arranged, order = ordered(walk, order_by)
     path, back = exact.smooth(arranged, keep), np.argsort(order)
-    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank")}
+    slopes = ("slope", "slope_var") if len(walk.trend) else ()
+    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank", *slopes)}
     cov = path.cov[back] if len(path.cov) else path.cov
     nowhere = ~np.isfinite(np.asarray(order_by, float))
     in_time["theta"][nowhere] = in_time["var"][nowhere] = np.nan

@@ -21,7 +21,7 @@ Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the ro
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,13 +34,20 @@ KNOWN_EXACTLY = 1e8
 """How much more is known of what the prior fixes than all samples together could say; its square is beyond rounding."""
 
 
-def smooth(walk: Walk, scale: Array, spanned: Array, keep: str = "std") -> Path:
-    """Solve the problem with columns divided by ``scale``, whose regressors span ``spanned / scale``."""
-    cross = np.outer(scale, scale)
+class Start(NamedTuple):
+    """What is known before the first sample, ``rows theta_1 = values``, and which parameters stay undetermined."""
+
+    rows: Array
+    values: Array
+    hidden: Array
+    """(n,) or (T, n) bool"""
+
+
+def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") -> Path:
+    """Solve the problem with columns divided by ``scale``; G is the root of q in these units."""
+    cross, hidden = np.outer(scale, scale), begin.hidden
     scaled = walk._replace(phi=walk.phi / scale)
-    rows, values, hidden = start(walk, scale, spanned)
-    G = information.triangular_root(walk.q * cross)
-    found, blocks = meeting(scaled, G, rows, values, keep)
+    found, blocks = meeting(scaled, G, begin.rows, begin.values, keep)
     found.rho[walk.weight == 0.0] = np.nan
     lag_cov = gains(scaled, G, blocks) @ found.cov[1:] if keep == "cov" else found.cov
     return found._replace(
@@ -57,7 +64,7 @@ def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std")
     filters, meet = compiled()
     pair = workspace(n, 2).copy()
     pair["G"] = G[:, :, None]
-    cost = filters(pair, walk.phi, walk.y, root, drift, rows, values, blocks)
+    cost = filters(pair, walk.phi, walk.y, root, drift, *changes(walk), rows, values, blocks)
     theta, var, rho, c = np.empty((T, n)), np.empty((T, n)), np.empty(T), np.empty(T)
     R = np.empty((T if keep == "cov" else 0, n, n))
     meet(workspace(n, WIDTH).copy(), walk.phi, walk.y, root, blocks, theta, var, rho, c, R)
@@ -65,8 +72,15 @@ def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std")
     return Path(theta, var, rho, c, cost, cov, cov, "safe"), blocks
 
 
-def start(walk: Walk, scale: Array, spanned: Array) -> tuple[Array, Array, Array]:
-    """What is known before the first sample, as rows and values, and which parameters stay undetermined.
+def changes(walk: Walk) -> tuple[Array, Array]:
+    """``each`` and ``trend`` with an entry after the last sample, where nothing happens any more."""
+    each, trend = walk.each, walk.trend.ravel()
+    each = np.vstack([each, np.ones((1, each.shape[1]))]) if len(each) else each
+    return each, np.append(trend, 0.0) if len(trend) else trend
+
+
+def start(walk: Walk, scale: Array, spanned: Array) -> Start:
+    """The start of a problem whose regressors span ``spanned / scale``.
 
     A proper prior gives a row for each of its axes. Without one, a row that fixes the first point is needed in every
     direction that the regressors never span; it costs nothing there, so its weight does not matter.
@@ -76,13 +90,13 @@ def start(walk: Walk, scale: Array, spanned: Array) -> tuple[Array, Array, Array
         variance, axes = np.linalg.eigh(walk.p0 * np.outer(scale, scale))
         sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
         rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
-        return rows, rows @ theta0, np.zeros(len(scale), bool)
+        return Start(rows, rows @ theta0, np.zeros(len(scale), bool))
     if len(spanned) == len(scale):
-        return np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool)
+        return Start(np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool))
     natural = unspanned(spanned, scale)
     rows = natural / scale
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows, rows @ theta0, undetermined(natural)
+    return Start(rows, rows @ theta0, undetermined(natural))
 
 
 def unspanned(spanned: Array, scale: Array) -> Array:
@@ -101,9 +115,10 @@ def undetermined(hidden: Array) -> Array:
 
 
 def gains(walk: Walk, G: Array, blocks: Array) -> Array:
-    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}, I - g (I + g' U g)^-1 g' U.
+    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}, F^-1 (I - g (I + g' U g)^-1 g' U).
 
-    U is the information on theta_t of the samples up to t, g = G sqrt(drift_{t+1}).
+    U is the information on F theta_t of the samples up to t, g = E G sqrt(drift_{t+1}); F moves theta along its slope
+    and is 1 where it has none.
     """
     phi = walk.phi
     T, n = phi.shape
@@ -111,8 +126,13 @@ def gains(walk: Walk, G: Array, blocks: Array) -> Array:
     S[:, *np.triu_indices(n)] = np.moveaxis(blocks["S"][:, 0], 1, 2).reshape(-1, n * (n + 1) // 2)[:T]
     U = S.swapaxes(1, 2) @ S + walk.weight[:, None, None] * phi[:, :, None] * phi[:, None, :]
     g = G * np.sqrt(walk.drift[1:, None, None])
-    gU = g.swapaxes(1, 2) @ U[:-1]
-    gain: Array = np.eye(n) - g @ np.linalg.solve(np.eye(n) + gU @ g, gU)
+    if len(walk.each):
+        g = walk.each[1:, :, None] * g
+    back = np.broadcast_to(np.eye(n), (T - 1, n, n))
+    if len(walk.trend):
+        back = back - np.eye(n, k=n // 2) * walk.trend[1:, None, None]
+    gU = g.swapaxes(1, 2) @ (back.swapaxes(1, 2) @ U[:-1] @ back)
+    gain: Array = back @ (np.eye(n) - g @ np.linalg.solve(np.eye(n) + gU @ g, gU))
     return gain
 
 
@@ -126,7 +146,8 @@ def block_type(n: int) -> np.dtype[Any]:
 def workspace(n: int, L: int) -> Array:
     """Scratch space of L lanes, to be copied."""
     square, vector = np.zeros((n, n)), np.zeros(n)
-    names = {"S": square, "R": square, "G": square, "d": vector, "x": vector, "row": vector, "pivot": vector}
+    names = {"S": square, "R": square, "G": square, "H": square, "d": vector, "x": vector, "row": vector}
+    names |= {"pivot": vector}
     return make_tile(n, 0, {}, [{"theta": vector, "rho": 0.0, "c": 0.0, **names}] * L)
 
 
@@ -134,23 +155,34 @@ def workspace(n: int, L: int) -> Array:
 def compiled() -> tuple[Any, Any]:
     """The two loops; closures, so that the cache on disk sees when a kernel changes."""
     absorb, spread, solve, invert = information.absorb, information.spread, information.solve, information.invert
-    width = WIDTH
+    shear, width = information.shear, WIDTH
 
     @Driver
     def filters(
-        work: Array, phi: Array, y: Array, root: Array, drift: Array, rows: Array, values: Array, blocks: Array
-    ) -> float:
+        work: Array, phi: Array, y: Array, root: Array, drift: Array, each: Array, trend: Array,
+        rows: Array, values: Array, blocks: Array,
+    ) -> float:  # fmt: skip
         """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0."""
         s = work[0]
         T, n = phi.shape[0], s.d.shape[0]
+        s.H[:] = s.G
         for k in range(rows.shape[0]):
             for i in range(n):
                 s.row[i, 0] = rows[k, i]
             absorb(s.S, s.d, s.row, values[k], 0)
         cost = 0.0
         for t in range(T):
+            if each.shape[0] > 0:
+                for l in range(2):
+                    for i in range(n):
+                        for j in range(i, n):
+                            s.H[i, j, l] = each[t if l == 0 else T - t, i] * s.G[i, j, l]
+            if trend.shape[0] > 0:
+                shear(s.S, -trend[t], 0)
             for l in range(2):
-                spread(s.S, s.d, s.G, drift[t if l == 0 else T - t], s.pivot, l)
+                spread(s.S, s.d, s.H, drift[t if l == 0 else T - t], s.pivot, l)
+            if trend.shape[0] > 0:
+                shear(s.S, trend[T - t], 1)
             for l in range(2):
                 at = t if l == 0 else T - 1 - t
                 block, lane = blocks[at // width], at % width

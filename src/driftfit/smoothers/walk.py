@@ -1,7 +1,7 @@
 """The problem that smoothers solve: a regression whose coefficients walk at random, as a run left it.
 
     y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
-    theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r q drift_t)
+    theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(each_t)
     theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
 
 The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
@@ -10,12 +10,13 @@ once to collect them.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from driftfit.drivers import drivers, make_tile, output_type
-from driftfit.kernel import Array, State, kernel
+from driftfit.drivers import TrackerSteps, drivers, make_tile, output_type
+from driftfit.kernel import Array, State, Step, kernel
 from driftfit.signals import as_numbers
 from driftfit.trackers.base import RandomWalk
 
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from driftfit.result import Track
 
 COLLECTED = ("phi", "y", "dt", "valid")
+
+NONE = np.zeros((0, 0))
+"""No parameter drifts otherwise than q says, and none has a slope."""
 
 
 class Walk(NamedTuple):
@@ -44,6 +48,10 @@ class Walk(NamedTuple):
     """(n, n), or None for the diffuse start."""
     r: float | None
     """Noise variance; None where it is to be estimated."""
+    each: Array = NONE
+    """(T, n): roots of the factors of each parameter's drift before each sample; empty where there are none."""
+    trend: Array = NONE
+    """(T,): intervals of motion along a slope before each sample, where q is the drift of that slope; else empty."""
 
     @property
     def used(self) -> int:
@@ -58,11 +66,22 @@ class Walk(NamedTuple):
     def pull(self, residual: Array) -> Array:
         """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the force on each increment.
 
-        At the minimum of J its first row is zero (without a prior) and theta_{t+1} - theta_t = drift_{t+1} q pull.
+        At the minimum of J its first row is zero (without a prior), and `moves` of it are the increments.
         """
         weighted = self.phi * (self.weight * residual)[:, None]
         forces: Array = np.cumsum(weighted[::-1], axis=0)[::-1]
         return forces
+
+    def moves(self, pull: Array) -> Array:
+        """theta_{t+1} - theta_t under forces (T, n) as `pull` gives them: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
+
+        Where theta has a slope, slope_{t+1} - slope_t, with sum over i > t of trend_i pull_i in the place of pull.
+        """
+        if len(self.trend):
+            pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
+        each = self.each[1:] if len(self.each) else 1.0
+        moves: Array = self.drift[1:, None] * each * ((each * pull[1:]) @ self.q)
+        return moves
 
 
 def constants(n: int) -> RandomWalk:
@@ -91,6 +110,10 @@ class Path(NamedTuple):
     """"fast" or "safe"."""
     rank: Array = np.zeros(0, np.int64)
     """(T,): rank of the regressors up to each sample."""
+    slope: Array = NONE
+    """(T, n), per nominal interval; empty where theta has none."""
+    slope_var: Array = NONE
+    """(T, n), or empty."""
 
 
 @kernel
@@ -103,12 +126,47 @@ def collect(o: State, s: State, l: int) -> None:
     o.valid[l] = s.valid[l]
 
 
+@kernel
+def collect_all(o: State, s: State, l: int) -> None:
+    """The same, and the factor of the noise variance that the correction used."""
+    collect(o, s, l)
+    o.used_noise[l] = s.used_noise[l]
+
+
+@lru_cache
+def attentive(steps: TrackerSteps) -> TrackerSteps:
+    """Steps that note the factor of the noise variance when the tracker is at work.
+
+    A model may make it larger than what the user gave (measurement noise that comes in through a curve).
+    """
+    predict, begin = steps.predict, steps.begin
+
+    @kernel
+    def noting(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        predict(s, l)
+
+    if begin is None:
+        return steps._replace(predict=noting, store=collect_all)
+    first: Step = begin
+
+    @kernel
+    def noting_first(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        first(s, l)
+
+    return steps._replace(predict=noting, begin=noting_first, store=collect_all)
+
+
 def replay(run: Track) -> Array:
-    """Run the tracker over its record again and return what it saw, (T,) records of phi, y, dt, valid, ok and more."""
+    """Run the tracker over its record again and return what it saw, (T,) records.
+
+    Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
+    """
     model, tracker = run.model, run.tracker
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
-    out = np.empty(len(run), output_type(tile, COLLECTED))
-    steps = tracker.steps_for(model)._replace(store=collect)
+    tile = make_tile(model.n, model.m, model.memory(), [{**tracker.state_for(model), "used_noise": 1.0}])
+    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise")))
+    steps = attentive(tracker.steps_for(model))
     drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
     return out
 
@@ -118,18 +176,20 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
 
     ``prior`` replaces what the tracker takes theta to be.
     """
+    each = run._known[:, 3:] if prior is None and run._known.shape[1] > 3 else NONE
     prior = run.tracker.random_walk(run.model) if prior is None else prior
     seen = replay(run)
     dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
-    with np.errstate(divide="ignore"):
-        weight = np.where(ok, 1.0 / run._known[:, 1], 0.0)
+    weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run._known[:, 2]
+    trend = dt if prior.slopes else NONE
     if prior.at_first_sample or prior.p0 is None:
-        drift[: np.argmax(dt > 0.0) + 1] = 0.0
+        first = int(np.argmax(dt > 0.0)) + 1
+        drift[:first], trend[:first] = 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
-    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r)
+    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
 
 
 def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
@@ -144,4 +204,8 @@ def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
     weight = np.where(np.isfinite(value), walk.weight, 0.0)
     drift = np.ones(len(order))
     drift[:1] = 0.0 if walk.p0 is None else 1.0
-    return walk._replace(phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift), order
+    trend = drift.copy() if len(walk.trend) else NONE
+    arranged = walk._replace(
+        phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift, each=NONE, trend=trend
+    )
+    return arranged, order

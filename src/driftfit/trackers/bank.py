@@ -233,7 +233,7 @@ class Bank(Tracker):
         if self.p0 is not None and (nominal.r is not None or guessed):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
             arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
-            arrays["root"], scale = arrays["B"][:, :1].copy(), 1.0
+            arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
         return {
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
@@ -244,7 +244,7 @@ class Bank(Tracker):
             **packed(arrays, n, na, nominal.r is None, self._alike),
         }  # fmt: skip
 
-    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
@@ -258,8 +258,8 @@ class Bank(Tracker):
             columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
         return columns
 
-    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
-        columns, Hd = self.beside(1, prob, drift)[0], len(self.all_changes)
+    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+        columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
         for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
             start = lane["table"][PACKED.index(name), 0] // 8
             lane["memory"][start : start + len(values)] = values

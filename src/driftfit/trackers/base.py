@@ -12,6 +12,7 @@ from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import Settings
+from driftfit.trackers.each import roots
 
 
 class RandomWalk(NamedTuple):
@@ -27,6 +28,8 @@ class RandomWalk(NamedTuple):
     """(n, n), or None where nothing is known before the first sample."""
     at_first_sample: bool = False
     """Whether the prior holds at the first sample, with no drift before it."""
+    slopes: bool = False
+    """Whether it is the slope of theta that walks, so that theta_t = theta_{t-1} + dt slope_t."""
 
 
 class Tracker(Settings, ABC):
@@ -48,6 +51,8 @@ class Tracker(Settings, ABC):
     outputs: ClassVar[tuple[str, ...]] = ()
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
+    drift_each: ClassVar[bool] = False
+    """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
 
@@ -87,17 +92,22 @@ class Tracker(Settings, ABC):
             "track with FLS or Kalman."
         )
 
-    def beside(self, T: int, prob: Any, drift: Any) -> Array:
+    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
+        if prob is None and drift is not None and self.drift_each:
+            return roots(type(self).__name__, self.names_for(model), T, drift)
         given = "prob" if prob is not None else f"drift of shape {np.shape(drift)}"
         raise ValueError(
             f"{type(self).__name__} has one hypothesis and takes drift of shape (T,), but got {given}; prob= and a "
-            "drift for each change are for a Bank."
+            "drift for each change are for a Bank, a drift for each parameter is for FLS and Kalman."
         )
 
-    def tell(self, lane: Mapping[str, Array], prob: Any, drift: Any) -> None:
+    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         """What is known of the next sample of a stream; None is what holds otherwise."""
-        self.beside(1, prob, drift)
+        if prob is None and drift is None:
+            lane["each"][:] = 1.0
+        else:
+            lane["each"][:] = self.beside(model, 1, prob, np.asarray(drift)[None])[0]
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         """Add variances p (n,), in squared units of theta, to the covariance in the fields of one lane.

@@ -26,14 +26,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.kernel import State, kernel
+from driftfit.kernel import Array, State, kernel
 from driftfit.models.base import Model
 from driftfit.models.basis import PiecewiseLinear
+from driftfit.models.block_memory import MINIMAL
 from driftfit.models.block_products import Structure
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.models.hammerstein_wiener_steps import MINIMAL
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.each import told
 from driftfit.trackers.kalman import drift, drift_matrix
 
 
@@ -52,11 +53,11 @@ def structure_of(owner: str, model: Model) -> Structure:
     return structure
 
 
-def minimal_cells(model: Model) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The cells of the model with the mark that theta is xi."""
-    cells = np.array(model.memory()["cells"])
-    cells[MINIMAL] = 1.0
-    return cells
+def minimal_memory(model: Model) -> Array:
+    """The memory of the model with the mark that theta is xi."""
+    blocks = np.array(model.memory()["blocks"])
+    blocks[MINIMAL] = 1.0
+    return blocks
 
 
 @lru_cache
@@ -136,7 +137,7 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
         s.e[l] = e
         s.s[l] = v
 
-    return TrackerSteps(drift_matrix if together else drift, correct)
+    return TrackerSteps(drift_matrix if together else drift, correct, told=told)
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,7 @@ class ExtendedKalman(Tracker):
     inflation: float = 0.0
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.q is not None:
@@ -194,6 +196,7 @@ class ExtendedKalman(Tracker):
             "r": self.r,
             "inflation": self.inflation,
             "g": np.zeros(n),
+            "each": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
         }
@@ -204,7 +207,7 @@ class ExtendedKalman(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("ExtendedKalman", model)
-        return {**self.state(structure.n_x), "cells": minimal_cells(model)}
+        return {**self.state(structure.n_x), "blocks": minimal_memory(model)}
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)

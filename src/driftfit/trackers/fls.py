@@ -3,9 +3,11 @@
 At every t it gives the last point of the path that minimises
 
     J = sum_k w_k (y_k - phi_k' theta_k)^2 + sum_k (theta_{k+1} - theta_k)' D_k (theta_{k+1} - theta_k) + prior
-    D_k = diag(mu) / (dt_{k+1} d_{k+1}),   k <= t
+    D_k = diag(mu / d_{k+1}) / dt_{k+1},   k <= t
 
-with w the weight of a sample, dt the interval since the last one and d a known factor of the drift, 1 unless given.
+with w the weight of a sample, dt the interval since the last one and d known factors of the drift, one number or one
+for each parameter, 1 unless given: ``track(.., drift=1 / mu)`` of `FLS(1.0)` has a mu of its own for every step and
+parameter (``drift[0]`` stands before the first sample and is not used).
 
     predict   P <- P + D^-1                                          (not before the first sample)
     correct   e = y - phi' theta;  s = phi' P phi + 1 / w;  K = P phi / s
@@ -32,11 +34,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import State, kernel
+from driftfit.kernel import Array, State, kernel
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, plain, vector
+from driftfit.trackers import second_differences
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.each import told
 from driftfit.trackers.rls import correct, learn_scale
 
 
@@ -45,7 +49,7 @@ def drift(s: State, l: int) -> None:
     """Between samples only: the prior stands at the first one."""
     time = s.dt[l] * s.drift[l] * s.begun[l]
     for i in range(s.theta.shape[0]):
-        s.P[i, i, l] += s.q[i, l] * time
+        s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
 
 
@@ -64,6 +68,11 @@ def price(mu: Any) -> Any:
         array = np.asarray(mu, dtype=float)
     except (TypeError, ValueError):
         raise ValueError(f"FLS: mu must be numeric; got {mu!r}.") from None
+    if array.ndim == 2 and array.size and (array > 0.0).all():
+        raise ValueError(
+            f"FLS: mu must be one number or one per parameter; got shape {array.shape}. A mu for every step goes with "
+            "the record: FLS(1.0) and track(.., drift=1 / mu), drift being (T, n) with the steps in rows 1 to T - 1."
+        )
     if array.ndim > 1 or not (array > 0.0).all():
         raise ValueError(
             f"FLS: mu must be positive, one number or one per parameter (inf keeps a parameter constant); got {mu!r}."
@@ -84,18 +93,23 @@ class FLS(Tracker):
         Mean of theta at the first sample; without p0 it stands only in directions that the regressors never span.
     p0 : number, (n,), (n, n), or None
         Covariance of theta at the first sample, in units of the noise variance. None: nothing is known.
+    differences : 1 or 2
+        2 prices changes of the slope, theta_{k+1} - 2 theta_k + theta_{k-1}, in the place of changes of theta, so that
+        a straight line costs nothing (`driftfit.trackers.second_differences`); it starts from no knowledge.
 
     Raises
     ------
     ValueError
-        If mu is not positive or p0 is not a covariance.
+        If mu is not positive, p0 is not a covariance, or differences is neither 1 nor 2 or comes with p0.
     """
 
     mu: Any = None
     theta0: Any = 0.0
     p0: Any = None
+    differences: int = 1
 
     required: ClassVar[tuple[str, ...]] = ("mu",)
+    drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.mu is not None:
@@ -103,14 +117,22 @@ class FLS(Tracker):
         self._set("theta0", numbers("FLS", "theta0", self.theta0))
         if self.p0 is not None:
             self._set("p0", covariance("FLS", "p0", self.p0))
+        if self.differences not in (1, 2):
+            raise ValueError(f"FLS: differences must be 1 or 2; got {self.differences!r}.")
+        if self.differences == 2 and self.p0 is not None:
+            raise ValueError("FLS: p0 says nothing of the slope; with differences=2 leave it None (nothing is known).")
 
     def state(self, n: int) -> Mapping[str, Any]:
+        mu, theta0 = vector("FLS", "mu", self.mu, n), vector("FLS", "theta0", self.theta0, n)
+        if self.differences == 2:
+            return second_differences.state(mu, theta0)
         return {
-            "theta": vector("FLS", "theta0", self.theta0, n),
+            "theta": theta0,
             "P": np.zeros((n, n)) if self.p0 is None else matrix("FLS", "p0", self.p0, n),
-            "q": 1.0 / vector("FLS", "mu", self.mu, n),
+            "q": 1.0 / mu,
             "r": 1.0,
             "g": np.zeros(n),
+            "each": np.ones(n),
             "begun": 0.0,
             "squares": 0.0,
             "count": 0.0,
@@ -120,13 +142,22 @@ class FLS(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return STEPS
+        return second_differences.STEPS if self.differences == 2 else STEPS
+
+    def cov(self, lane: Mapping[str, Array]) -> Array:
+        n = len(lane["theta"])
+        return super().cov({**lane, "P": lane["P"][:n, :n]})
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        n = len(p)
+        super().widen({**lane, "P": lane["P"][:n, :n]}, p)
 
     def random_walk(self, model: Model) -> RandomWalk:
         n = model.n
         p0 = None if self.p0 is None else matrix("FLS", "p0", self.p0, n)
         q = np.diag(1.0 / vector("FLS", "mu", self.mu, n))
-        return RandomWalk(q, None, vector("FLS", "theta0", self.theta0, n), p0, at_first_sample=True)
+        theta0 = vector("FLS", "theta0", self.theta0, n)
+        return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told)

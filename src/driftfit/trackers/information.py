@@ -71,6 +71,18 @@ def spread(S: Array, d: Array, G: Array, size: float, pivot: Array, l: int) -> N
 
 
 @kernel
+def shear(S: Array, time: float, l: int) -> None:
+    """S <- S [[1, time], [0, 1]], which leaves a triangle a triangle.
+
+    With x = (level, slope): what S says of (level + time slope, slope) it then says of x.
+    """
+    half = S.shape[0] // 2
+    for i in range(S.shape[0]):
+        for j in range(half):
+            S[i, half + j, l] += time * S[i, j, l]
+
+
+@kernel
 def solve(S: Array, d: Array, x: Array, l: int) -> None:
     """x = S^-1 d."""
     n = S.shape[0]

@@ -2,11 +2,11 @@
 
     theta_t = theta_{t-1} + w_t,  w ~ N(0, q);    y_t = phi_t' theta_t + v_t,  v ~ N(0, r)
 
-    predict   P <- P + q dt d
+    predict   P <- P + q dt d,  or q_ij sqrt(d_i d_j) dt where every parameter has a factor of its own
     correct   e = y - phi' theta;  s = phi' P phi + r / w;  K = P phi / s
               theta <- theta + K e;  P <- P - K (P phi)'
 
-with w the weight of the sample and d a known factor of the drift, both 1 unless given.
+with w the weight of the sample and d known factors of the drift, 1 unless given.
 
 Use it when the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` carries no
 covariance. Without excitation P grows by exactly q per sample: finite and honest.
@@ -33,13 +33,14 @@ from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers import square_root
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.each import told
 
 
 @kernel
 def drift(s: State, l: int) -> None:
     time = s.dt[l] * s.drift[l]
     for i in range(s.theta.shape[0]):
-        s.P[i, i, l] += s.q[i, l] * time
+        s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
 
 
 @kernel
@@ -47,7 +48,7 @@ def drift_matrix(s: State, l: int) -> None:
     time = s.dt[l] * s.drift[l]
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
-            s.P[i, j, l] += s.q[i, j, l] * time
+            s.P[i, j, l] += s.q[i, j, l] * (s.each[i, l] * s.each[j, l]) * time
 
 
 def _steps(predict: Any) -> TrackerSteps:
@@ -57,7 +58,7 @@ def _steps(predict: Any) -> TrackerSteps:
         enter(s, l)
         spanned_variance(s, l)
 
-    return TrackerSteps(predict, measurement, diagonal, begin)
+    return TrackerSteps(predict, measurement, diagonal, begin, told=told)
 
 
 INDEPENDENT, TOGETHER = _steps(drift), _steps(drift_matrix)
@@ -95,6 +96,7 @@ class Kalman(Tracker):
     form: str = "covariance"
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.q is not None:
@@ -120,6 +122,7 @@ class Kalman(Tracker):
             "q": matrix("Kalman", "q", self.q, n) if together else vector("Kalman", "q", self.q, n),
             "r": self.r,
             "g": np.zeros(n),
+            "each": np.ones(n),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **(self._root(n) if self.form == "sqrt" else {}),
         }

@@ -24,207 +24,45 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import LARGEST, TrackerSteps
-from driftfit.kernel import Array, State, kernel, shared
+from driftfit.drivers import TrackerSteps
+from driftfit.kernel import Array, State, kernel, nothing
 from driftfit.models.base import Model
 from driftfit.models.basis import PiecewiseLinear
-from driftfit.models.curves import Curves
+from driftfit.models.block_memory import PREDICTED
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.models.hammerstein_wiener_steps import GIVEN, HIGHEST, LOWEST, PREDICTED, RAW, STARTED, inverse_of
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.extended_kalman import minimal_cells, structure_of
-
-FLATTEST = 0.05
-"""Least slope of F that the filter divides by."""
-REACH = 3.0
-"""Times the largest w of the outputs seen: w is held within that."""
-FARTHEST = 1e6
-"""The same before any output was seen."""
-LARGEST_VARIANCE = 1e20
-"""Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
-
-
-@shared
-def past_levels(theta: Array, g_lag: Array, orders: tuple[int, int, int, int], w: Array, S: Array, p_w: float) -> None:
-    """w = F(y) at the last outputs, each of variance p_w."""
-    na, nb, n_in, n_out = orders
-    x_d = na + nb + n_in - 1
-    for i in range(na):
-        total = g_lag[0, i]
-        for k in range(1, n_out):
-            total += theta[x_d + k - 1] * g_lag[k, i]
-        w[i] = total if total == total else 0.0
-        S[i, i] = p_w
-
-
-@shared
-def advance(
-    theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, orders: tuple[int, int, int, int],
-    q_w: float, reach: float,
-) -> None:  # fmt: skip
-    """The time update of w and of S, the covariance of [w, xi]."""
-    na, nb, n_in, n_out = orders
-    n_w, N = w.shape[0], S.shape[0]
-    at_bc = na + nb + n_out - 1
-    x_c = n_w + na + nb
-    total = 0.0
-    for i in range(N):
-        row[i] = 0.0
-    for i in range(na):
-        row[i] = -theta[i]
-        row[n_w + i] = -w[i]
-        total -= theta[i] * w[i]
-    for j in range(nb):
-        v = -phi[na + j]
-        for k in range(n_in - 1):
-            f = -phi[at_bc + k * nb + j]
-            v += theta[na + nb + k] * f
-            row[x_c + k] += theta[na + j] * f
-        row[n_w + na + j] = v
-        total += theta[na + j] * v
-    for x in range(x_c + n_in - 1 + n_out - 1, N):
-        row[x] = -1.0
-        total -= theta[x - n_w]
-    for x in range(N):
-        value = 0.0
-        for z in range(N):
-            value += S[x, z] * row[z]
-        moved[x] = value
-    own = q_w
-    for x in range(N):
-        own += row[x] * moved[x]
-    for i in range(n_w - 1, 0, -1):
-        w[i] = w[i - 1]
-        for j in range(i, 0, -1):
-            S[i, j] = S[i - 1, j - 1]
-            S[j, i] = S[i, j]
-        for x in range(n_w, N):
-            S[i, x] = S[i - 1, x]
-            S[x, i] = S[i, x]
-    for i in range(1, n_w):
-        S[0, i] = moved[i - 1]
-        S[i, 0] = S[0, i]
-    for x in range(n_w, N):
-        S[0, x] = moved[x]
-        S[x, 0] = S[0, x]
-    S[0, 0] = own
-    if own > LARGEST_VARIANCE:
-        shrink = np.sqrt(LARGEST_VARIANCE / own)
-        for x in range(N):
-            S[0, x] *= shrink
-            S[x, 0] = S[0, x]
-        S[0, 0] = LARGEST_VARIANCE
-    w[0] = min(max(total, -reach), reach)
-
-
-@shared
-def absorb(
-    e: float, slope: float, g: Array, r: float, ok: float, theta: Array, w: Array, S: Array, row: Array, moved: Array,
-    at_d: int,
-) -> float:  # fmt: skip
-    """The measurement update; returns the variance of the innovation."""
-    n_w, N, n_out = w.shape[0], S.shape[0], g.shape[0]
-    for x in range(N):
-        row[x] = 0.0
-    row[0] = 1.0 / slope
-    for k in range(1, n_out):
-        row[n_w + at_d + k - 1] = -g[k] / slope
-    s = r
-    for x in range(N):
-        value = 0.0
-        for z in range(N):
-            value += S[x, z] * row[z]
-        moved[x] = value
-    for x in range(N):
-        s += row[x] * moved[x]
-    if ok > 0.0:
-        for x in range(N):
-            k = moved[x] / s
-            if x < n_w:
-                w[x] += k * e
-            else:
-                theta[x - n_w] += k * e
-            for z in range(x + 1):
-                S[x, z] -= k * moved[z]
-                S[z, x] = S[x, z]
-    return s
+from driftfit.trackers.extended_kalman import minimal_memory, structure_of
+from driftfit.trackers.output_error_machine import (
+    OK,
+    P_W,
+    Q_W,
+    S2,
+    SEEN,
+    SIZE,
+    TIME,
+    V_POWER,
+    VALID,
+    E,
+    R,
+    output_error,
+)
 
 
 @lru_cache
-def _steps(orders: tuple[int, int, int, int], nk: int, out: Curves, linear: bool) -> TrackerSteps:
-    na, nb, n_in, n_out = orders
-    inverse, values, slopes = inverse_of(out), out.values, out.slopes
-    at_d = na + nb + n_in - 1
-
-    @kernel
-    def predict(s: State, l: int) -> None:
-        time = s.dt[l] * s.drift[l]
-        n_w = s.w.shape[0]
-        for i in range(s.theta.shape[0]):
-            for j in range(s.theta.shape[0]):
-                s.S[n_w + i, n_w + j, l] += s.q[i, j, l] * time
-
+def _steps(machine: Any) -> TrackerSteps:
     @kernel
     def correct(s: State, l: int) -> None:
-        known = 1.0
-        power = 0.0
-        for j in range(nb):
-            for k in range(n_in):
-                known = known if abs(s.f_lag[k, nk + j, l]) < LARGEST else 0.0
-            power += s.theta[na + j, l] * s.theta[na + j, l]
-        if s.begun[l] == 0 and s.cells[STARTED, l] > 0.0:
-            past_levels(s.theta[:, l], s.g_lag[:, :, l], orders, s.w[:, l], s.S[:, :, l], s.p_w[l])
-            s.begun[l] = 1
-        low, high = s.cells[LOWEST, l], s.cells[HIGHEST, l]
-        if not linear:
-            low, high = s.level[0, l], s.level[s.level.shape[0] - 1, l]
-        reach = REACH * max(abs(low), abs(high))
-        reach = reach if 0.0 < reach < np.inf else FARTHEST
-        noise = s.q_w[l] + (0.0 if known > 0.0 else power * s.v_power[l])
-        advance(s.theta[:, l], s.phi[:, l], s.w[:, l], s.S[:, :, l], s.row[:, l], s.moved[:, l], orders, noise, reach)
-        for k in range(n_out - 1):
-            s.d_now[k + 1, l] = s.theta[at_d + k, l]
-        y_hat = s.w[0, l]
-        if not linear:
-            y_hat = inverse(
-                s.w[0, l], s.g_hat[:, l], s.h_hat[:, l], s.d_now[:, l], s.out[:, l], s.curve[:, :, l], s.level[:, l],
-                s.cells[:, l],
-            )  # fmt: skip
-        y = s.cells[RAW, l]
-        able = abs(y_hat) < np.inf
-        values(y_hat if able else 0.0, s.out[:, l], s.g_hat[:, l])
-        slopes(y_hat if able else 0.0, s.out[:, l], s.h_hat[:, l])
-        slope = 0.0
-        for k in range(n_out):
-            slope += s.d_now[k, l] * s.h_hat[k, l]
-        slope = max(slope, FLATTEST)
-        s.valid[l] = 1.0 if known > 0.0 and able and s.begun[l] > 0 else 0.0
-        used = s.valid[l] > 0.0 and abs(y) < np.inf and s.cells[GIVEN, l] < np.inf
-        s.seen[l] = 1.0 if abs(y) < np.inf else 0.0
-        s.ok[l] = 1.0 if used else 0.0
-        s.e[l] = y - y_hat if used else 0.0
-        s.s[l] = absorb(
-            s.e[l], slope, s.g_hat[:, l], s.r[l] * s.cells[GIVEN, l] if used else s.r[l], s.ok[l], s.theta[:, l],
-            s.w[:, l], s.S[:, :, l], s.row[:, l], s.moved[:, l], at_d,
+        s.own[TIME, l] = s.dt[l] * s.drift[l]
+        machine(
+            s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data,
+            s.w.ctypes.data, s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
+            s.theta.shape[0], s.phi.shape[0],
         )  # fmt: skip
-        s.y_hat[l] = y_hat
-        s.cells[PREDICTED, l] = y_hat
-        v = 0.0
-        for k in range(n_in):
-            c = s.theta[na + nb + k - 1, l] if k > 0 else 1.0
-            v += c * s.f_lag[k, 0, l]
-        s.v_power[l] += 0.01 * (v * v - s.v_power[l]) if abs(v) < 1e6 else 0.0
+        s.valid[l], s.seen[l], s.ok[l] = s.own[VALID, l], s.own[SEEN, l], s.own[OK, l]
+        s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
 
-    @kernel
-    def report(s: State, l: int) -> None:
-        n_w = s.w.shape[0]
-        for i in range(s.theta.shape[0]):
-            for j in range(i + 1):
-                s.P[i, j, l] = s.S[n_w + i, n_w + j, l]
-            s.var[i, l] = s.P[i, i, l]
-
-    return TrackerSteps(predict, correct, report)
+    return TrackerSteps(nothing, correct)
 
 
 @dataclass(frozen=True)
@@ -276,12 +114,14 @@ class OutputError(Tracker):
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The part of the state that depends on the number n of minimal parameters alone."""
+        own = np.zeros(SIZE)
+        own[[R, Q_W, P_W, V_POWER]] = self.r, self.q_w, self.p_w, 1.0
         return {
             "theta": vector("OutputError", "theta0", self.theta0, n),
             "P": matrix("OutputError", "p0", self.p0, n),
             "q": matrix("OutputError", "q", self.q, n),
-            "r": self.r, "q_w": self.q_w, "p_w": self.p_w, "v_power": 1.0, "begun": 0, "var": np.zeros(n),
-        }  # fmt: skip
+            "own": own,
+        }
 
     @property
     def steps(self) -> TrackerSteps:
@@ -289,20 +129,21 @@ class OutputError(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("OutputError", model)
-        n_w, n_out = max(structure.na, 1), structure.n_out
+        n_w = max(structure.na, 1)
         N = n_w + structure.n_x
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {
-            **self.state(structure.n_x), "cells": minimal_cells(model), "w": np.zeros(n_w), "S": S,
-            "row": np.zeros(N), "moved": np.zeros(N), "g_hat": np.zeros(n_out), "h_hat": np.zeros(n_out),
+            **self.state(structure.n_x), "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
+            "scratch": np.zeros(2 * N),
         }  # fmt: skip
 
     def steps_for(self, model: Model) -> TrackerSteps:
-        structure = structure_of("OutputError", model)
+        structure_of("OutputError", model)
         assert isinstance(model, HammersteinWiener)
-        orders = (structure.na, structure.nb, structure.n_in, structure.n_out)
-        return _steps(orders, model.nk, model.out.curves, model.linear)
+        machine = output_error(model.out.evaluate, model.places)
+        machine.load()
+        return _steps(machine)
 
     def names_for(self, model: Model) -> tuple[str, ...]:
         return structure_of("OutputError", model).minimal_names

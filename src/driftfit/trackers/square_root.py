@@ -1,6 +1,6 @@
 """The Kalman filter of a random walk on square roots of information: positive by construction.
 
-    predict   theta <- theta + G w sqrt(dt d), G G' = q           spread
+    predict   theta <- theta + diag(d)^(1/2) G w sqrt(dt), G G' = q    spread
     correct   (phi' theta = y) / sqrt(r / w)                      absorb;  theta = S^-1 d,  P = S^-1 S^-T
               s = |S^-T phi|^2 + r / w,  e = y - phi' theta       with S before the sample
 
@@ -21,6 +21,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel
 from driftfit.trackers.diffuse import enter, prediction, spanned_variance
+from driftfit.trackers.each import told
 from driftfit.trackers.information import absorb, invert, solve, spread, triangular_root
 
 
@@ -31,14 +32,18 @@ def state(q: Array, theta0: Array, p0: Array | None) -> Mapping[str, Any]:
     n = len(theta0)
     S = np.zeros((n, n)) if p0 is None else linalg.solve_triangular(triangular_root(p0), np.eye(n))
     return {
-        "S": S, "d": S @ theta0, "R": np.zeros((n, n)), "G": triangular_root(q),
+        "S": S, "d": S @ theta0, "R": np.zeros((n, n)), "G": triangular_root(q), "H": np.zeros((n, n)),
         "row": np.zeros(n), "pivot": np.zeros(n), "x": np.zeros(n),
     }  # fmt: skip
 
 
 @kernel
 def grow(s: State, l: int) -> None:
-    spread(s.S, s.d, s.G, np.sqrt(s.dt[l] * s.drift[l]), s.pivot, l)
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            s.H[i, j, l] = s.each[i, l] * s.G[i, j, l]
+    spread(s.S, s.d, s.H, np.sqrt(s.dt[l] * s.drift[l]), s.pivot, l)
 
 
 @kernel
@@ -100,4 +105,4 @@ def steps(drift: Any) -> TrackerSteps:
             read_out(s, l)
             diagonal(s, l)
 
-    return TrackerSteps(grow, correct, diagonal, begin)
+    return TrackerSteps(grow, correct, diagonal, begin, told=told)

@@ -11,7 +11,7 @@ from the settings that it was left without:
 
 p_i is the mean square of regressor i, s their sum, v the variance that a constant theta leaves. A group shares one
 drift *as it is seen in the output*, so no unit of the data matters. T samples cannot tell a drift below 1 / T^2 from
-none.
+none (of slopes: 1 / T^4).
 """
 
 from __future__ import annotations
@@ -108,9 +108,10 @@ def constant(record: Record, tracker: Any) -> Tracker:
     return Kalman(q=(0.0,) * n, r=1.0)
 
 
-def _range(record: Record, bounds: Bounds, p: int) -> tuple[Array, Array]:
-    """Ends of log10 mu, (p,) each."""
-    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * np.log10(len(record.y))))
+def _range(record: Record, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
+    """Ends of log10 mu, (p,) each; a drift of slopes adds up twice over the record."""
+    times = getattr(tracker, "differences", 1)
+    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(record.y))))
     return np.full(p, low), np.full(p, high)
 
 
@@ -130,7 +131,7 @@ def _weight(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     power, _ = still(record, constant(record, tracker))
     group = members(names, groups)
     share = np.full(len(names), power.sum()) if groups is None else np.where(power > 0.0, power, power.max())
-    low, high = _range(record, bounds, int(group.max()) + 1)
+    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
 
     def each(x: Array) -> Array:
         return np.asarray(10.0 ** x[group] * share)
@@ -153,7 +154,7 @@ def _drift(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
         power = np.full(len(names), power.sum())
     group = members(names, groups)
     share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
-    low, high = _range(record, bounds, int(group.max()) + 1)
+    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
     low, high = -high, -low
     own_r = tracker.r is None and tracker.p0 is not None
     profiled = tracker.r is None and not own_r

@@ -62,8 +62,7 @@ def _smoothed_score(record: Record, tracker: Tracker, method: str) -> float:
     weight = path.walk.weight
     used = weight > 0.0
     if method == "loo":
-        terms = weight * path.loo**2
-        value = float(np.mean(terms[np.isfinite(terms)])) if np.isfinite(terms).any() else np.inf
+        value = path.press
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
             value = float(path.measurement_cost / used.sum() / np.mean(1.0 - path.leverage[used]) ** 2)

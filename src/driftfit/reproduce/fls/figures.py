@@ -69,6 +69,7 @@ def outputs(records: list[Simulated], found: list[Fit], title: str) -> Figure:
     signal.plot(d.y - fit.one_step, color=BLUE, lw=1.1, label="one-step prediction")
     signal.plot(after, color=RED, lw=0.8, ls="--", label="a posteriori")
     figure.suptitle(title, fontsize=9)
+    signal.set_ylabel("y")
     signal.legend(**ABOVE)
     one_step = np.stack([each.one_step for each in found])
     _view(signal, np.stack([d.y, d.y - fit.one_step]))

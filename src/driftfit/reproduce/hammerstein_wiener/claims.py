@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from driftfit.reproduce.hammerstein_wiener.runs import CLOSE, PAPER
-from driftfit.reproduce.hammerstein_wiener.tables import Found, arrivals, end, gains, values
+from driftfit.reproduce.hammerstein_wiener.tables import Found, arrivals, end, gains, total, values
 from driftfit.systems.hammerstein_wiener import WALK, example
 from driftfit.track import track
 
@@ -93,8 +93,8 @@ def noise(found: Found) -> Claim:
 
 def order(found: Found) -> Claim:
     """Example 4."""
-    raw = ", ".join(f"{end([r.a + r.b + r.p for r in paths]):.2f} (q = {q})" for q, paths in found.raw.items())
-    share = max(end([r.b for r in paths]) / end([r.a + r.b + r.p for r in paths]) for paths in found.raw.values())
+    raw = ", ".join(f"{total(paths):.2f} (q = {q})" for q, paths in found.raw.items())
+    share = max(end([r.b for r in paths]) / total(paths) for paths in found.raw.values())
     return Claim(
         "A higher order is more accurate (example 4)",
         "we could not reproduce it with raw powers",

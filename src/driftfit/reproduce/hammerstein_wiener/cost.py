@@ -33,11 +33,13 @@ def least(function: Callable[[], object], samples: int) -> float:
     return 1e9 * min(times) / samples
 
 
-def measure(samples: int = 5000) -> dict[tuple[int, ...], dict[str, float]]:
+def measure(
+    samples: int = 5000, orders: tuple[tuple[int, int, int, int], ...] = ORDERS
+) -> dict[tuple[int, ...], dict[str, float]]:
     """ns a sample, the least of five, for (na, nb, n_in, n_out); the last order without its filter step."""
     found: dict[tuple[int, ...], dict[str, float]] = {}
     rng = np.random.default_rng(0)
-    for order in ORDERS:
+    for order in orders:
         na, nb, n_in, n_out = order
         model = HammersteinWiener(na, nb, input=Legendre(n_in, (-4, 4)), output=Legendre(n_out, (-4, 4)))
         y, u = rng.uniform(-3.0, 3.0, (2, samples))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 METHODS = {"average": RED, "svd": BLUE}
+FADED = {"average": 0.5, "svd": 1.0}
 GREEN = "#3a8f4f"
 
 
@@ -63,8 +64,8 @@ def errors(paths: Mapping[str, Array], title: str) -> Figure:
     low, high = np.quantile(settled, (0.001, 0.999))
     axis.set_ylim(0.5 * low, 3.0 * max(high, 1.0))
     axis.set(xlabel="sample", ylabel="error of the parameters")
-    axis.set_title(title, fontsize=9)
-    axis.legend(fontsize=8, frameon=False, loc="upper right")
+    axis.set_title(title, fontsize=9, loc="left")
+    axis.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.0)
     axis.grid(alpha=0.25, lw=0.5)
     return figure
 
@@ -77,7 +78,7 @@ def parameters(s: Simulated, paths: Mapping[str, Array], part: slice, title: str
     for axis, name, i in zip(axes, names, range(part.start, part.stop), strict=True):
         axis.plot(s.xi[:, i], lw=2.6, color=GREY, alpha=0.7, label="true")
         for method, xi in paths.items():
-            axis.plot(xi[:, i], lw=0.6, color=METHODS[method], label=method)
+            axis.plot(xi[:, i], lw=0.6, color=METHODS[method], alpha=FADED[method], label=method)
         shown = np.concatenate([s.xi[:, i], paths["svd"][500:, i]])
         low, high = np.quantile(shown, (0.005, 0.995))
         axis.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))

@@ -12,9 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.blocks.constant import fit_constant
 from driftfit.blocks.free_run import free_run
 from driftfit.blocks.hand_off import hand_off
 from driftfit.blocks.paths import split
+from driftfit.blocks.product_drift import track_products
+from driftfit.blocks.ratios import track_ratios
 from driftfit.kernel import Array
 from driftfit.models.basis import DeadZone, Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -51,27 +54,16 @@ def late(error: Array) -> Errors:
     return Errors(float(np.median(error[-LAST:])), float(np.sqrt(np.mean(error[BURN:] ** 2))))
 
 
+def rms(error: Array) -> float:
+    """Root mean square of the last four thousand samples."""
+    return float(np.sqrt(np.nanmean(error[-4000:] ** 2)))
+
+
 def separated(run: Track, method: str) -> Array:
     """xi by a method, without the warnings that a user gets."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return run.blocks(method).xi
-
-
-def structured(s: Simulated, piece: int = 100) -> Array:
-    """xi by "gls" under Q = J Q_xi J' + eps I, J at the separated xi of the samples before, renewed piece by piece.
-
-    A drift of the products that has the right shape, from one number.
-    """
-    xi, parts, run = s.xi[0], [], None
-    for first in range(0, len(s.y), piece):
-        J = s.model.structure.jacobian(xi)
-        tracker = Kalman(q=WALK**2 * (J @ J.T + 1e-3 * np.eye(len(J))), r=1e-6, p0=1e8, theta0=0.01)
-        part = slice(first, first + piece)
-        run = track(s.model, tracker, s.y[part], s.u[part], keep="cov", warm_start=run)
-        parts.append(separated(run, "gls"))
-        xi = parts[-1][-1]
-    return np.concatenate(parts)
 
 
 def printed(theta: Array) -> Array:
@@ -89,11 +81,11 @@ def first_example(seed: int) -> dict[str, Errors | float]:
     run = track(s.model, PAPER, s.y, s.u)
     methods = ("average", "svd", "svd-joint", "gls")
     found: dict[str, Errors | float] = {m: late(off(separated(run, m), s)) for m in methods}
-    found["structured"] = late(off(structured(s), s))
+    found["structured"] = late(off(track_products(s.model, s.y, s.u, q=WALK**2, r=1e-6, start=s.xi[0]).xi, s))
     found["ekf"] = late(off(track(s.model, FAST, s.y, s.u).theta, s))
     found["printed"] = late(off(printed(run.theta), s))
-    found["one-step"] = float(np.sqrt(np.nanmean((s.y - run.prediction)[-4000:] ** 2)))
-    found["free run"] = float(np.sqrt(np.nanmean((s.y - free_run(run).y)[-4000:] ** 2)))
+    found["one-step"] = rms(s.y - run.prediction)
+    found["free run"] = rms(s.y - free_run(run, "gls").y)
     return found
 
 
@@ -127,11 +119,11 @@ def third_example(seed: int) -> dict[str, Errors | float]:
     run = track(s.model, PAPER, s.y, s.u)
     found |= {f"noisy {m}": late(off(separated(run, m), s)) for m in ("average", "svd-joint")}
     found["noisy start"] = late(off(np.repeat(s.xi[:1], len(s.y), axis=0), s))
-    found["noisy one-step"] = float(np.sqrt(np.nanmean((s.y - run.prediction)[-4000:] ** 2)))
+    found["noisy one-step"] = rms(s.y0 - run.prediction)
     slow = track(s.model, Kalman(q=1e-3, r=1.0, p0=1e8, theta0=0.01), s.y, s.u)
     found["slow svd-joint"] = late(off(separated(slow, "svd-joint"), s))
-    found["slow one-step"] = float(np.sqrt(np.nanmean((s.y - slow.prediction)[-4000:] ** 2)))
-    found["slow free run"] = float(np.sqrt(np.nanmean((s.y0 - free_run(slow).y)[-4000:] ** 2)))
+    found["slow one-step"] = rms(s.y0 - slow.prediction)
+    found["slow free run"] = rms(s.y0 - free_run(slow).y)
     aware = replace(CUBIC, output_noise=s.sigma)
     stage = Kalman(q=4e-6, r=1.0, p0=1e4, theta0=0.01)
     found["aware gls"] = late(off(separated(track(aware, stage, s.y, s.u), "gls"), s))
@@ -186,3 +178,25 @@ def bias(snr_db: float | None, equation_noise: float, seed: int, T: int = 5000) 
     run = track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
     a, b, c, d, _ = split(CUBIC, run.theta[-1:], "svd-joint")
     return float(np.linalg.norm(CUBIC.structure.minimal(a, b, c, d) - s.xi[-1:]))
+
+
+FIXES = ("least squares", "instruments", "instruments, unbiased basis")
+
+
+def fixes(seed: int, T: int = 20_000) -> dict[str, float]:
+    """|xi_hat - xi| on a constant system at 20 dB, by what takes the bias away."""
+    from driftfit.systems.hammerstein_wiener import START, simulate
+
+    groups = (START[name] for name in "abcd")
+    s = simulate(CUBIC, *groups, T=T, rng=np.random.default_rng(seed), snr_db=20.0)
+    fits = (
+        fit_constant(CUBIC, s.y, s.u, rounds=0), fit_constant(CUBIC, s.y, s.u),
+        fit_constant(CUBIC, s.y, s.u, sigma=s.sigma),
+    )  # fmt: skip
+    return {name: float(np.linalg.norm(fit.xi - s.xi[0])) for name, fit in zip(FIXES, fits, strict=True)}
+
+
+def choice(name: str, seed: int, T: int = 2000) -> float:
+    """The ratio q / r that the likelihood of y prefers at the end of a record: without noise, at 30 or 20 dB."""
+    s = example(1, seed, T=T) if name == "noise-free" else example(3, seed, T=T, snr_db=float(name.split()[0]))
+    return float(track_ratios(s.model, s.y, s.u).rho[-1])

@@ -1,0 +1,93 @@
+"""A drift covariance of the shape of products, for stage one: Q = J Q_xi J' + eps I.
+
+    J = dg/dxi at the separated xi,   Q_xi = diag(one variance per group a, b, c, d),   eps = 1e-3 of the largest
+
+When b_j walks, so do all b_j c_k: the drift of theta is far from a multiple of the identity, and four numbers say
+more than a full matrix that nobody knows. J moves with xi, so the record is tracked in pieces, each with J at the end
+of the piece before; the filter goes on where it stood.
+
+Source: the covariance of a product to first order. Cost per sample: that of `Kalman` with a full q.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.kernel import Array
+from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.result import Track
+from driftfit.settings import numbers, whole
+from driftfit.signals import as_inputs, as_output
+from driftfit.track import track
+from driftfit.trackers.kalman import Kalman
+
+FLOOR = 1e-3
+"""eps over the largest variance."""
+
+
+class ProductTrack(NamedTuple):
+    """``xi`` (T, n_x) by generalised least squares, ``theta`` (T, n), and the runs of the pieces."""
+
+    xi: Array
+    theta: Array
+    runs: tuple[Track, ...]
+
+
+def product_drift(model: HammersteinWiener, xi: Array, q: Any) -> Array:
+    """Q (n, n) at xi (n_x,), for one variance q, or four: those of a, b, c and d per nominal sample."""
+    given = numbers("product_drift", "q", q, low=0.0)
+    four = given if isinstance(given, tuple) else (given,) * 4
+    if len(four) != 4:
+        raise ValueError(f"product_drift: q is one variance, or those of a, b, c and d; got {q!r}.")
+    na, nb, n_in, n_out, intercept = model.structure
+    variances = np.repeat([*four, max(four)], [na, nb, n_in - 1, n_out - 1, int(intercept)])
+    J = model.structure.jacobian(xi)
+    Q: Array = (J * variances) @ J.T + FLOOR * max(four) * np.eye(model.n)
+    return 0.5 * (Q + Q.T)
+
+
+def track_products(
+    model: HammersteinWiener, y: Any, u: Any, *, q: Any, r: float, start: Any = None, p0: float = 1e8,
+    theta0: Any = 0.01, every: int = 100,
+) -> ProductTrack:  # fmt: skip
+    """Track a record with a drift of the shape of products, renewed every so many samples.
+
+    Parameters
+    ----------
+    model : HammersteinWiener
+    y, u : (T,)
+    q : number or four
+        Drift variances of a, b, c and d per sample.
+    r : number
+        Variance of the equation error.
+    start : (n_x,) or None
+        xi for the first piece; None: a first piece with q I.
+    p0, theta0
+        Start of the products.
+
+    Raises
+    ------
+    ValueError
+        For another model, or variances below 0.
+    """
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(f"track_products: takes a HammersteinWiener; got {type(model).__name__}.")
+    whole("track_products", "every", every, 1)
+    output = as_output(y)
+    inputs = as_inputs(u, len(output))
+    xi, run, runs, paths = start, None, [], []
+    for first in range(0, len(output), every):
+        part = slice(first, first + every)
+        Q = float(np.max(q)) * np.eye(model.n) if xi is None else product_drift(model, xi, q)
+        tracker = Kalman(q=Q, r=r, p0=p0, theta0=theta0)
+        with warnings.catch_warnings():  # a piece is too short for what is said about records
+            warnings.simplefilter("ignore", UserWarning)
+            run = track(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
+            paths.append(run.blocks("gls").xi)
+        runs.append(run)
+        last = paths[-1][-1]
+        xi = last if np.isfinite(last).all() else xi
+    return ProductTrack(np.concatenate(paths), np.concatenate([one.theta for one in runs]), tuple(runs))

@@ -1,0 +1,100 @@
+"""Report of many runs: one self-contained page about a fleet, or about the outputs of one record.
+
+The verdict over all of them first, then one table with a row for each, pictures of those that move most clearly, and
+how often each diagnostic is out of bounds. The page has the looks of `driftfit.report`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from html import escape
+from typing import TYPE_CHECKING
+
+from driftfit.judges.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judges.page import READING
+from driftfit.report import PARAMETERS, document, parameter_figure, picture, section, table
+from driftfit.verdict import p_text
+
+if TYPE_CHECKING:
+    from driftfit.result import Track
+
+LISTED = 200
+"""Rows of the table."""
+PICTURED = 4
+"""Runs with pictures."""
+LEVEL = 0.05
+
+MANY = """<p>Each row was judged by itself. Where many are tested some look as if they moved by chance: q is the share
+of false ones among all with a q this small or smaller (false discovery rate).</p>"""
+
+
+def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapping[Hashable, str]) -> str:
+    """The page as text; ``failed`` says why some have no result."""
+    if not runs:
+        raise ValueError("report: there is no run with a result to report on.")
+    said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
+    heading = title or f"{len(runs)} series"
+    samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
+    counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
+    shown = [row for row in said.rows[:PICTURED] if row.drifts] or list(said.rows[:1])
+    return document(
+        heading,
+        [
+            f"<h1>{escape(heading)}</h1>",
+            f'<p class="soft">{escape(counted)}</p>',
+            _verdict(said, health),
+            section("All series", _rows(said, health)),
+            section("Those that move most clearly", "".join(_pictured(row, runs[row.key]) for row in shown)),
+            section("Diagnostics", _health(health)),
+            section("Settings, and what was left out", _settings(runs, failed)),
+            section("How to read this", MANY + READING),
+        ],
+    )
+
+
+def _verdict(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+    out = sum(not one.ok for one in health.of.values())
+    state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
+    return f'<div class="verdict">{lines}</div>'
+
+
+def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+    rows = []
+    for row in said.rows[:LISTED]:
+        out = len(health[row.key].sentences)
+        numbers = (escape(p_text(row.said.p)), escape(p_text(row.q)))
+        errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
+        marked = f'<span class="bad">{out}</span>' if out else "0"
+        rows.append((escape(str(row.key)), escape(row.change), *numbers, *errors, marked))
+    heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
+    more = f" The first {LISTED} of {len(said)}." if len(said) > LISTED else ""
+    return table(f"The clearest first.{more}", heads, rows)
+
+
+def _pictured(row: Judgement, run: Track) -> str:
+    told = escape(" ".join(row.said.sentences))
+    return f"<h3>{escape(str(row.key))}</h3><p>{told}</p>{picture(parameter_figure(run), run, PARAMETERS)}"
+
+
+def _health(health: ManyDiagnoses) -> str:
+    counts = table(
+        "How many are out of bounds.", ("check", "series"), [(name, str(k)) for name, k in health.counts.items()]
+    )
+    worst = [key for key in health.worst[:PICTURED] if not health[key].ok]
+    told = "".join(f"<li><b>{escape(str(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst)
+    return counts + (f"<ul>{told}</ul>" if told else "")
+
+
+def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:
+    from driftfit import __version__
+
+    trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
+    models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
+    pairs = [
+        ("Model", models[0] if len(models) == 1 else f"{len(models)} different ones"),
+        ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
+        ("Without a result", "; ".join(f"{key}: {reason}" for key, reason in list(failed.items())[:20]) or "none"),
+        ("Made by", f"driftfit {__version__}"),
+    ]
+    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"

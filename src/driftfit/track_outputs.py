@@ -1,0 +1,230 @@
+"""Record mode for several outputs: arrays, tables, fleets and grids; see `driftfit.track`."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.drivers import output_type
+from driftfit.joint import drive, joint_tile, taken_over, trackers_of
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.outputs import Outputs
+from driftfit.records import PLAIN, Labels
+from driftfit.result import Track
+from driftfit.settings import one_of
+from driftfit.shared_outputs import Shared, row_model
+from driftfit.signals import as_inputs, as_numbers, factor, intervals, noise_of
+from driftfit.trackers.base import Tracker
+from driftfit.warm import Run, first_interval
+
+
+class Signals(NamedTuple):
+    """A checked record: y (T, ny), u as the user gave it, time (T,) or None, and what is known of every sample."""
+
+    y: Array
+    u: Any
+    time: Array | None
+    gaps: Array
+    """(T,): nominal intervals."""
+    noise: Array
+    """(T, ny): factors of the noise variance."""
+    drift: Array
+    """(T,) or (T, n): factors of the drift."""
+    labels: Labels = PLAIN
+
+
+class OutputsFleet(dict[Hashable, Any]):
+    """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result."""
+
+    def __init__(
+        self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str], by: Sequence[str] = ("series",)
+    ) -> None:
+        super().__init__(runs)
+        self.failed, self.by = dict(failed), tuple(by)
+
+    def __repr__(self) -> str:
+        return f"Records of several outputs: {', '.join(map(repr, self))}"
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """All results as one table, the keys first."""
+        from driftfit.export import outputs_table
+
+        return outputs_table(self, kind)
+
+
+def track_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, data: Any, time: Any, by: Any, dt: Any, weights: Any, drift: Any,
+    units: Any, keep: str, before: Any,
+) -> Any:  # fmt: skip
+    """Follow a model with several outputs; the arguments are those of `track`."""
+    one_of("track", "keep", keep, ("std", "cov"))
+    failed: Mapping[Hashable, str] = {}
+    if units is not None:
+        raise ValueError("track: units= is for single outputs; several outputs carry none.")
+    if data is not None:
+        model, found, failed = of_table(model, y, u, data, time, by, dt, weights, drift)
+    elif by == "row":
+        found = of_rows(model, y, u, time, dt, weights, drift)
+    elif by is not None:
+        raise ValueError(f"track: by={by!r} names a column of a table, so data= is needed; rows are by='row'.")
+    else:
+        found = {0: of_arrays(model, y, u, time, dt, weights, drift)}
+    if by is None and not isinstance(tracker, Sequence):
+        return run_one(model, tracker, found[0], keep, before, dt)
+    if by is None:
+        return OutputsFleet({k: run_one(model, one, found[0], keep, before, dt) for k, one in enumerate(tracker)}, {})
+    if isinstance(tracker, Sequence):
+        raise ValueError("track: a grid of trackers over several outputs is for one record; leave by= out.")
+    if before is not None and not isinstance(before, Mapping):
+        raise ValueError(f"warm_start: with by= it is what such a run gave, from key to record; got {before!r}.")
+    starts = before or {}
+    runs = {key: run_one(model, tracker, one, keep, starts.get(key), dt) for key, one in found.items()}
+    return OutputsFleet(runs, failed, ("series",) if by == "row" else (by,) if isinstance(by, str) else by)
+
+
+def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None, dt: Any) -> Outputs | Shared:
+    """One record."""
+    y, u, time = signals.y, signals.u, signals.time
+    gaps = signals.gaps.copy()
+    if before is not None:
+        gaps[0] *= first_interval(before, None if time is None else time[0], dt)
+    if model.shared:
+        return run_shared(model, tracker, signals._replace(gaps=gaps), keep, before)
+    inputs = as_inputs(u, len(y))
+    bound = model.bind(signals.labels.u or inputs.shape[1])
+    trackers = trackers_of(bound, tracker)
+    starts = taken_over(before, bound, trackers)
+    known = known_of(bound, trackers, signals._replace(gaps=gaps))
+    tile = joint_tile(bound, trackers, starts)
+    out = np.empty(len(y), output_type(tile, trackers[0].outputs, keep_of(keep, trackers[0])))
+    drive(bound, trackers[0].steps_for(bound), keep, tile, y, inputs, known, out)
+    return Outputs(bound, trackers, y, inputs, time, known, out, tile, starts, signals.labels)
+
+
+def keep_of(keep: str, tracker: Tracker) -> str:
+    """What is kept of a tracker that has it."""
+    if keep == "cov" and not tracker.covariance:
+        raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
+    return keep
+
+
+def known_of(model: Model, trackers: Sequence[Tracker], signals: Signals) -> Array:
+    """What the driver is told of every sample, (T, k, ny)."""
+    gaps, noise, drift = signals.gaps, signals.noise, signals.drift
+    T, ny = noise.shape
+    common = np.ones(T) if drift.ndim == 2 else drift
+    known = np.stack([np.repeat(gaps[:, None], ny, axis=1), noise, np.repeat(common[:, None], ny, axis=1)], axis=1)
+    if drift.ndim == 1:
+        return known
+    columns = trackers[0].beside(model, T, None, drift)
+    return np.concatenate([known, np.repeat(columns[:, :, None], ny, axis=2)], axis=1)
+
+
+def run_shared(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None) -> Shared:
+    """Rows of one instant as successive samples between which no time passes."""
+    from driftfit.track import drive as drive_one
+
+    (T, ny), time = signals.y.shape, signals.time
+    regressors = as_numbers("u", signals.u)
+    if regressors.ndim != 3 or regressors.shape[:2] != (T, ny):
+        raise ValueError(
+            f"u must be (T, ny, m) = ({T}, {ny}, m) with shared=True: a row of regressors for each output; "
+            f"got shape {regressors.shape}."
+        )
+    (one,) = trackers_of(model, tracker)
+    rows = row_model(model, one, regressors.shape[2])
+    starts = taken_over(before, rows, (one,))
+    tile = joint_tile(rows, (one,), starts)
+    known = np.moveaxis(known_of(rows, (one,), signals), 1, 2).reshape(T * ny, -1)
+    known[np.arange(T * ny) % ny > 0, 0] = 0.0
+    flat, inputs = np.ascontiguousarray(signals.y.ravel()), np.ascontiguousarray(regressors.reshape(T * ny, -1))
+    out = drive_one(rows, one, tile, flat, inputs, known, keep_of(keep, one))
+    times = None if time is None else np.repeat(time, ny)
+    start = starts[0] if starts else None
+    return Shared(Track(rows, one, flat, inputs, times, known, out, tile, start=start), model, time)
+
+
+def of_arrays(model: Model, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Signals:
+    """A record from arrays."""
+    ny = len(model.outputs)
+    output = as_numbers("y", y)
+    if output.ndim != 2 or output.shape[1] != ny or len(output) == 0:
+        raise ValueError(f"y must be (T, {ny}) for the outputs {', '.join(model.outputs)}; got shape {output.shape}.")
+    T = len(output)
+    axis, gaps = (None, np.ones(T)) if time is None else intervals(time, dt, T)
+    each = as_numbers("drift", drift) if np.ndim(drift) == 2 else None
+    factors = np.broadcast_to(factor("drift", drift, T), T) if each is None else each
+    return Signals(output, u, axis, gaps, noise_of_each(weights, T, ny), factors)
+
+
+def noise_of_each(weights: Any, T: int, ny: int) -> Array:
+    """Factors of the noise variance, (T, ny), from weights: a number, (T,), or (T, ny) for outputs of unlike noise."""
+    given = as_numbers("weights", weights)
+    if given.ndim < 2:
+        return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)
+    if given.shape != (T, ny):
+        raise ValueError(f"weights must be one number, ({T},) or ({T}, {ny}); got shape {given.shape}.")
+    return noise_of(given.ravel(), given.size).reshape(T, ny)
+
+
+def of_rows(model: Model, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> dict[Hashable, Signals]:
+    """Records as the first axis of arrays: y (units, T, ny), u (units, ..), time (T,) or (units, T)."""
+    outputs = as_numbers("y", y)
+    if outputs.ndim != 3:
+        raise ValueError(f'by="row": y must be (units, T, {len(model.outputs)}); got shape {outputs.shape}.')
+    inputs = None if u is None else as_numbers("u", u)
+    if inputs is not None and inputs.shape[:2] != outputs.shape[:2]:
+        raise ValueError(f'by="row": y has shape {outputs.shape}, so u cannot have shape {inputs.shape}.')
+    axes = None if time is None else np.asarray(time)
+    return {
+        k: of_arrays(
+            model, one, None if inputs is None else inputs[k], axes[k] if axes is not None and axes.ndim > 1 else axes,
+            dt, weights, drift,
+        )
+        for k, one in enumerate(outputs)
+    }  # fmt: skip
+
+
+def of_table(
+    model: Model, y: Any, u: Any, data: Any, time: Any, by: Any, dt: Any, weights: Any, drift: Any
+) -> tuple[Model, dict[Hashable, Signals], Mapping[Hashable, str]]:
+    """(the model with its outputs named, a record for each unit, the reasons of units without one) from a table.
+
+    ``y`` lists the columns of the outputs, ``u`` those of the inputs (with shared=True a list for each output).
+    """
+    from driftfit.tables import read_records
+
+    outputs = [y] if isinstance(y, str) else list(y)
+    ny = len(model.outputs)
+    if len(outputs) != ny:
+        raise ValueError(f"track: y must name {ny} columns, one for each output; got {y!r}.")
+    if isinstance(getattr(model, "ny", None), int):
+        model = replace(model, ny=tuple(outputs))  # type: ignore[type-var]
+    inputs = [] if u is None else [u] if isinstance(u, str) else list(u)
+    if model.shared:
+        inputs = [name for row in inputs for name in ([row] if isinstance(row, str) else row)]
+    many = [] if isinstance(weights, str) or np.ndim(weights) == 0 else list(weights)
+    columns = [*outputs[1:], *inputs, *many]
+    records, failed = read_records(data, outputs[0], columns, time, by, dt, 1.0 if many else weights, drift, None)
+    labels = replace(PLAIN, time=records.labels.time, zone=records.labels.zone)
+    found = {}
+    for k, key in enumerate(records.keys):
+        first, rest, axis, known = records.part(k)
+        T, end = len(first), ny - 1 + len(inputs)
+        signals = np.ascontiguousarray(rest[:, ny - 1 : end])
+        known = np.broadcast_to(known, (T, 3))
+        each = rest[:, end:]
+        noise = (
+            noise_of_each(np.where(np.isfinite(each), each, 1.0), T, ny) if many else np.repeat(known[:, 1:2], ny, 1)
+        )
+        rows = slice(int(records.first[k]), int(records.first[k]) + T)
+        factors = known[:, 2].copy() if records.drifts is None else records.drifts[rows]
+        found[key] = Signals(
+            np.column_stack([first, rest[:, : ny - 1]]), signals.reshape(T, ny, -1) if model.shared else signals, axis,
+            known[:, 0].copy(), noise, factors, labels if model.shared else replace(labels, u=tuple(inputs)),
+        )  # fmt: skip
+    return model, found, failed

@@ -1,0 +1,103 @@
+"""Many runs judged at once: false discovery control, the table, the page; outputs of one record."""
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy import stats
+from support import THETA, arx_record
+
+from driftfit import ARX, Kalman, Regression, track
+from driftfit.judges.many import discoveries
+
+K = Kalman(q=1e-4, r=0.01)
+MOVED = (1, 4)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    """Seven series of an ARX(2, 2) system, a gain of two of which doubles, and one that is too short to tell."""
+    T, parts = 300, []
+    for k in range(7):
+        path = np.tile(THETA, (T, 1))
+        path[150:, 2] += 1.0 if k in MOVED else 0.0
+        y, u = arx_record(T, 20 + k, theta=path)
+        length = 20 if k == 6 else T
+        parts.append(pl.DataFrame({"unit": f"<{k}>", "t": np.arange(length), "y": y[:length], "u": u[:length]}))
+    return track(ARX(2, 2), K, "y", "u", data=pl.concat(parts), time="t", by="unit")
+
+
+def test_q_values_are_those_of_benjamini_and_hochberg():
+    p = np.random.default_rng(0).uniform(size=40) ** 2
+    assert discoveries(p) == pytest.approx(stats.false_discovery_control(p))
+    with_gaps = np.insert(p, [3, 17], np.nan)
+    assert discoveries(with_gaps)[~np.isnan(with_gaps)] == pytest.approx(discoveries(p))
+    assert np.isnan(discoveries(with_gaps)[np.isnan(with_gaps)]).all()
+    assert discoveries(np.zeros(0)).shape == (0,)
+
+
+def test_those_that_move_are_found_and_named(fleet):
+    said = fleet.verdict()
+    assert set(said.drifting) == {f"<{k}>" for k in MOVED}
+    assert said["<1>"].moving == ("b1[u]",)
+    assert said["<1>"].said == fleet["<1>"].verdict()
+    assert said["<1>"].pays
+    assert said.rows[-1].key == "<6>"
+    assert "In 2 of 6" in said.sentences[0]
+    assert "1 cannot be tested" in said.sentences[-1]
+    table = said.table
+    assert table["key"][0] in said.drifting
+    assert table.filter(pl.col("drifts"))["moving"].to_list() == ["b1[u]"] * 2
+    assert "b1[u]" in str(said)
+    with pytest.raises(KeyError, match="<9>"):
+        said["<9>"]
+
+
+def test_a_level_is_the_false_discovery_rate(fleet):
+    """Lower levels accuse fewer; the test of one series is not that of the fleet."""
+    strict = fleet.verdict(level=1e-12)
+    assert set(strict.drifting) <= {f"<{k}>" for k in MOVED}
+    for row in fleet.verdict().rows:
+        assert np.isnan(row.q) or row.q >= row.said.p
+
+
+def test_diagnoses_are_counted(fleet):
+    health = fleet.diagnose()
+    assert len(health) == 7
+    assert health["<2>"].checks == fleet["<2>"].diagnose().checks
+    for name, count in health.counts.items():
+        assert count == sum(not health[key][name].ok for key in fleet)
+    assert health.table.height == 7
+    assert "whiteness (p)" in health.table.columns
+    assert "Out of bounds" in str(health)
+    assert health.ok == (sum(health.counts.values()) == 0)
+
+
+def test_page_of_a_fleet(fleet, tmp_path):
+    fleet.report(tmp_path / "fleet.html", "Seven")
+    text = (tmp_path / "fleet.html").read_text()
+    assert text.count("<section>") == text.count("</section>") == 5
+    assert fleet.verdict().sentences[0] in text
+    assert "&lt;1&gt;" in text
+    assert "<h3>&lt;6&gt;" not in text  # pictures only of those that move
+    with pytest.raises(ValueError, match=r"\.html"):
+        fleet.report(tmp_path / "fleet.txt")
+
+
+def test_outputs_of_one_record(tmp_path):
+    rng = np.random.default_rng(3)
+    T = 300
+    u = rng.normal(size=(T, 2))
+    gain = np.where(np.arange(T) < 150, 1.0, 2.0)
+    y = np.column_stack([u @ [1.0, -0.5], gain * u[:, 0]]) + 0.1 * rng.normal(size=(T, 2))
+    run = track(Regression(2, ny=("level", "flow")), K, y, u)
+    said = run.verdict()
+    assert said.drifting == ("flow",)
+    assert run.diagnose()["level"]["noise level"].ok
+    run.report(tmp_path / "outputs.html")
+    assert "flow" in (tmp_path / "outputs.html").read_text()
+    rows = np.stack([u, u[:, ::-1]], axis=1)
+    theta = np.column_stack([np.ones(T), gain])
+    y = np.einsum("toi,ti->to", rows, theta) + 0.1 * rng.normal(size=(T, 2))
+    shared = track(Regression(2, ny=2, shared=True), K, y, rows)
+    assert shared.verdict().drifts
+    shared.report(tmp_path / "shared.html")
