@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import ARX, FLS, RLS, AugmentedFLS, Bank, Change, Kalman, Live, Regression, Sensor, track
+from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.live_outputs import LiveOutputs
 
 NAMES = ["level", "flow"]
@@ -154,9 +154,6 @@ def test_what_does_not_fit_is_named():
         track(Regression(2, ny=2, shared=True), FLS(1.0), z, phi[:, 0])
     with pytest.raises(ValueError, match="carries no covariance"):
         track(Regression(2, ny=2, shared=True), AugmentedFLS(1.0), z, phi)
-    bank = Bank(changes=[Change(q=0.0)], sensors=[Sensor.nominal(r=0.1)], theta0=0.0, p0=1.0)
-    with pytest.raises(ValueError, match="Bank follows one output at a time"):
-        track(ARX(1, 1, ny=2), bank, y, u)
     with pytest.raises(ValueError, match="must be of one kind and form"):
         track(ARX(1, 1, ny=2), {"y1": FLS(1.0), "y2": RLS(0.9)}, y, u)
     with pytest.raises(ValueError, match="trackers were given for level"):
