@@ -141,13 +141,6 @@ def part(function: Callable[..., Any]) -> Any:
     return _compiled(function, cache=True, forceinline=True, **_PLAIN)
 
 
-def named(function: Any, *parts: Any) -> Any:
-    """A function whose place on disk is its own: closures of one name would share an index."""
-    text = "\n".join(str(getattr(one, "identity", one)) for one in parts)
-    function.__qualname__ += "_" + hashlib.sha256(text.encode()).hexdigest()[:12]
-    return function
-
-
 class Outside(types.ExternalFunction):
     """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 

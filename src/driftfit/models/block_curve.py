@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.kernel import Array, core, named, part
+from driftfit.kernel import Array, core, part
 from driftfit.models.block_memory import (
     BEFORE,
     BEND,
@@ -212,7 +212,7 @@ def inverse_of(level_at: Any) -> Any:
                 break
         return y
 
-    return part(named(invert, level_at))
+    return part(invert)
 
 
 @lru_cache
@@ -242,4 +242,4 @@ def laying(values: Any) -> Any:
                     m[bend + i * n_out + k, 0] = m[h + k, 0]
             m[p[REACH], 0] = np.inf
 
-    return part(named(lay, values))
+    return part(lay)

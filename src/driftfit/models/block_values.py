@@ -9,7 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
-from driftfit.kernel import Array, named, part
+from driftfit.kernel import Array, part
 from driftfit.models.block_memory import (
     CURVE,
     D_NOW,
@@ -34,7 +34,7 @@ def values_of(evaluate: Any, numbers: int, following: int, count: int) -> Any:
         base, size = m.ctypes.data, 8 * L
         evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
 
-    found = part(named(values, evaluate, numbers))
+    found = part(values)
     if evaluate is not built_in:
         return found
 
@@ -49,7 +49,7 @@ def values_of(evaluate: Any, numbers: int, following: int, count: int) -> Any:
                 power = power * x
                 m[at + i, 0] = power
 
-    return part(named(powers_first, evaluate, numbers))
+    return part(powers_first)
 
 
 def input_values(evaluate: Any) -> Any:
@@ -76,7 +76,7 @@ def level_of(evaluate: Any) -> Any:
             slope += m[d + k, 0] * m[h + k, 0]
         return value, slope
 
-    found = part(named(at_output, evaluate))
+    found = part(at_output)
     if evaluate is not built_in:
         return found
 
@@ -89,4 +89,4 @@ def level_of(evaluate: Any) -> Any:
             value = value * y + (m[p[D_NOW] + k, 0] if k > 0 else 1.0)
         return value * y, slope * y + value
 
-    return part(named(horner_first, evaluate))
+    return part(horner_first)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, core, floats, kernel, named, outside, part
+from driftfit.kernel import Array, State, core, floats, kernel, outside, part
 from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverse_of, laying
 from driftfit.models.block_memory import (
@@ -220,7 +220,7 @@ def _regress_work(into: Any, out: Any) -> Any:
         m[Y, 0] = -m[g, 0] if seen else np.nan
         m[DT, 0] = m[DT, 0] if m[STARTED, 0] > 0.0 else 0.0
 
-    return part(named(regress_work, into, out))
+    return part(regress_work)
 
 
 @lru_cache
@@ -232,7 +232,7 @@ def _regress(into: Any, out: Any, p: tuple[int, ...], lanes: bool) -> Any:
         stride = L if lanes else 1  # which the compiler knows
         work(floats(blocks, 1, stride), orders, floats(theta, 1, stride), floats(phi, 1, stride))
 
-    return outside(named(machine_regress, lanes, p, into, out))
+    return outside(machine_regress)
 
 
 @lru_cache
@@ -253,7 +253,7 @@ def _push_work(out: Any) -> Any:
         if p[IDENTITY] == 0:
             lay(m, p)
 
-    return part(named(push_work, out))
+    return part(push_work)
 
 
 @lru_cache
@@ -265,7 +265,7 @@ def _push(out: Any, p: tuple[int, ...], lanes: bool) -> Any:
         stride = L if lanes else 1
         work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
 
-    return outside(named(machine_push, lanes, p, out))
+    return outside(machine_push)
 
 
 @lru_cache

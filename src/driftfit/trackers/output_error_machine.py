@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.kernel import Array, core, floats, named, outside
+from driftfit.kernel import Array, core, floats, outside
 from driftfit.models.block_curve import inverse_of, level, rises
 from driftfit.models.block_memory import (
     CURVE,
@@ -223,7 +223,7 @@ def _work(out: Any) -> Any:
             for j in range(i + 1):
                 P[i, j] = S[n_w + i, n_w + j]
 
-    return core(named(output_error_work, out))
+    return core(output_error_work)
 
 
 @lru_cache
@@ -242,4 +242,4 @@ def output_error(out: Any, p: tuple[int, ...]) -> Any:
             floats(scratch, 2, N)[1],
         )  # fmt: skip
 
-    return outside(named(machine_output_error, p, out))
+    return outside(machine_output_error)
