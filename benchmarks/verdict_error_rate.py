@@ -54,7 +54,7 @@ def record(model: str, kind: str, rng: np.random.Generator, T: int, jump: float)
 
 
 def main(records: int = 1000) -> None:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell", width=100)
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell", width=108)
     for head in ("model", "noise", "T", "joint", "named", "no lags", "Hansen", "finds a jump of 0.5"):
         table.add_column(head, justify="left" if head in ("model", "noise") else "right")
     for model in ("regression", "arx"):

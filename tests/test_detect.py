@@ -8,8 +8,9 @@ import pytest
 from scipy import signal, stats
 from support import arx_record
 
-from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
-from driftfit.detect import Alarms, normal_scores
+from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
+from driftfit.detect import Alarms
+from driftfit.judges.alarm_statistics import normal_scores
 from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
 from driftfit.judges.onsets import held, mean_limit, normal_limit, onsets, power_limit
 from driftfit.judges.scale import core
@@ -258,3 +259,10 @@ def test_a_tracker_without_covariance_has_no_band():
     run = track(ARX(2, 2), AugmentedFLS(mu=10.0), *arx_record(400, 1))
     with pytest.raises(ValueError, match="no covariance"):
         run.detect("band", reference={"b1": (0.0, 1.0)})
+
+
+def test_a_calibration_needs_a_model_that_it_can_simulate():
+    y, u = arx_record(200, 1)
+    run = track(HammersteinWiener(1, 1), K, y, u)
+    with pytest.raises(ValueError, match="calibration simulates"):
+        run.detect("innovation", every=100.0, calibrate=True)

@@ -1,14 +1,12 @@
 """Models run forward: outputs of constant systems, bands by drawing, and what cannot be run forward."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from support import arx_record
 
 from driftfit import ARX, ExtendedKalman, Kalman, Regression, track
 from driftfit.judges.draws import ahead_by_draws, drawn, simulate_by_draws
-from driftfit.kernel import Array
+from driftfit.models.base import Model
 from driftfit.models.basis import DeadZone, Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.systems.hammerstein_wiener import simulate
@@ -112,17 +110,17 @@ def test_draws_have_the_covariance_that_is_asked_for():
     assert np.isnan(drawn(np.zeros((1, 2)), np.full((1, 2, 2), np.nan), 3, 0)).all()
 
 
-@dataclass(frozen=True)
-class Squared(Regression):
-    """A model of one's own that does not say how it runs forward."""
-
-    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[float, float]) -> Array:
-        return super().play(theta, y, u, noise, span)
+def test_regressions_are_played_without_memory():
+    rng = np.random.default_rng(0)
+    theta, u, noise = rng.normal(size=(3, 3)), rng.normal(size=(3, 6, 2)), rng.normal(size=(3, 4))
+    got = Regression(2, intercept=True).play(theta, np.zeros((3, 2)), u, noise, (0.0, 0.0))
+    for d in range(3):
+        assert got[d] == pytest.approx(u[d, 2:] @ theta[d, :2] + theta[d, 2] + noise[d])
 
 
 def test_a_model_that_cannot_be_run_forward_says_so():
-    with pytest.raises(ValueError, match="Squared does not say how"):
-        Squared(1).play(np.zeros((1, 1)), np.zeros((1, 0)), np.zeros((1, 3, 1)), np.zeros((1, 3)), (0.0, 1.0))
+    with pytest.raises(ValueError, match="Regression does not say how"):
+        Model.play(Regression(1), np.zeros((1, 1)), np.zeros((1, 0)), np.zeros((1, 3, 1)), np.zeros((1, 3)), (0.0, 1.0))
     y, u = arx_record(200, 3)
     joint = track(ARX(1, 1, ny=2), Kalman(q=0.0, r=0.01), np.column_stack([y, y]), u)
     with pytest.raises(ValueError, match="feed each other"):

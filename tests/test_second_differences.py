@@ -125,6 +125,9 @@ def test_what_two_samples_a_direction_do_not_say_stays_where_theta0_put_it():
     np.testing.assert_allclose(run.theta[:, 1], 4.0, rtol=1e-12)
     assert np.isinf(path.std[:, 1]).all()
     assert np.isfinite(path.std[:, 0]).all()
+    with pytest.raises(ValueError, match=r"does not determine theta2 \(rank 2 of 4\)"):
+        run.smooth(undetermined="raise")
+    assert np.isnan(run.smooth(undetermined="nan").theta[:, 1]).all()
     once = np.zeros((20, 2))
     once[4] = [1.0, 0.0]
     single = track(TWO, FLS(1.0, differences=2), y, once).smooth()

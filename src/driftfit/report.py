@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 LONG = 3000
 """Records longer than this have the points of their pictures as an image inside the SVG."""
 
+SHORT = 12
+"""A table of at most so many rows is not broken over two pages."""
+
 INK = "#1b1b1b"
 """Text and axes while a picture is drawn; becomes the ink of the page."""
 
@@ -142,8 +145,9 @@ def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]])
     """A table; cells are HTML already."""
     top = "".join(f"<th>{head}</th>" for head in heads)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+    short = " short" if len(rows) <= SHORT else ""
     return (
-        f'<div class="wide"><table><caption>{escape(caption)}</caption>'
+        f'<div class="wide{short}"><table><caption>{escape(caption)}</caption>'
         f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 

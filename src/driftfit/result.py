@@ -272,7 +272,7 @@ class Track(Judged):
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see `driftfit.blocks.separate`;
         ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`.
         """
-        from driftfit.blocks.paths import blocks_of
+        from driftfit.blocks.of_run import blocks_of
 
         return blocks_of(self, method, input, output, at)
 

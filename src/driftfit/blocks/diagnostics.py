@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.blocks.paths import blocks_of, covariances
+from driftfit.blocks.of_run import blocks_of, covariances
 from driftfit.kernel import Array
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.settings import whole

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.blocks.paths import Blocks, blocks_of
+from driftfit.blocks.of_run import blocks_of
+from driftfit.blocks.paths import Blocks
 from driftfit.drivers import LARGEST
 from driftfit.kernel import Array
 from driftfit.models.block_curve import FAR, WIDER

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.blocks.paths import blocks_of
+from driftfit.blocks.of_run import blocks_of
 from driftfit.plots import date_axis, frame, new_figure, settled, time_label
 
 if TYPE_CHECKING:

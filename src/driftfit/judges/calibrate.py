@@ -24,6 +24,8 @@ from driftfit.drivers import LARGEST
 from driftfit.judges.onsets import onsets
 from driftfit.judges.scale import core
 from driftfit.kernel import Array
+from driftfit.models.arx import ARX
+from driftfit.models.regression import Regression
 from driftfit.simulate import input_regressors, moved
 from driftfit.track import drive
 
@@ -42,6 +44,11 @@ LATER = 10
 
 def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track]:
     """Runs over simulated records with the parameters of sample ``at``; ValueError for models with other regressors."""
+    if not isinstance(run.model, ARX | Regression) or len(run.model.outputs) > 1:
+        raise ValueError(
+            "detect: a calibration simulates records, which is for ARX and Regression with one output; "
+            f"this run followed {run.model!r}. Give a reference= instead."
+        )
     rng = np.random.default_rng(seed)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     pool, U, theta = residuals(run, na, U), _last_known(U), run.theta[at]

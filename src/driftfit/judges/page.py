@@ -25,7 +25,8 @@ dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; m
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margin: .2rem 0; }
 @media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
   --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } html { font-size: 11px; }
-  figure, tr, li, .verdict { break-inside: avoid; } h2 { break-after: avoid; } main { max-width: none; padding: 0; }
+  figure, tr, li, .verdict, .short { break-inside: avoid; }
+  h2, h3 { break-after: avoid; } main { max-width: none; padding: 0; }
   .wide { overflow: visible; } th, td { white-space: normal; } }
 """
 

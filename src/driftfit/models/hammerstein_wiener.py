@@ -220,7 +220,9 @@ class HammersteinWiener(Model):
         for what, basis, data in (("u", self.into, u[:, 0]), ("y", self.out, y)):
             if basis.n == 1 and not np.isfinite(basis.expected).any():
                 continue
-            seen = data if abs(data.sum()) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
+            with np.errstate(invalid="ignore", over="ignore"):
+                total = float(data.sum())
+            seen = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
             low, high = basis.expected
             outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:

@@ -7,7 +7,7 @@ on its own coefficients is evaluated anew for all lags. The output is predicted 
 
 with `driftfit.models.block_curve`. The steps that drivers are compiled with only hand a lane over to two machines,
 which are compiled once for all trackers: a call of a machine that knows its orders is as fast as code in the midst of a
-driver. With orders at run time one machine would do for all models, but took three times as long a sample.
+driver. With orders at run time one machine would do for all models, but took twice as long a sample.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverse_of, laying
 from driftfit.models.block_memory import (
     ADAPTIVE,
-    CURVE,
     D_NOW,
     DT,
     F_PAST,
@@ -40,14 +39,11 @@ from driftfit.models.block_memory import (
     NB,
     NK,
     OK,
-    OUT,
     PREDICTED,
     RAW,
     SEEN,
     SPARE,
     STARTED,
-    TRIAL,
-    TRIAL_BEND,
     U_PAST,
     VARIANCE,
     N,
@@ -55,80 +51,12 @@ from driftfit.models.block_memory import (
     U,
     Y,
 )
-from driftfit.models.curve_kernels import POWERS
-from driftfit.models.curve_kernels import evaluate as built_in
+from driftfit.models.block_values import input_values, level_of, output_values
 
 INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
 FLOOR = 1e-4
 """Least variance of the equation error under measurement noise."""
-
-
-@lru_cache
-def values_of(evaluate: Any, numbers: int, following: int, count: int) -> Any:
-    """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes."""
-
-    def values(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
-        own, L = p[numbers], m.shape[1]
-        base, size = m.ctypes.data, 8 * L
-        evaluate(x, base + size * own, p[following] - own, base + size * at, base + size * slopes, p[count], L)
-
-    found = part(named(values, evaluate, numbers))
-    if evaluate is not built_in:
-        return found
-
-    def powers_first(m: Array, p: Places, x: float, at: int, slopes: int) -> None:
-        if m[p[numbers], 0] != POWERS:
-            found(m, p, x, at, slopes)
-        else:
-            power, k = 1.0, 0.0
-            for i in range(p[count]):
-                k += 1.0
-                m[slopes + i, 0] = k * power
-                power = power * x
-                m[at + i, 0] = power
-
-    return part(named(powers_first, evaluate, numbers))
-
-
-def input_values(evaluate: Any) -> Any:
-    """Those of the input block."""
-    return values_of(evaluate, INTO, OUT, N_IN)
-
-
-def output_values(evaluate: Any) -> Any:
-    """Those of the output block."""
-    return values_of(evaluate, OUT, CURVE, N_OUT)
-
-
-@lru_cache
-def level_of(evaluate: Any) -> Any:
-    """A part (m, p, y) that says the level of the output block at y, and its slope; it fills trial and trial_bend."""
-    fill_trial = output_values(evaluate)
-
-    def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:
-        n_out, d, g, h = p[N_OUT], p[D_NOW], p[TRIAL], p[TRIAL_BEND]
-        fill_trial(m, p, y, g, h)
-        value, slope = m[g, 0], m[h, 0]
-        for k in range(1, n_out):
-            value += m[d + k, 0] * m[g + k, 0]
-            slope += m[d + k, 0] * m[h + k, 0]
-        return value, slope
-
-    found = part(named(at_output, evaluate))
-    if evaluate is not built_in:
-        return found
-
-    def horner_first(m: Array, p: Places, y: float) -> tuple[float, float]:
-        if m[p[OUT], 0] != POWERS:
-            return found(m, p, y)  # type: ignore[no-any-return]
-        value, slope = 0.0, 0.0
-        for k in range(p[N_OUT] - 1, -1, -1):
-            slope = slope * y + value
-            value = value * y + (m[p[D_NOW] + k, 0] if k > 0 else 1.0)
-        return value * y, slope * y + value
-
-    return part(named(horner_first, evaluate))
 
 
 @part

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import ModelSteps
-from driftfit.kernel import State, kernel, nothing
+from driftfit.kernel import Array, State, kernel, nothing
 from driftfit.models.base import Model
 from driftfit.settings import output_names, whole
 
@@ -97,6 +97,10 @@ class Regression(Model):
     @property
     def steps(self) -> ModelSteps:
         return _steps(self.m, self.intercept)
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        rest = theta[:, -1:] if self.intercept else 0.0
+        return np.asarray(np.sum(u[:, y.shape[1] :] * theta[:, None, : self.m], axis=2) + rest + noise)
 
 
 @lru_cache

@@ -74,8 +74,9 @@ class Smoothed:
             names = ", ".join(
                 name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
             )
+            size = len(run.names) * (2 if len(walk.trend) else 1)
             raise ValueError(
-                f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {len(run.names)}); "
+                f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
                 'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
             )
         if undetermined == "nan":

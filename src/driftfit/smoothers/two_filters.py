@@ -11,7 +11,8 @@ The last rotation leaves rho and the product c of the cosines, which give withou
     residual                y_t - phi_t' theta_t = rho c / sqrt(weight_t)
     with t left out         y_t - phi_t' theta_t(without t) = rho / (c sqrt(weight_t))
 
-It serves every ratio of drift to noise, any prior, zero and singular q, collinear and badly scaled regressors. Both
+It serves every ratio of drift to noise, any prior, zero and singular q, a drift of its own for every parameter and
+sample (rows of G scaled by ``each``), slopes (a shear of S by ``trend``), collinear and badly scaled regressors. Both
 filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), 8 (n + 1) (n + 2) bytes a sample.
 
 Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the rotations

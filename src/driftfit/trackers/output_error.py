@@ -121,6 +121,7 @@ class OutputError(Tracker):
             "P": matrix("OutputError", "p0", self.p0, n),
             "q": matrix("OutputError", "q", self.q, n),
             "own": own,
+            "var": np.zeros(n),
         }
 
     @property
@@ -142,7 +143,8 @@ class OutputError(Tracker):
         structure_of("OutputError", model)
         assert isinstance(model, HammersteinWiener)
         machine = output_error(model.out.evaluate, model.places)
-        machine.load()
+        for one in (model.out.evaluate, machine):  # the machine calls the other
+            one.load()
         return _steps(machine)
 
     def names_for(self, model: Model) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ from driftfit.models.block_memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.hammerstein_wiener_steps import level_of, output_values
+from driftfit.models.block_values import level_of, output_values
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""

@@ -158,7 +158,7 @@ def table(found: Found) -> Table:
     shown.add_section()
     for q, paths in found.raw.items():
         both = " ".join(f"{total(paths, last):.2f}" for last in (2000, 1000))
-        shown.add_row("4", f'raw powers, "average", Er of the last 2000, 1000, q = {q}', both, f"{RAW[q]:g}", "", "")
+        shown.add_row("4", f"raw powers, Er of the last 2000, 1000, q = {q}", both, f"{RAW[q]:g}", "", "")
     for name, reference in (("a", "7e-5"), ("p", "6e-4")):
         ends: list[Array] = [getattr(run, name) for run in found.legendre]
         what = f'Legendre q = 4, "svd", squared error of {name}'
