@@ -59,21 +59,29 @@ GAIN = 0.5
 @kernel
 def gain(s, l):
     return GAIN * s.ok[l]
+
+@kernel
+def twice(x):
+    return 2.0 * x
 """
 
 OWN_FILE = """
 from dataclasses import dataclass
 import numpy as np
 from driftfit.drivers import TrackerSteps, unknown
-from driftfit.kernel import kernel, nothing
+from driftfit.kernel import kernel, nothing, shared
 from driftfit.trackers.base import Tracker
-from own_parts import gain
+from own_parts import gain, twice
+
+@shared
+def same(x):
+    return 0.5 * twice(x)
 
 @kernel
 def correct(s, l):
     s.y_hat[l] = s.theta[0, l] * s.phi[0, l]
     s.e[l] = s.y[l] - s.y_hat[l]
-    s.theta[0, l] += gain(s, l) * s.e[l]
+    s.theta[0, l] += gain(s, l) * same(s.e[l])
 
 @dataclass(frozen=True)
 class Half(Tracker):
@@ -102,7 +110,9 @@ def test_a_second_process_compiles_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "edit", [("GAIN = 0.5", "GAIN = 0.25"), ("s.ok[l]", "s.ok[l] * 0.5")], ids=["constant", "step"]
+    "edit",
+    [("GAIN = 0.5", "GAIN = 0.25"), ("s.ok[l]", "s.ok[l] * 0.5"), ("2.0 * x", "1.0 * x")],
+    ids=["constant", "step", "kept on disk by itself"],
 )
 def test_an_edit_in_another_file_is_seen(tmp_path, edit):
     (tmp_path / "own_tracker.py").write_text(OWN_FILE)

@@ -38,7 +38,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     places[forget.MEAN], places[forget.CAP] = theta0, np.inf
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
-    parents, children = room(max(shape.parents, K // (Hd * Hm)), Hd, Hm)
+    parents, children = _room(max(shape.parents, K // H), Hd, Hm)
     past = -(-W * (H + 1) // WIDTH) * WIDTH
     refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
     return {
@@ -77,11 +77,11 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 
 
-def room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
+def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
     """Columns for leaves and for their children, with room for eights that begin at every block of them."""
     blocks = (parents, parents * Hd, parents * Hd * Hm)
     up = [-(-size // WIDTH) * WIDTH for size in blocks]
-    most = max(blocks[2] - size + whole for size, whole in zip(blocks, up, strict=True))
+    most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
     return up[0], -(-most // WIDTH) * WIDTH
 
 
