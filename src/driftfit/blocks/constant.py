@@ -2,11 +2,13 @@
 
     theta_0  = argmin sum (z_t - phi_t' theta)^2                     biased: phi holds the noisy y
     y_s      = the output simulated with the estimate, from the inputs alone
-    theta    = (sum phi_s,t phi_t')^-1 sum phi_s,t z_t               phi_s from y_s, again and again
+    theta    = (sum phi_s,t phi_t' / R_t)^-1 sum phi_s,t z_t / R_t   phi_s from y_s, again and again
+    R_t      = sum_i a_i^2 F'(y_s,t-i)^2,  a_0 = 1                   what white noise on y makes of the equation
 
 The simulated regressors know nothing of the noise of the record, so that white noise on y no longer biases what is
-linear in y. Powers of y stay biased, as E y^2 = y0^2 + sigma^2; where sigma is known, and the noise Gaussian, Hermite
-polynomials of y have the powers of the clean output as their means,
+linear in y. Weighting by R_t leaves a third of the error that equal weights leave. Powers of y stay biased, as
+E y^2 = y0^2 + sigma^2; where sigma is known, and the noise Gaussian, Hermite polynomials of y have the powers of the
+clean output as their means,
 
     h_1 = y,  h_2 = y^2 - sigma^2,  h_3 = y^3 - 3 sigma^2 y,  h_(k+1) = y h_k - k sigma^2 h_(k-1)
 
@@ -34,7 +36,9 @@ POINTS = 2000
 
 
 class Constant(NamedTuple):
-    """theta (n,) and what it separates into, a, b, c, d; xi (n_x,); and ``y`` (T,), the output simulated with it."""
+    """theta (n,) and what it separates into, a, b, c, d; xi (n_x,); and ``y`` (T,), the output simulated with it, where
+    the output block has the ``slope`` (T,).
+    """
 
     theta: Array
     a: Array
@@ -43,6 +47,7 @@ class Constant(NamedTuple):
     d: Array
     xi: Array
     y: Array
+    slope: Array
 
 
 def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, sigma: float | None = None) -> Constant:
@@ -79,7 +84,7 @@ def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, s
     for _ in range(rounds):
         instruments = regression(model, f, model.out.value(found.y))[0]
         both = used & np.isfinite(instruments).all(axis=1)
-        Z = instruments[both]
+        Z = instruments[both] / noise_of_equation(found)[both, None]
         found = _separated(model, np.linalg.lstsq(Z.T @ phi[both], Z.T @ z[both], rcond=None)[0], f, output)
     return found
 
@@ -105,6 +110,13 @@ def regression(model: HammersteinWiener, f: Array, g: Array) -> tuple[Array, Arr
     return np.stack(columns + ([np.ones(len(g))] if model.intercept else []), axis=1), -g[:, 0]
 
 
+def noise_of_equation(fit: Constant) -> Array:
+    """R_t (T,), and a hundredth of its mean, so that flat places of the output block do not count for everything."""
+    squares = fit.slope**2
+    total = sum(a**2 * np.concatenate([squares[:i], squares[: len(squares) - i]]) for i, a in enumerate((1.0, *fit.a)))
+    return np.asarray(total + 0.01 * np.mean(total))
+
+
 def _late(x: Array, k: int) -> Array:
     return np.concatenate([np.full((k, x.shape[1]), np.nan), x[: max(len(x) - k, 0)]])[: len(x)]
 
@@ -120,4 +132,5 @@ def _separated(model: HammersteinWiener, theta: Array, f: Array, y: Array) -> Co
     grid = np.linspace(seen.min(), seen.max(), POINTS)
     level = np.maximum.accumulate(model.out.value(grid) @ d)
     xi = model.structure.minimal(a, b, c, d, rest[0] if rest is not None else None)
-    return Constant(theta, a, b, c, d, xi, np.interp(w, level, grid))
+    simulated = np.interp(w, level, grid)
+    return Constant(theta, a, b, c, d, xi, simulated, np.interp(simulated, grid, np.gradient(level, grid)))
