@@ -232,8 +232,8 @@ def test_what_is_of_one_output_says_so():
         _ = run.polynomials
     with pytest.raises(AttributeError, match="did you mean prediction"):
         _ = run.predictions
-    with pytest.raises(AttributeError, match=r"run.rows.diagnose"):
-        _ = track(shared, TRACKER, z, phi).diagnose
+    with pytest.raises(AttributeError, match=r"run.rows.detect"):
+        _ = track(shared, TRACKER, z, phi).detect
     assert "FLS(mu=1000.0)" in repr(run)
     with pytest.raises(ValueError, match="takes drift of shape"):
         track(joint, RLS(0.9), y, u, drift=np.ones((80, 3)))

@@ -13,7 +13,6 @@ import numpy as np
 
 from driftfit.hypotheses.forecast import expect, expect_together
 from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
-from driftfit.hypotheses.forget import plain as walks
 from driftfit.hypotheses.grow import grow
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import (
@@ -167,7 +166,7 @@ def advance(
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
     decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lag_prob: Array, theta: Array, cov: Array,
-    na: int, unknown: bool, same: bool, plain: bool,
+    na: int, unknown: bool, same: bool, plain: bool, walks: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
     The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`.
@@ -186,7 +185,9 @@ def advance(
         decided[k, 0] = -1.0
     increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
     settings, maps = maps[: len(Q)], maps[len(Q) :]
-    for_interval(settings, now[IN_DT], maps)
+    Qt, mixed = Qt[: len(Q)], Qt[len(Q)]
+    if not walks:
+        for_interval(settings, now[IN_DT], maps)
 
     # forecast: every leaf with all that may happen to it
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
@@ -194,17 +195,18 @@ def advance(
     h, y_hat = expected[0], expected[1]
     scratch = X[tri + 3 * n + 3 :]
     expanded = many[EXPANDED] > 0
-    priors(T, event, expanded, first, alike, L, P, row, prior)
+    asked = 1 if plain and alike and kind != INTERACT and now[IN_OK] > 0.0 else L  # one stands for all
+    priors(T, event, expanded, first, alike, asked, P, row, prior)
     if still:
-        standstill(prior, L, Hm)
+        standstill(prior, asked, Hm)
     variance_factor(B, L, unknown, factor)
     if plain:
         now[Y_HAT], now[S2] = expect_together(
-            B[WEIGHT], L, factor, prior, alike, phi, theta, cov, Qt, sensors, now[R] * noise, scratch
+            B[WEIGHT], L, factor, prior, alike, phi, theta, cov, Qt, mixed, sensors, now[R] * noise, scratch
         )
     if not plain or now[IN_OK] == 0.0:
         regressors(phi, B, L, min(L, 1), n, na, Z)
-        if walks(maps):
+        if walks:
             blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
         else:
             average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
@@ -254,8 +256,10 @@ def advance(
             many[LEAVES], many[EXPANDED] = L, 1
             shift_covariance(B, L, B, slice(0, L), n, na, False, m, h, now[R], X[len(X) - na :])
             push(B, L, n, na, now[IN_Y], True, y_hat)
-            if own:
-                priors(T, event, True, first, alike, K, P, row, prior)
+            if own or asked < L:
+                priors(T, event, many[EXPANDED] > 0, first, alike, L, P, row, prior)
+                if still:
+                    standstill(prior, L, Hm)
             shift(T, L, prior, Hm)
         many[FLOORS] += 1
         plan(
@@ -283,7 +287,7 @@ def advance(
             many[FLOORS] += 1
     many[CLOCK] += 1
     mixture(B, L, n, unknown, X, theta, cov)
-    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, parent, event, scratch[0], many[PARENTS], lag_prob)
+    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, event, scratch[0], scratch[1], many[PARENTS], lag_prob)
     if now[IN_SEEN] > 0.0:
         now[LAST] = now[IN_Y]
 
@@ -367,7 +371,7 @@ PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
 BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
 """Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
 and whether the noise is unknown and events are independent; of PLAIN whether all leaves have one regressor, all changes
-are walks and all sensors differ in their noise alone; and how many rows there are.
+are walks and all sensors differ in their noise alone, and whether all changes are walks; and how many rows there are.
 """
 
 
@@ -410,6 +414,7 @@ def bank(table: int) -> None:
         packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
         packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
         floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0,
+        t[PLAIN, 1] > 0,
     )  # fmt: skip
     head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
     note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 27))

@@ -61,13 +61,13 @@ def expect(
 @part
 def expect_together(
     w: Array, L: int, factor: Array, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
-    sensors: Array, r: float, X: Array,
+    mixed: Array, sensors: Array, r: float, X: Array,
 ) -> tuple[float, float]:  # fmt: skip
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
 
         y = z' mean,   s = z' (cov + sum_i f_i Q_i) z + sum_j f_j factor_j r,
 
-    f being the probabilities of events, times what covariances are in units of.
+    f being the probabilities of events, times what covariances are in units of. ``mixed`` takes sum_i f_i Q_i.
     """
     n, Hm = len(phi), len(sensors)
     Hd, part, share = len(prior) // Hm, X[0], X[1]
@@ -88,16 +88,18 @@ def expect_together(
                 f = total(part, L)
             share[i] += f
             rest += f * sensors[j, FACTOR]
+    for at in range(len(mixed)):
+        mixed[at] = share[0] * Q[0, at]
+    for k in range(1, Hd):
+        for at in range(len(mixed)):
+            mixed[at] += share[k] * Q[k, at]
     mean, wide = 0.0, 0.0
     for i in range(n):
-        g = 0.0
-        for j in range(n):
-            row, column = max(i, j), min(i, j)
-            at = row * (row + 1) // 2 + column
-            step = 0.0
-            for k in range(Hd):
-                step += share[k] * Q[k, at]
-            g += (P[row, column] + step) * phi[j]
+        g, row = 0.0, i * (i + 1) // 2
+        for j in range(i + 1):
+            g += (P[i, j] + mixed[row + j]) * phi[j]
+        for j in range(i + 1, n):
+            g += (P[j, i] + mixed[j * (j + 1) // 2 + i]) * phi[j]
         mean += phi[i] * theta[i]
         wide += phi[i] * g
     return mean, wide + rest * r

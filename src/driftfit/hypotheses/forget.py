@@ -53,15 +53,6 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
 
 
 @core
-def plain(maps: Array) -> bool:
-    """Whether all changes are walks."""
-    other = 0
-    for i in range(len(maps)):
-        other += 1 if maps[i, KEEP] != 1.0 or maps[i, RESET] > 0.0 or maps[i, KIND] > 0.0 else 0
-    return other == 0
-
-
-@core
 def apply(C: Array, m: Array, a: int, b: int, c: int, maps: Array, places: Array, Q: Array, g: Array, h: Array) -> None:
     """The rest of change c in the columns a .. b, which have taken in KEEP, RESET and Q."""
     kind, n = int(maps[c, KIND]), len(m)

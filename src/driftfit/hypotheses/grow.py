@@ -22,7 +22,7 @@ import numpy as np
 from driftfit.eights import WIDTH, fill, load, minus, over, plus, store, times
 from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE
 from driftfit.hypotheses.forecast import WIDTH as STUCK_WIDTH
-from driftfit.hypotheses.forget import apply
+from driftfit.hypotheses.forget import KIND, apply
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.kernel import Array, core, log, part
@@ -49,7 +49,8 @@ def develop(
             for i in range(n):
                 m[i, l] = places[0, i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
         for c in range(len(Q)):
-            apply(C, m, c * Hm, (c + 1) * Hm, c, maps, places, Q, g, h)
+            if maps[c, KIND] > 0.0:
+                apply(C, m, c * Hm, (c + 1) * Hm, c, maps, places, Q, g, h)
         return K
     for c in range(len(Q)):
         keep, reset = fill(maps[c, 0]), maps[c, 1] > 0.0
@@ -58,7 +59,8 @@ def develop(
                 store(C, k, c * K + l, plus(times(keep, load(A, first + k, l)), fill(Q[c, k])))
             for i in range(n):
                 store(m, i, c * K + l, fill(places[0, i]) if reset else load(A, FIRST + i, l))
-        apply(C, m, c * K, (c + 1) * K, c, maps, places, Q, g, h)
+        if maps[c, KIND] > 0.0:
+            apply(C, m, c * K, (c + 1) * K, c, maps, places, Q, g, h)
     return K * len(Q)
 
 
@@ -116,12 +118,14 @@ def student(nus: Array, scales: Array, eps: Array, s: Array, fade: float, least:
 
 
 @core
-def frozen(nus: Array, scales: Array, y: float, last: float, width: float, r: float, unknown: bool, out: Array) -> None:
+def frozen(
+    B: Array, at: int, columns: int, y: float, last: float, width: float, r: float, unknown: bool, out: Array
+) -> None:
     """Log density of the last output again."""
-    for l in range(len(nus)):
+    for l in range(columns):
         wide = width
         if width <= 0.0:
-            wide = -width * (scales[l] / (nus[l] - 2.0) if unknown else r)
+            wide = -width * (B[S, at + l] / (B[NU, at + l] - 2.0) if unknown else r)
         far = y - last
         out[l] = -0.5 * (LOG_2PI + log(wide) + far * far / wide) if abs(last) < np.inf else -np.inf
 
@@ -143,20 +147,21 @@ def grow(
     columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, expected[0])
     regressors(phi, A, K, columns // K, n, na, Z)
     spread(C, Z, m, columns, g, expected)
-    widen_by_lags(A, K, columns, n, na, m, expected[0])
+    if na > 0:
+        widen_by_lags(A, K, columns, n, na, m, expected[0])
     for j in range(Hm):
         at = j * columns
         if unknown:
             inherit(A, K, B, NU, at, columns)
             inherit(A, K, B, S, at, columns)
-        nus, scales = B[NU, at : at + columns], B[S, at : at + columns]
         if sensors[j, FROZEN] > 0.0:
             leave(B, at, columns, n, C, m)
-            frozen(nus, scales, y, last, sensors[j, STUCK_WIDTH], r, unknown, likely)
+            frozen(B, at, columns, y, last, sensors[j, STUCK_WIDTH], r, unknown, likely)
         else:
             noise_j = sensors[j, FACTOR] * r * noise
             correct(B, at, columns, n, C, m, g, expected, y - sensors[j, VALUE], noise_j, scratch)
             if unknown:
+                nus, scales = B[NU, at : at + columns], B[S, at : at + columns]
                 student(nus, scales, scratch[0], scratch[1], fade, least, likely)
             else:
                 gaussian(scratch[0], scratch[1], columns, likely)

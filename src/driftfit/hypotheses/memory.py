@@ -53,7 +53,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "chain": chain, "initial": initial, "given": np.full(H, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd, tri)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd + 1, tri)),
         "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
@@ -72,7 +72,7 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
     table[core.FLAGS] = na, unknown, alike
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[core.PLAIN] = na == 0 and walks and noises
+    table[core.PLAIN] = na == 0 and walks and noises, walks, 0
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from driftfit.hypotheses.lags import merge_covariance
-from driftfit.hypotheses.leaves import CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
+from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.hypotheses.past import average
 from driftfit.kernel import Array, core, kernel, part
 
@@ -149,10 +149,16 @@ def combine(
 @part
 def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
     """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
-    for row in range(rows):
-        if used(row, unknown, bases):
-            for k in range(G):
-                A[row, k] = B[row, order[k]]
+    gather(B, LOG, order, G, A)
+    gather(B, AGE, order, G, A)
+    if unknown:
+        gather(B, NU, order, G, A)
+        gather(B, S, order, G, A)
+    for k in range(3):
+        if bases[k] > 1.0:
+            gather(B, (CODE, SENSORS, CHANGES)[k], order, G, A)
+    for row in range(FIRST, rows):
+        gather(B, row, order, G, A)
     kept = 0.0
     for k in range(G):
         kept += B[WEIGHT, order[k]]
@@ -160,11 +166,10 @@ def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array,
 
 
 @kernel
-def used(row: int, unknown: bool, bases: Array) -> bool:
-    """Whether leaves need the row: the weight follows from its logarithm, and not all reductions need all codes."""
-    coded = row in (CODE, SENSORS, CHANGES)
-    base = bases[0 if row == CODE else 1 if row == SENSORS else 2]
-    return row != WEIGHT and (unknown or (row not in (NU, S))) and (base > 1.0 or not coded)
+def gather(B: Array, row: int, order: Array, G: int, A: Array) -> None:
+    """A row of the leaves that are kept."""
+    for k in range(G):
+        A[row, k] = B[row, order[k]]
 
 
 @core

@@ -82,7 +82,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 @part
 def marginals(
-    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, mass: Array, K: int,
+    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, event: Array, mass: Array, steady: Array, K: int,
     lags: Array,
 ) -> float:  # fmt: skip
     """lags[k, e] = p(event e, k floors back); returns the probability of a change among the floors of the table.
@@ -99,14 +99,20 @@ def marginals(
             mass[l] = w[l]
     else:
         for l in range(K):
-            mass[l] = 0.0
+            mass[l], steady[l] = 0.0, 0.0
         for at in range(0, L, K):
+            newest, own = event[at], 0.0
             for l in range(K):
-                mass[l] += w[np.uint64(at + l)]
-            for l in range(K):
-                lags[0, event[at + l]] += w[at + l]
-        for l in range(L):
-            quiet += (w[l] if event[l] < Hm else 0.0) * (T[parent[l], last - block] if W > 1 else 1.0)
+                p, e = w[np.uint64(at + l)], event[np.uint64(at + l)]
+                mass[l] += p
+                steady[l] += p if e < Hm else 0.0
+                if e != newest:
+                    lags[0, newest] += own
+                    newest, own = e, 0.0
+                own += p
+            lags[0, newest] += own
+        for l in range(K):
+            quiet += steady[l] * (T[l, last - block] if W > 1 else 1.0)
     for at in range(0, T.shape[1], WIDTH):
         total = fill(0.0)
         for l in range(K):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.eights import WIDTH, fill, load, plus, reaches, sum_of
+from driftfit.eights import WIDTH, fill, load, plus, reaches, store, sum_of
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.hypotheses.lookahead import expected_risk
 from driftfit.kernel import Array, core, kernel, part
@@ -53,14 +53,19 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
 
 
 @part
-def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array) -> int:
+def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. What follows in the row, up to the next eight, must be zero.
+    many. What follows in the row, up to the next eight, must be zero; ``ranks`` (1, count) is overwritten.
     """
     value, over, G = V[row], 0, 0
     if count <= FEW:
+        for l in range(0, count, WIDTH):
+            here, rank = load(V, row, l), fill(0.0)
+            for k in range(count):
+                rank = plus(rank, reaches(fill(value[k]), here))
+            store(ranks, 0, l, rank)
         for l in range(count):
-            keep = 1 if value[l] > 0.0 and reached(V, row, count, value[l]) <= M else 0
+            keep = 1 if value[l] > 0.0 and ranks[0, l] <= M else 0
             group[l], order[G] = G if keep > 0 else -1, l
             G += keep
         if G == M:
@@ -92,7 +97,7 @@ def beam(B: Array, L: int, knobs: Array, links: Array, Hm: int, group: Array, X:
     w, value, mass = B[WEIGHT], X[0], X[1]
     parent, event, M = links[0], links[1], int(knobs[LEAVES])
     if knobs[LIFE] <= 0.0 and knobs[BEST] <= 0.0:
-        return int(heaviest(B, WEIGHT, L, M, group, links[3]))
+        return int(heaviest(B, WEIGHT, L, M, group, links[3], X[2:3]))
     top = 0
     for l in range(L):
         value[l] = w[l]
@@ -112,7 +117,7 @@ def beam(B: Array, L: int, knobs: Array, links: Array, Hm: int, group: Array, X:
             value[l] = 0.0 if event[l] >= Hm and parent[l] != best else value[l]
     value[top] = 4.0
     clear(X, 0, L)
-    return int(heaviest(X, 0, L, M, group, links[3]))
+    return int(heaviest(X, 0, L, M, group, links[3], X[2:3]))
 
 
 @core
@@ -158,7 +163,7 @@ def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Ar
         for k in range(G):
             slots[k] = 0
         clear(X, 0, G)
-        G2 = heaviest(X, 0, G, M, slots, order)
+        G2 = heaviest(X, 0, G, M, slots, order, X[2:3])
         for k in range(G):
             renumber[k] = slots[k]
         for l in range(L):
