@@ -1,13 +1,10 @@
 """Stage one of Hammerstein-Wiener models: columns, the exact regression, the filter, missing data, bases, warnings."""
 
-import json
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.polynomial import chebyshev, legendre
-from scipy.interpolate import BSpline as ScipyBSpline
 from support import same
 
 from driftfit import ARX, RLS, Kalman, Live, Track, track
@@ -16,13 +13,10 @@ from driftfit.drivers import TrackerSteps, unknown
 from driftfit.kernel import kernel, nothing
 from driftfit.models.basis import (
     BSpline,
-    Chebyshev,
     DeadZone,
-    Functions,
     Legendre,
     PiecewiseLinear,
     Polynomial,
-    basis_of,
 )
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.systems.drift import RandomWalk
@@ -324,70 +318,6 @@ def test_noise_aware_variances():
     for t in range(200):
         live.update(float(s.y[t]), float(s.u[t]))
     assert same(live.theta, run.theta[-1])
-
-
-def test_bases_are_what_they_say():
-    x = np.linspace(-1.9, 3.2, 23)
-    s = (x - 1.0) / 3.0
-    np.testing.assert_allclose(Legendre(5, (-2, 4)).value(x), legendre.legvander(s, 5)[:, 1:], atol=1e-14)
-    np.testing.assert_allclose(Chebyshev(5, (-2, 4)).value(x), chebyshev.chebvander(s, 5)[:, 1:], atol=1e-14)
-    np.testing.assert_allclose(Polynomial(3).value(x), x[:, None] ** [1, 2, 3])
-    bends = PiecewiseLinear([-1.0, 0.0, 2.0])
-    np.testing.assert_allclose(bends.value([-3.0, 1.0, 5.0]), [[-3, -2, 0, 0], [1, 0, 1, 0], [5, 0, 5, 3]])
-    for degree in (1, 2, 3):
-        spline = BSpline(degree, [-2.0, -1.0, 0.5, 1.0, 3.3], anchor=0.3)
-        ends = np.pad(spline.knots, degree, mode="edge")
-        twin = [
-            ScipyBSpline(ends, row, degree)(x) - ScipyBSpline(ends, row, degree)(0.3)
-            for row in np.eye(len(ends) - degree - 1)[1:]
-        ]
-        np.testing.assert_allclose(spline.value(x), np.stack(twin, axis=1), atol=1e-14)
-        assert spline.n == len(twin) == len(spline.names)
-        assert np.isnan(spline.value(3.31)).all()
-    zone = DeadZone(3.0).known(1.0, -0.5)
-    np.testing.assert_allclose(zone.value([2.0, 0.5, -2.0]) @ [1.0, 1.0, -0.5], [1.0, 0.0, -1.5])
-
-
-@pytest.mark.parametrize(
-    "basis",
-    [
-        Polynomial(3), Legendre(4, (-2, 4)), Chebyshev(4, (-2, 4)), PiecewiseLinear([-1.0, 1.0]),
-        BSpline(3, [-2.0, 0.0, 4.0]), DeadZone(3.0),
-    ],
-    ids=repr,
-)  # fmt: skip
-def test_derivatives_and_settings_of_bases(basis):
-    x = np.linspace(-1.93, 3.17, 19)
-    numeric = (basis.value(x + 1e-6) - basis.value(x - 1e-6)) / 2e-6
-    np.testing.assert_allclose(basis.derivative(x), numeric, atol=1e-7)
-    assert basis_of(json.loads(json.dumps(basis.plain()))) == basis
-    model = HammersteinWiener(1, 1, input=basis, intercept=True)
-    again = HammersteinWiener.from_settings(json.loads(json.dumps(model.settings())))
-    assert (again, hash(again), again.names) == (model, hash(model), model.names)
-
-
-def swing(x, p, out):
-    out[0] = x + p[0] * np.sin(x)
-    out[1] = np.tanh(x)
-
-
-def swing_slopes(x, p, out):
-    out[0] = 1.0 + p[0] * np.cos(x)
-    out[1] = 1.0 - np.tanh(x) ** 2
-
-
-def test_functions_of_the_user(tmp_path):
-    own = Functions(swing, swing_slopes, 2, (0.3,), ("sway", "bend"))
-    np.testing.assert_allclose(own.value([0.5])[0], [0.5 + 0.3 * np.sin(0.5), np.tanh(0.5)])
-    model = HammersteinWiener(1, 1, output=own)
-    rng = np.random.default_rng(8)
-    s = simulate(model, [-0.5], [0.5], d=[0.4], T=100, rng=rng)
-    run = track(model, Kalman(q=0.0, r=1e-6, p0=1e6), s.y, s.u)
-    np.testing.assert_allclose(run.theta[-1], s.theta[-1], atol=1e-3)
-    run.save(tmp_path / "run")
-    assert Track.load(tmp_path / "run").model == model
-    with pytest.raises(ValueError, match="cannot be imported"):
-        Functions("nowhere:f", "nowhere:g")
 
 
 def test_inversion_and_what_cannot_be_inverted():

@@ -95,7 +95,8 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
     if cache:
         source = function
-        function = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
+        defaults, closure = source.__defaults__, source.__closure__
+        function = FunctionType(source.__code__, source.__globals__, source.__name__, defaults, closure)
         function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
     dispatcher = njit(error_model="numpy", nogil=True, cache=cache, **options)(function)
     dispatcher.identity = name

@@ -29,7 +29,7 @@ import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel, shared
-from driftfit.trackers.diffuse import SPANNED, TOLERANCE, outside, prediction
+from driftfit.trackers.diffuse import SPANNED, TOLERANCE, outside, prediction, symmetric_product
 from driftfit.trackers.each import told
 from driftfit.trackers.rls import learn_scale
 
@@ -71,23 +71,14 @@ def drift(s: State, l: int) -> None:
 
 @kernel
 def spread(s: State, l: int) -> float:
-    """s.g = P h from the lower triangle of P; returns h' P h."""
+    """s.g = P h, h the regressor and zeros for the slopes, from the lower triangle of P; returns h' P h."""
     n = s.theta.shape[0]
-    for i in range(n):
-        g = 0.0
-        for j in range(i + 1):
-            g += s.P[i, j, l] * s.phi[j, l]
-        for j in range(i + 1, n):
-            g += s.P[j, i, l] * s.phi[j, l]
-        s.g[i, l] = g
+    total: float = symmetric_product(s, l)
     for i in range(n):
         g = 0.0
         for j in range(n):
             g += s.P[n + i, j, l] * s.phi[j, l]
         s.g[n + i, l] = g
-    total = 0.0
-    for i in range(n):
-        total += s.phi[i, l] * s.g[i, l]
     return total
 
 
