@@ -145,8 +145,8 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
     size = np.dtype(fields).itemsize
-    if L > 1:  # whole cache lines, so that no vector load of a lane block straddles two
-        fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
+    # whole cache lines, so that no vector load of a lane block straddles two
+    fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
     tile = _aligned(np.dtype(fields, align=True), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():

@@ -142,6 +142,25 @@ def part(function: Callable[..., Any]) -> Any:
     return _compiled(function, cache=True, forceinline=True, **_PLAIN)
 
 
+def sized(function: Callable[..., Any]) -> Any:
+    """Compile a part of a machine whose first argument is a number of parameters: once for each of two, three and four,
+    which the compiler then knows, so that it unrolls loops and keeps what they work on in registers; and once for all.
+    """
+    work = part(function)
+
+    @part
+    def chosen(n: int, *rest: Any) -> Any:
+        if n == 2:
+            return work(2, *rest)
+        if n == 3:
+            return work(3, *rest)
+        if n == 4:
+            return work(4, *rest)
+        return work(n, *rest)
+
+    return chosen
+
+
 class Outside(types.ExternalFunction):
     """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
@@ -266,12 +285,12 @@ def nothing(s: State, l: int) -> None:
     """The step that leaves the record alone."""
 
 
-_LOG2 = 0.6931471805599453
-_LOG2_HIGH = 0.6931471803691238  # ln 2 with its last 32 bits zero, so that k * _LOG2_HIGH is exact
-_LOG2_LOW = 1.9082149292705877e-10
-_ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to a whole number without a call
-_EXP = tuple(1.0 / math.factorial(i) for i in range(14))
-_ARTANH = tuple(1.0 / i for i in range(1, 24, 2))
+LOG2 = 0.6931471805599453
+LOG2_HIGH = 0.6931471803691238  # ln 2 with its last 32 bits zero, so that k * LOG2_HIGH is exact
+LOG2_LOW = 1.9082149292705877e-10
+ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to a whole number without a call
+EXP = tuple(1.0 / math.factorial(i) for i in range(14))
+ARTANH = tuple(1.0 / i for i in range(1, 24, 2))
 
 
 @kernel
@@ -279,14 +298,17 @@ def exp(x: float) -> float:
     """e^x within 2 ulp, the same bits at every lane width (a vectorised library exp differs from the scalar one).
 
     x = k ln 2 + r with |r| <= ln 2 / 2, then the Taylor series of e^r to r^13 and 2^k through the exponent bits.
-    Arguments are held within [-708, 709].
+    Arguments are held within [-708, 709]. Terms are added in pairs, fours and eights: one after the other they would be
+    a chain of twenty-six operations of which each waits for the last.
     """
     x = min(709.0, max(-708.0, x))
-    k = (x * (1.0 / _LOG2) + _ROUND) - _ROUND
-    r = (x - k * _LOG2_HIGH) - k * _LOG2_LOW
-    total = _EXP[13]
-    for i in range(12, -1, -1):
-        total = total * r + _EXP[i]
+    k = (x * (1.0 / LOG2) + ROUND) - ROUND
+    r = (x - k * LOG2_HIGH) - k * LOG2_LOW
+    r2 = r * r
+    r4 = r2 * r2
+    low = (EXP[4] + EXP[5] * r) + (EXP[6] + EXP[7] * r) * r2
+    high = ((EXP[8] + EXP[9] * r) + (EXP[10] + EXP[11] * r) * r2) + (EXP[12] + EXP[13] * r) * r4
+    total = 1.0 + (r + (r2 * (EXP[2] + EXP[3] * r) + r4 * (low + high * r4)))
     return total * np.int64((np.int64(k) + 1023) << 52).view(np.float64)
 
 
@@ -303,8 +325,10 @@ def log(x: float) -> float:
     m = 0.5 * m if up else m
     k = k + 1 if up else k
     f = (m - 1.0) / (m + 1.0)
-    square = f * f
-    total = _ARTANH[11]
-    for i in range(10, -1, -1):
-        total = total * square + _ARTANH[i]
-    return k * _LOG2_HIGH + (2.0 * f * total + k * _LOG2_LOW)
+    s = f * f
+    s2 = s * s
+    s4 = s2 * s2
+    low = (ARTANH[4] + ARTANH[5] * s) + (ARTANH[6] + ARTANH[7] * s) * s2
+    high = (ARTANH[8] + ARTANH[9] * s) + (ARTANH[10] + ARTANH[11] * s) * s2
+    total = 1.0 + (s * ARTANH[1] + (s2 * (ARTANH[2] + ARTANH[3] * s) + s4 * (low + high * s4)))
+    return k * LOG2_HIGH + (2.0 * f * total + k * LOG2_LOW)

@@ -78,7 +78,8 @@ HEAD = 4
 def reduce(
     A: Array, B: Array, T: Array, T2: Array, many: Array, now: Array, prior: Array, row: Array, knobs: Array,
     bases: Array, links: Array, group: Array, n: int, na: int, Hm: int, unknown: bool, Q: Array, sizes: Array, c: Array,
-    factors: Array, maps: Array, theta0: Array, sensors: Array, root: Array, samples: Array, Qt: Array, X: Array,
+    factors: Array, maps: Array, theta0: Array, sensors: Array, root: Array, samples: Array, Qt: Array, news: Array,
+    X: Array,
 ) -> int:  # fmt: skip
     """Carry out what was planned: the parents of the next floor, in A."""
     H, L, kind = len(row), many[LEAVES], int(knobs[KIND])
@@ -94,7 +95,7 @@ def reduce(
     elif kind in (MERGE, HYBRID):
         alone = sort(group, L, many[GROUPS], start, order) == many[GROUPS]
     if not alone and not expanded:
-        write_out(T, L, H, Hm, parent, event, T2)
+        write_out(T, L, H, Hm, parent, event, news, T2)
         flip(many)
         T, T2 = T2, T
     if full:
@@ -110,7 +111,7 @@ def reduce(
         return int(mix(B, L, prior, n, na, unknown, A, order, X[0], T, T2))
     G = many[GROUPS]
     if alone:
-        pick(T, expanded, H, Hm, parent, event, order, G, T2)
+        pick(T, expanded, H, Hm, parent, event, order, G, news, T2)
         kept = take(B, order, G, len(A), unknown, bases, A)
     else:
         kept = combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
@@ -165,8 +166,8 @@ def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, lag_prob: Array, theta: Array, cov: Array,
-    na: int, unknown: bool, same: bool, plain: bool, walks: bool,
+    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, lag_prob: Array, theta: Array,
+    cov: Array, na: int, unknown: bool, same: bool, plain: bool, walks: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
     The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`.
@@ -185,13 +186,13 @@ def advance(
         decided[k, 0] = -1.0
     increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
     settings, maps = maps[: len(Q)], maps[len(Q) :]
-    Qt, mixed = Qt[: len(Q)], Qt[len(Q)]
+    with_mean, Qt = Qt, Qt[: len(Q)]
     if not walks:
         for_interval(settings, now[IN_DT], maps)
 
     # forecast: every leaf with all that may happen to it
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
-    expected, factor = X[tri + 3 * n : tri + 3 * n + 2], X[tri + 3 * n + 2]
+    expected, factor = X[tri + 3 * n : tri + 3 * n + 2], tri + 3 * n + 2
     h, y_hat = expected[0], expected[1]
     scratch = X[tri + 3 * n + 3 :]
     expanded = many[EXPANDED] > 0
@@ -199,10 +200,10 @@ def advance(
     priors(T, event, expanded, first, alike, asked, P, row, prior)
     if still:
         standstill(prior, asked, Hm)
-    variance_factor(B, L, unknown, factor)
+    variance_factor(B, L, unknown, X, factor)
     if plain:
         now[Y_HAT], now[S2] = expect_together(
-            B[WEIGHT], L, factor, prior, alike, phi, theta, cov, Qt, mixed, sensors, now[R] * noise, scratch
+            B, L, X, factor, prior, alike, phi, theta, cov, with_mean, sensors, now[R] * noise
         )
     if not plain or now[IN_OK] == 0.0:
         regressors(phi, B, L, min(L, 1), n, na, Z)
@@ -210,15 +211,17 @@ def advance(
             blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
         else:
             average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
-        spread(C, Z, m, L, g, expected)
+        spread(C, Z, m, L, n, na, g, expected)
         widen_by_lags(B, L, L, n, na, m, h)
     if not plain:
-        now[Y_HAT], now[S2] = expect(B[WEIGHT], L, y_hat, h, factor, prior, sensors, now[R], noise, now[LAST], scratch)
+        now[Y_HAT], now[S2] = expect(
+            B[WEIGHT], L, y_hat, h, X[factor], prior, sensors, now[R], noise, now[LAST], scratch
+        )
 
     if now[IN_OK] > 0.0:
         K = reduce(
             A, B, T, T2, many, now, prior, row, knobs, bases, links, group, n, na, Hm, unknown, Q, sizes, c, factors,
-            maps, theta0, sensors, root, samples, Qt, X,
+            maps, theta0, sensors, root, samples, Qt, news, X,
         )  # fmt: skip
         if kind == REFILTER:
             increments(Q, sizes, c, now[R], unknown, now[IN_TIME], factors, Qt)
@@ -279,15 +282,15 @@ def advance(
                 for l in range(L):
                     B[FIRST + n + k, l] = C[k, l]
             if not expanded:
-                write_out(T, L, H, Hm, parent, event, T2)
+                write_out(T, L, H, Hm, parent, event, news, T2)
                 flip(many)
                 T, T2 = T2, T
                 many[EXPANDED] = 1
             shift(T, L, prior, Hm)
             many[FLOORS] += 1
     many[CLOCK] += 1
-    mixture(B, L, n, unknown, X, theta, cov)
-    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, event, scratch[0], scratch[1], many[PARENTS], lag_prob)
+    mixture(n, B, L, unknown, X, theta, cov)
+    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, event, scratch, many[PARENTS], lag_prob)
     if now[IN_SEEN] > 0.0:
         now[LAST] = now[IN_Y]
 
@@ -361,7 +364,7 @@ def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
 PACKED = (
     "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
     "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "lag_prob", "decided",
+    "news", "lag_prob", "decided",
 )  # fmt: skip
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
@@ -396,7 +399,7 @@ def bank(table: int) -> None:
     head = floats(t[REPORT, 0], 1, HEAD)[0]
     if many[SETTLED] != 1:
         wait(
-            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 27),
+            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 28),
             t[FLAGS, 0],
         )  # fmt: skip
         root = packed(t, 23)
@@ -404,17 +407,17 @@ def bank(table: int) -> None:
             root[row, 0] = packed(t, 1)[row, 0]
         packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
-        note(packed(t, 26), many[CLOCK], 0.0, packed(t, 27))
+        note(packed(t, 26), many[CLOCK], 0.0, packed(t, 28))
         return
     advance(
         packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
         whole(t, 7)[0], many, now, packed(t, 8),
         floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
         packed(t, 12), packed(t, 13), packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
-        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 28), packed(t, 22),
-        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), floats(t[THETA, 0], 1, n)[0],
+        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 29), packed(t, 22),
+        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), packed(t, 28), floats(t[THETA, 0], 1, n)[0],
         floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0,
         t[PLAIN, 1] > 0,
     )  # fmt: skip
     head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
-    note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 27))
+    note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 28))

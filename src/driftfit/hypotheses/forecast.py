@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.hypotheses.leaves import total
-from driftfit.kernel import Array, core, part
+from driftfit.eights import WIDTH, fill, load, plus, store, sum_of, times
+from driftfit.hypotheses.leaves import WEIGHT, total
+from driftfit.kernel import Array, core, kernel, part
 
-FACTOR, VALUE, FROZEN, WIDTH, CLEANS = range(5)
+FACTOR, VALUE, FROZEN, STUCK, CLEANS = range(5)
 """Columns of the table of sensors."""
 
 
@@ -46,7 +47,7 @@ def expect(
         frozen = sensors[j, FROZEN] > 0.0 and abs(last) < np.inf
         if frozen:
             for l in range(L):
-                wide = sensors[j, WIDTH] if sensors[j, WIDTH] > 0.0 else -sensors[j, WIDTH] * r * factor[l]
+                wide = sensors[j, STUCK] if sensors[j, STUCK] > 0.0 else -sensors[j, STUCK] * r * factor[l]
                 share[l] = X[1 + j, l] * (wide + (last - mean) ** 2)
         else:
             for l in range(L):
@@ -60,39 +61,33 @@ def expect(
 
 @part
 def expect_together(
-    w: Array, L: int, factor: Array, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
-    mixed: Array, sensors: Array, r: float, X: Array,
+    B: Array, L: int, X: Array, factor: int, prior: Array, alike: bool, phi: Array, theta: Array, P: Array, Q: Array,
+    sensors: Array, r: float,
 ) -> tuple[float, float]:  # fmt: skip
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
 
         y = z' mean,   s = z' (cov + sum_i f_i Q_i) z + sum_j f_j factor_j r,
 
-    f being the probabilities of events, times what covariances are in units of. ``mixed`` takes sum_i f_i Q_i.
+    f being the probabilities of events, times what covariances are in units of, which is row ``factor`` of X; the row
+    after it, and the last of Q, are overwritten.
     """
     n, Hm = len(phi), len(sensors)
-    Hd, part, share = len(prior) // Hm, X[0], X[1]
-    rest = 0.0
+    Hd, mixed = len(prior) // Hm, Q[len(Q) - 1]
+    rest, unit = 0.0, weighted(B, L, X, factor) if alike else 0.0
+    for at in range(0, Q.shape[1], WIDTH):
+        store(Q, len(Q) - 1, at, fill(0.0))
     for i in range(Hd):
-        share[i] = 0.0
-    unit = 0.0
-    if alike:
-        for l in range(L):
-            part[l] = w[l] * factor[l]
-        unit = total(part, L)
-    for i in range(Hd):
+        share = 0.0
         for j in range(Hm):
             f = unit * prior[i * Hm + j, 0]
             if not alike:
-                for l in range(L):
-                    part[l] = w[l] * (factor[l] * prior[i * Hm + j, l])
-                f = total(part, L)
-            share[i] += f
+                for l in range(0, L, WIDTH):
+                    store(X, factor + 1, l, times(load(X, factor, l), load(prior, i * Hm + j, l)))
+                f = weighted(B, L, X, factor + 1)
+            share += f
             rest += f * sensors[j, FACTOR]
-    for at in range(len(mixed)):
-        mixed[at] = share[0] * Q[0, at]
-    for k in range(1, Hd):
-        for at in range(len(mixed)):
-            mixed[at] += share[k] * Q[k, at]
+        for at in range(0, Q.shape[1], WIDTH):
+            store(Q, len(Q) - 1, at, plus(load(Q, len(Q) - 1, at), times(fill(share), load(Q, i, at))))
     mean, wide = 0.0, 0.0
     for i in range(n):
         g, row = 0.0, i * (i + 1) // 2
@@ -103,3 +98,12 @@ def expect_together(
         mean += phi[i] * theta[i]
         wide += phi[i] * g
     return mean, wide + rest * r
+
+
+@kernel
+def weighted(B: Array, L: int, X: Array, row: int) -> float:
+    """The sum over leaves of their weights times a row of X."""
+    sums = fill(0.0)
+    for l in range(0, L, WIDTH):
+        sums = plus(sums, times(load(B, WEIGHT, l), load(X, row, l)))
+    return float(sum_of(sums))

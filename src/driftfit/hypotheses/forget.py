@@ -78,7 +78,7 @@ def guard(C: Array, n: int, a: int, b: int, keep: float, cap: float, q: Array, h
             h[l] += abs(C[at, l] - q[at])
     for l in range(a, b):
         h[l] = max(cap, h[l] / keep) / h[l] if h[l] > cap else 1.0
-    for k in range(len(q)):
+    for k in range(n * (n + 1) // 2):
         for l in range(a, b):
             C[k, l] = (C[k, l] - q[k]) * h[l] + q[k] if h[l] != 1.0 else C[k, l]
 

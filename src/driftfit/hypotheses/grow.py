@@ -19,13 +19,12 @@ import math
 
 import numpy as np
 
-from driftfit.eights import WIDTH, fill, load, minus, over, plus, store, times
-from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, VALUE
-from driftfit.hypotheses.forecast import WIDTH as STUCK_WIDTH
+from driftfit.eights import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
+from driftfit.hypotheses.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
 from driftfit.hypotheses.forget import KIND, apply
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.kernel import Array, core, log, part
+from driftfit.kernel import Array, core, log, part, sized
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
@@ -44,7 +43,7 @@ def develop(
     if own:
         for l in range(K):
             c = l // Hm
-            for k in range(Q.shape[1]):
+            for k in range(n * (n + 1) // 2):
                 C[k, l] = maps[c, 0] * A[first + k, l] + Q[c, k]
             for i in range(n):
                 m[i, l] = places[0, i] if maps[c, 1] > 0.0 else A[FIRST + i, l]
@@ -55,7 +54,7 @@ def develop(
     for c in range(len(Q)):
         keep, reset = fill(maps[c, 0]), maps[c, 1] > 0.0
         for l in range(0, K, WIDTH):
-            for k in range(Q.shape[1]):
+            for k in range(n * (n + 1) // 2):
                 store(C, k, c * K + l, plus(times(keep, load(A, first + k, l)), fill(Q[c, k])))
             for i in range(n):
                 store(m, i, c * K + l, fill(places[0, i]) if reset else load(A, FIRST + i, l))
@@ -64,17 +63,29 @@ def develop(
     return K * len(Q)
 
 
-@part
+@sized
+def ahead(
+    n: int, A: Array, K: int, phi: Array, na: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array,
+    m: Array, Z: Array, g: Array, expected: Array,
+) -> int:  # fmt: skip
+    """What the leaves and all that may happen to them expect of the sample; returns the number of columns."""
+    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, expected[0])
+    regressors(phi, A, K, columns // K, n, na, Z)
+    spread(C, Z, m, columns, n, na, g, expected)
+    return int(columns)
+
+
+@sized
 def correct(
-    B: Array, at: int, columns: int, n: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
-    X: Array,
+    n: int, B: Array, at: int, columns: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
+    X: Array, row: int,
 ) -> None:  # fmt: skip
-    """The data in the columns from ``at``; innovations and their variances go to the first two rows of X."""
+    """The data in the columns from ``at``; eps^2 / s and s of every leaf go to two rows of X."""
     for l in range(0, columns, WIDTH):
         s = plus(load(expected, 0, l), fill(noise))
         eps, gain, entry = minus(fill(y), load(expected, 1, l)), over(fill(1.0), s), 0
-        store(X, 0, l, eps)
-        store(X, 1, l, s)
+        store(X, row, l, times(eps, times(gain, eps)))
+        store(X, row + 1, l, s)
         for i in range(n):
             k = times(gain, load(g, i, l))
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(k, eps)))
@@ -94,27 +105,34 @@ def leave(B: Array, at: int, columns: int, n: int, C: Array, m: Array) -> None:
 
 
 @part
-def gaussian(eps: Array, s: Array, columns: int, out: Array) -> None:
-    """log N(eps; 0, s)."""
-    for l in range(columns):
-        out[l] = -0.5 * (LOG_2PI + log(s[l]) + eps[l] * eps[l] / s[l])
+def gaussian(X: Array, out: int, columns: int) -> None:
+    """Row ``out`` of X: log N(eps; 0, s), where eps^2 / s and s are in the two rows after it."""
+    for l in range(0, columns, WIDTH):
+        far = plus(plus(fill(LOG_2PI), log_of(load(X, out + 2, l))), load(X, out + 1, l))
+        store(X, out, l, times(fill(-0.5), far))
 
 
 @part
-def student(nus: Array, scales: Array, eps: Array, s: Array, fade: float, least: float, out: Array) -> None:
-    """Log density with unknown variance; nu and S take the sample in."""
+def student(B: Array, at: int, X: Array, out: int, columns: int, fade: float, least: float) -> None:
+    """The same with unknown variance; nu and S of the columns of B from ``at`` on take the sample in."""
     before, ratio = np.nan, 0.0
-    for l in range(len(nus)):
-        nu = fade * nus[l]
+    for l in range(columns):
+        nu = fade * B[NU, at + l]
         if nu != before:
             before, ratio = nu, math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu)
-        out[l] = ratio
-    for l in range(len(nus)):
-        nu, scale = fade * nus[l], fade * scales[l]
-        far = eps[l] * eps[l] / s[l]
-        out[l] -= 0.5 * (LOG_PI + log(scale) + log(s[l])) + 0.5 * (nu + 1.0) * log(1.0 + far / scale)
-        nus[l] = nu + 1.0
-        scales[l] = max(scale + far, least * (nu + 1.0))
+        X[out, l] = ratio
+    for l in range(0, columns, WIDTH):
+        nu, scale, far = (
+            times(fill(fade), load(B, NU, at + l)),
+            times(fill(fade), load(B, S, at + l)),
+            load(X, out + 1, l),
+        )
+        more = plus(nu, fill(1.0))
+        wide = plus(plus(fill(LOG_PI), log_of(scale)), log_of(load(X, out + 2, l)))
+        wide = plus(wide, times(more, log_of(plus(fill(1.0), over(far, scale)))))
+        store(X, out, l, minus(load(X, out, l), times(fill(0.5), wide)))
+        store(B, NU, at + l, more)
+        store(B, S, at + l, higher(plus(scale, far), times(fill(least), more)))
 
 
 @core
@@ -142,11 +160,8 @@ def grow(
     n, Hd, Hm = len(phi), len(Q), len(sensors)
     tri = n * (n + 1) // 2
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
-    expected, likely = X[tri + 3 * n : tri + 3 * n + 2], X[tri + 3 * n + 2]
-    scratch = X[tri + 3 * n + 3 :]
-    columns = develop(A, K, n, Q, maps, places, own, Hm, C, m, g, expected[0])
-    regressors(phi, A, K, columns // K, n, na, Z)
-    spread(C, Z, m, columns, g, expected)
+    expected, likely = X[tri + 3 * n : tri + 3 * n + 2], tri + 3 * n + 2
+    columns = ahead(n, A, K, phi, na, Q, maps, places, own, Hm, C, m, Z, g, expected)
     if na > 0:
         widen_by_lags(A, K, columns, n, na, m, expected[0])
     for j in range(Hm):
@@ -156,21 +171,20 @@ def grow(
             inherit(A, K, B, S, at, columns)
         if sensors[j, FROZEN] > 0.0:
             leave(B, at, columns, n, C, m)
-            frozen(B, at, columns, y, last, sensors[j, STUCK_WIDTH], r, unknown, likely)
+            frozen(B, at, columns, y, last, sensors[j, STUCK], r, unknown, X[likely])
         else:
             noise_j = sensors[j, FACTOR] * r * noise
-            correct(B, at, columns, n, C, m, g, expected, y - sensors[j, VALUE], noise_j, scratch)
+            correct(n, B, at, columns, C, m, g, expected, y - sensors[j, VALUE], noise_j, X, likely + 1)
             if unknown:
-                nus, scales = B[NU, at : at + columns], B[S, at : at + columns]
-                student(nus, scales, scratch[0], scratch[1], fade, least, likely)
+                student(B, at, X, likely, columns, fade, least)
             else:
-                gaussian(scratch[0], scratch[1], columns, likely)
+                gaussian(X, likely, columns)
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
             remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], own_lags)
             block, spare = slice(at, at + columns), X[len(X) - na :]
             shift_covariance(A, K, B, block, n, na, own_lags, m, expected[0], r, spare)
-        weigh(A, K, B, at, columns, j, Hm, own, alike, prior, likely, parent, event)
+        weigh(A, K, B, at, columns, j, Hm, own, alike, prior, X, likely, parent, event)
         encode(A, K, B, at, columns, j, Hd, Hm, bases, event)
     return int(columns * Hm)
 
@@ -200,9 +214,12 @@ def remember(
 @part
 def weigh(
     A: Array, K: int, B: Array, at: int, columns: int, j: int, Hm: int, own: bool, alike: bool, prior: Array,
-    likely: Array, parents: Array, events: Array,
+    X: Array, row: int, parents: Array, events: Array,
 ) -> None:  # fmt: skip
-    """Weights and ages of the children under sensor j, whose children they are, and by which event."""
+    """Weights and ages of the children under sensor j, whose children they are, and by which event; their log
+    densities are a row of X.
+    """
+    likely = X[row]
     if own:
         for l in range(K):
             B[LOG, at + l] = A[LOG, l] + (likely[l] if l % Hm == j else -np.inf)
@@ -214,14 +231,15 @@ def weigh(
         chances = prior[e]
         if alike:
             toll = log(chances[0]) if chances[0] > 0.0 else -np.inf
-            for l in range(K):
-                B[LOG, np.uint64(to + l)] = A[LOG, l] + (toll + likely[np.uint64(c * K + l)])
+            for l in range(0, K, WIDTH):
+                store(B, LOG, to + l, plus(load(A, LOG, l), plus(fill(toll), load(X, row, c * K + l))))
         else:
             for l in range(K):
                 toll = log(chances[l]) if chances[l] > 0.0 else -np.inf
                 B[LOG, np.uint64(to + l)] = A[LOG, l] + (toll + likely[np.uint64(c * K + l)])
+        for l in range(0, K, WIDTH):
+            store(B, AGE, to + l, fill(0.0) if c > 0 else plus(load(A, AGE, l), fill(1.0)))
         for l in range(K):
-            B[AGE, np.uint64(to + l)] = 0.0 if c > 0 else A[AGE, l] + 1.0
             parents[np.uint64(to + l)], events[np.uint64(to + l)] = l, e
 
 

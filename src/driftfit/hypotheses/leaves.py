@@ -18,8 +18,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.eights import WIDTH, fill, load, minus, plus, store, sum_of, times
-from driftfit.kernel import Array, core, exp, kernel, log, part
+from driftfit.eights import (
+    WIDTH,
+    exp_of,
+    fill,
+    load,
+    minus,
+    only,
+    over,
+    plus,
+    reaches,
+    row_sums,
+    store,
+    sum_of,
+    times,
+)
+from driftfit.kernel import Array, core, kernel, log, part, sized
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -61,46 +75,62 @@ def normalise(B: Array, L: int) -> float:
     top = largest(B[LOG], L)
     if not abs(top) < np.inf:
         return np.nan
-    for l in range(L):
-        far = B[LOG, l] - top
-        B[WEIGHT, l] = exp(far) if far > -700.0 else 0.0
-    for l in range(L, min(L + WIDTH, B.shape[1])):
-        B[WEIGHT, l] = 0.0
-    mass = total(B[WEIGHT], L)
+    store(B, LOG, L, fill(-np.inf))
+    sums = fill(0.0)
+    for l in range(0, L, WIDTH):
+        far = minus(load(B, LOG, l), fill(top))
+        w = times(exp_of(far), reaches(far, fill(-700.0)))
+        store(B, WEIGHT, l, w)
+        sums = plus(sums, w)
+    store(B, WEIGHT, L, fill(0.0))
+    mass = sum_of(sums)
     gone = top + log(mass)
     each = 1.0 / mass
-    for l in range(L):
-        B[WEIGHT, l] *= each
-        B[LOG, l] -= gone
+    for l in range(0, L, WIDTH):
+        store(B, WEIGHT, l, times(load(B, WEIGHT, l), fill(each)))
+        store(B, LOG, l, minus(load(B, LOG, l), fill(gone)))
     return float(gone)
 
 
 @core
-def variance_factor(B: Array, L: int, unknown: bool, out: Array) -> None:
-    """What C is in units of: 1, or the expected noise variance S / (nu - 2)."""
-    for l in range(L):
-        out[l] = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
+def variance_factor(B: Array, L: int, unknown: bool, X: Array, row: int) -> None:
+    """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2)."""
+    for l in range(0, L, WIDTH):
+        ratio = over(load(B, S, l), minus(load(B, NU, l), fill(2.0))) if unknown else fill(1.0)
+        store(X, row, l, only(ratio, load(B, WEIGHT, l)))
 
 
-@part
-def mixture(B: Array, L: int, n: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
+@sized
+def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
-    variance_factor(B, L, unknown, X[n])
+    variance_factor(B, L, unknown, X, n)
+    parts, tri = n + 1, n * (n + 1) // 2
     for i in range(n):
         sums = fill(0.0)
         for l in range(0, L, WIDTH):
             sums = plus(sums, times(load(B, WEIGHT, l), load(B, FIRST + i, l)))
-        theta[i] = sum_of(sums)
+        store(X, parts + i, 0, sums)
+    for i in range(0, n, WIDTH):
+        store(X, parts + i, 0, row_sums(X, parts + i))
+    for i in range(n):
+        theta[i] = X[parts + (i & -WIDTH), i & (WIDTH - 1)]
         for l in range(0, L, WIDTH):
             store(X, i, l, minus(load(B, FIRST + i, l), fill(theta[i])))
-    at = FIRST + n
+    at = 0
     for i in range(n):
         for j in range(i + 1):
             sums = fill(0.0)
             for l in range(0, L, WIDTH):
-                inner = times(load(B, at, l), load(X, n, l))
+                inner = times(load(B, FIRST + n + at, l), load(X, n, l))
                 sums = plus(sums, times(load(B, WEIGHT, l), plus(inner, times(load(X, i, l), load(X, j, l)))))
-            P[i, j] = sum_of(sums)
+            store(X, parts + at, 0, sums)
+            at += 1
+    for at in range(0, tri, WIDTH):
+        store(X, parts + at, 0, row_sums(X, parts + at))
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            P[i, j] = X[parts + (at & -WIDTH), at & (WIDTH - 1)]
             at += 1
 
 
@@ -144,42 +174,40 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
 def increments(
     Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
 ) -> None:
-    """out[i] = lower triangle of the covariance that change i adds in this interval."""
-    n = sizes.shape[1]
+    """out[i] = lower triangle of the covariance that change i adds in this interval; ``sizes`` may have no columns."""
     for i in range(len(Q)):
         span = time * factors[i]
-        for k in range(Q.shape[1]):
-            out[i, k] = Q[i, k] * span
-        for k in range(n):
+        for k in range(0, Q.shape[1], WIDTH):
+            store(out, i, k, times(load(Q, i, k), fill(span)))
+        for k in range(sizes.shape[1]):
             if sizes[i, k] > 0.0 and c[k] > 0.0:
                 out[i, k * (k + 1) // 2 + k] += sizes[i, k] * ((1.0 if unknown else r) / c[k]) * span
 
 
-@core
+@part
 def regressors(phi: Array, B: Array, L: int, copies: int, n: int, na: int, Z: Array) -> None:
-    """The regressor of every leaf: phi, with the leaf's own output lags where it keeps some."""
+    """The regressor of every leaf, with its own output lags where it keeps some; else phi, for the first eight."""
     lags = FIRST + n + n * (n + 1) // 2
     for i in range(na):
         for at in range(0, copies * L, L):
             for l in range(L):
                 Z[i, at + l] = B[lags + i, l]
     for i in range(na, n):
-        for l in range(copies * L):
-            Z[i, l] = phi[i]
+        for l in range(0, copies * L if na > 0 else 1, WIDTH):
+            store(Z, i, l, fill(phi[i]))
 
 
-@core
-def spread(C: Array, Z: Array, m: Array, L: int, g: Array, expected: Array) -> None:
+@part
+def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
     """g = C z, and the rows h = z' C z and y = z' m of ``expected``, for every leaf; C is a lower triangle."""
-    n = len(Z)
     for l in range(0, L, WIDTH):
-        h, y = fill(0.0), fill(0.0)
+        h, y, k = fill(0.0), fill(0.0), l if na > 0 else 0
         for i in range(n):
-            z, sums, row = load(Z, i, l), fill(0.0), i * (i + 1) // 2
+            z, sums, row = load(Z, i, k), fill(0.0), i * (i + 1) // 2
             for j in range(i + 1):
-                sums = plus(sums, times(load(C, row + j, l), load(Z, j, l)))
+                sums = plus(sums, times(load(C, row + j, l), load(Z, j, k)))
             for j in range(i + 1, n):
-                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(Z, j, l)))
+                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(Z, j, k)))
             store(g, i, l, sums)
             h = plus(h, times(z, sums))
             y = plus(y, times(z, load(m, i, l)))

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from driftfit.hypotheses.forecast import FACTOR, FROZEN, VALUE, WIDTH
+from driftfit.hypotheses.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.hypotheses.leaves import CODE, FIRST, NU, WEIGHT, S
 from driftfit.kernel import Array, core, exp
 
@@ -57,7 +57,7 @@ def density_parts(
                     continue
                 out[0, count], out[1, count] = B[CODE, l] // top, chance
                 if frozen:
-                    width = sensors[j, WIDTH]
+                    width = sensors[j, STUCK]
                     out[2, count] = last
                     out[3, count] = math.sqrt(width if width > 0.0 else -width * r * unit)
                 else:

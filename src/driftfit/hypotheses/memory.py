@@ -14,6 +14,7 @@ from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED
 from driftfit.hypotheses.forecast import FROZEN, VALUE
 from driftfit.hypotheses.leaves import FIRST
 from driftfit.hypotheses.lookahead import NODES
+from driftfit.hypotheses.past import news_of
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
@@ -29,9 +30,11 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     """What `driftfit.hypotheses.advance` works on, before the first sample; covariances are multiplied by ``unit``."""
     shape, Hd, Hm, H = bank._shape, len(bank.all_changes), len(bank.all_sensors), bank._count
     tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
+    wide, links = _eights(tri), _eights(K + 1)
     chain, initial = bank._events
     rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
     steps = [one.increments(n) for one in bank.all_changes]
+    scaled = any(sizes.any() for _, sizes in steps)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
     places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
@@ -39,22 +42,24 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
     parents, children = _room(max(shape.parents, K // H), Hd, Hm)
-    past = -(-W * (H + 1) // WIDTH) * WIDTH
+    past = _eights(W * (H + 1))
     refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
     return {
-        "A": np.zeros((rows, parents)), "B": np.zeros((rows, children)), "T": np.zeros((K + 1, past)),
+        "A": np.zeros((rows, parents)), "B": np.zeros((rows, children + WIDTH)), "T": np.zeros((K + 1, past)),
         "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
-        "links": np.zeros((4, K + 1), int), "group": np.zeros(K, int),
-        "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, K)),
-        "Q": np.array([Q[lower] * unit for Q, _ in steps]), "sizes": np.array([sizes for _, sizes in steps]),
+        "links": np.zeros((4, links), int), "group": np.zeros(K, int),
+        "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, children)),
+        "Q": np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps]),
+        "sizes": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]),
         "factors": np.ones(Hd), "theta0": places,
         "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
         "sensors": np.array([sensor.row() for sensor in bank.all_sensors]),
         "chain": chain, "initial": initial, "given": np.full(H, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd + 1, tri)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd + 1, wide)),
         "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
+        "news": news_of(H, Hm, past),
         "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
@@ -64,8 +69,9 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
     table = np.zeros((core.ROWS, 3), int)
     flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
     for k, name in enumerate(PACKED):
-        array = np.ascontiguousarray(arrays[name])
-        into = flat[name in REPORTED]
+        array, into = np.ascontiguousarray(arrays[name]), flat[name in REPORTED]
+        if into is flat[0]:
+            into.append(np.zeros(-sum(part.size for part in into) % WIDTH))  # a cache line begins
         table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
         into.append(array.ravel().view(np.float64))
     table[core.THETA, 1] = n
@@ -80,9 +86,14 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
     """Columns for leaves and for their children, with room for eights that begin at every block of them."""
     blocks = (parents, parents * Hd, parents * Hd * Hm)
-    up = [-(-size // WIDTH) * WIDTH for size in blocks]
+    up = [_eights(size) for size in blocks]
     most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
-    return up[0], -(-most // WIDTH) * WIDTH
+    return up[0], _eights(most)
+
+
+def _eights(size: int) -> int:
+    """The next multiple of eight."""
+    return -(-size // WIDTH) * WIDTH
 
 
 def _padded(x: Array, least: int) -> Array:

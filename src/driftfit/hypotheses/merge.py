@@ -17,10 +17,11 @@ import math
 
 import numpy as np
 
+from driftfit.eights import WIDTH, gathered, store
 from driftfit.hypotheses.lags import merge_covariance
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.hypotheses.past import average
-from driftfit.kernel import Array, core, kernel, part
+from driftfit.kernel import Array, core, part
 
 
 @core
@@ -149,27 +150,21 @@ def combine(
 @part
 def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
     """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
-    gather(B, LOG, order, G, A)
-    gather(B, AGE, order, G, A)
-    if unknown:
-        gather(B, NU, order, G, A)
-        gather(B, S, order, G, A)
-    for k in range(3):
-        if bases[k] > 1.0:
-            gather(B, (CODE, SENSORS, CHANGES)[k], order, G, A)
-    for row in range(FIRST, rows):
-        gather(B, row, order, G, A)
+    for k in range(0, G, WIDTH):
+        for row in range(LOG, CODE):
+            if unknown or row < NU:
+                store(A, row, k, gathered(B, row, order, k))
+        store(A, AGE, k, gathered(B, AGE, order, k))
+        for i in range(3):
+            if bases[i] > 1.0:
+                row = (CODE, SENSORS, CHANGES)[i]
+                store(A, row, k, gathered(B, row, order, k))
+        for row in range(FIRST, rows):
+            store(A, row, k, gathered(B, row, order, k))
     kept = 0.0
     for k in range(G):
-        kept += B[WEIGHT, order[k]]
+        kept += A[WEIGHT, k]
     return kept
-
-
-@kernel
-def gather(B: Array, row: int, order: Array, G: int, A: Array) -> None:
-    """A row of the leaves that are kept."""
-    for k in range(G):
-        A[row, k] = B[row, order[k]]
 
 
 @core

@@ -2,40 +2,48 @@
 
 Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k floors back | leaf), entry
 k (H + 1) + H is p(no change in the newest k + 1 floors | leaf). A leaf's memory is one piece, so that handing it on is
-one copy and a marginal one sum of rows; the last row of the table is for such sums. After growth the table is still
-that of the parents; a sample that is not used writes it out for every leaf.
+one copy and a marginal one sum of rows; the last row of the table is for such sums. What an event adds is a row of
+`news`, after which come two rows of factors for what was remembered: where nothing changed, and where something did.
+After growth the table is still that of the parents; a sample that is not used writes it out for every leaf.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from driftfit.eights import WIDTH, fill, load, plus, store, times
+from driftfit.eights import WIDTH, below, equal, fill, load, plus, store, sum_of, times
 from driftfit.hypotheses.leaves import WEIGHT
 from driftfit.kernel import Array, core, kernel, part
 
 
+def news_of(H: int, Hm: int, width: int) -> Array:
+    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors."""
+    news = np.zeros((H + 2, width))
+    news[range(H), range(H)] = 1.0
+    news[:Hm, H] = 1.0
+    news[H:] = 1.0
+    news[H + 1, H :: H + 1] = 0.0
+    return news
+
+
 @kernel
-def hand_on(T: Array, of: int, e: int, H: int, Hm: int, T2: Array, to: int) -> None:
-    """Row ``to`` of T2: what the child of leaf ``of`` with event e remembers. It may write into the row after it."""
+def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, to: int) -> None:
+    """Row ``to`` of T2: what the child of leaf ``of`` with event e remembers, without a branch. It may write into the
+    row after it.
+    """
     block, width = H + 1, T.shape[1]
+    quiet = H if e < Hm else H + 1
+    for k in range(0, block, WIDTH):
+        store(T2, to, k, load(news, e, k))
     for k in range(0, width - block, WIDTH):
-        store(T2, to, block + k, load(T, of, k))
-    for k in range(block):
-        T2[to, k] = 0.0
-    T2[to, e] = 1.0
-    if e < Hm:
-        T2[to, H] = 1.0
-    else:
-        for k in range(block + H, width, block):
-            T2[to, k] = 0.0
+        store(T2, to, block + k, times(load(T, of, k), load(news, quiet, block + k)))
 
 
 @core
-def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, T2: Array) -> None:
+def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, news: Array, T2: Array) -> None:
     """The table of the children, from that of their parents."""
     for l in range(L):
-        hand_on(T, parent[l], event[l], H, Hm, T2, l)
+        hand_on(T, parent[l], event[l], H, Hm, news, T2, l)
 
 
 @core
@@ -58,8 +66,9 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
 
 @part
 def pick(
-    T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, order: Array, G: int, T2: Array
-) -> None:
+    T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, order: Array, G: int, news: Array,
+    T2: Array,
+) -> None:  # fmt: skip
     """The table of leaves that were kept as they were."""
     for k in range(G):
         l = order[k]
@@ -67,7 +76,7 @@ def pick(
             for at in range(T.shape[1]):
                 T2[k, at] = T[l, at]
         else:
-            hand_on(T, parent[l], event[l], H, Hm, T2, k)
+            hand_on(T, parent[l], event[l], H, Hm, news, T2, k)
 
 
 @core
@@ -82,35 +91,29 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 @part
 def marginals(
-    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, event: Array, mass: Array, steady: Array, K: int,
-    lags: Array,
-) -> float:  # fmt: skip
+    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, event: Array, X: Array, K: int, lags: Array
+) -> float:
     """lags[k, e] = p(event e, k floors back); returns the probability of a change among the floors of the table.
 
-    Leaves are blocks of the children of K parents, in their order.
+    Leaves are blocks of the children of K parents, in their order. The first two rows of X are overwritten.
     """
-    block, W, sums, w = H + 1, len(lags), len(T) - 1, B[WEIGHT]
+    block, W, sums, mass, steady = H + 1, len(lags), len(T) - 1, X[0], X[1]
     back, quiet, last = 1, 0.0, W * block - 1
-    for e in range(H):
-        lags[0, e] = 0.0
     if expanded:
         K, back = L, 0
-        for l in range(L):
-            mass[l] = w[l]
-    else:
-        for l in range(K):
-            mass[l], steady[l] = 0.0, 0.0
-        for at in range(0, L, K):
-            newest, own = event[at], 0.0
-            for l in range(K):
-                p, e = w[np.uint64(at + l)], event[np.uint64(at + l)]
-                mass[l] += p
-                steady[l] += p if e < Hm else 0.0
-                if e != newest:
-                    lags[0, newest] += own
-                    newest, own = e, 0.0
-                own += p
-            lags[0, newest] += own
+    for l in range(0, K, WIDTH):
+        own, still = fill(0.0), fill(0.0)
+        for at in range(l, L, K):
+            p = load(B, WEIGHT, at)
+            own, still = plus(own, p), plus(still, times(p, below(event, at, Hm)))
+        store(X, 0, l, own)
+        store(X, 1, l, still)
+    if not expanded:
+        for e in range(H):
+            own = fill(0.0)
+            for l in range(0, L, WIDTH):
+                own = plus(own, times(load(B, WEIGHT, l), equal(event, l, e)))
+            lags[0, e] = sum_of(own)
         for l in range(K):
             quiet += steady[l] * (T[l, last - block] if W > 1 else 1.0)
     for at in range(0, T.shape[1], WIDTH):

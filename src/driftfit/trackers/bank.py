@@ -234,14 +234,14 @@ class Bank(Tracker):
             core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
             arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
-        return {
+        return {  # memory first, where a cache line begins
+            **packed(arrays, n, na, nominal.r is None, self._alike),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            "q0": arrays["Q"][0], "size0": arrays["sizes"][0],
+            "q0": arrays["Q"][0, : n * (n + 1) // 2], "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
-            **packed(arrays, n, na, nominal.r is None, self._alike),
         }  # fmt: skip
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
