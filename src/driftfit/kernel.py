@@ -28,6 +28,8 @@ from numba.core import cgutils
 from numba.core.datamodel import models, register_default
 from numba.extending import intrinsic
 
+from driftfit.linked import only_linked
+
 Array = npt.NDArray[Any]
 State = Any
 """A record of lanes as a kernel sees it: fields as attributes, each an array whose last axis is the lane."""
@@ -131,7 +133,7 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    return _compiled(function, cache=True, **_PLAIN)
+    return only_linked(_compiled(function, **_PLAIN))
 
 
 def part(function: Callable[..., Any]) -> Any:
@@ -139,7 +141,7 @@ def part(function: Callable[..., Any]) -> Any:
 
     Passing a few dozen arrays may cost more than the work on them.
     """
-    return _compiled(function, cache=True, forceinline=True, **_PLAIN)
+    return only_linked(_compiled(function, forceinline=True, **_PLAIN))
 
 
 def sized(function: Callable[..., Any]) -> Any:
