@@ -75,7 +75,12 @@ def track(
         list[str],
         typer.Argument(help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'."),
     ],
-    y: Annotated[str, typer.Option(help="Column of the output.")],
+    y: Annotated[
+        list[str],
+        typer.Option(
+            help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."
+        ),
+    ],
     u: Annotated[
         list[str] | None, typer.Option(help="Column of an input; repeat it, or separate names by commas.")
     ] = None,
@@ -115,16 +120,23 @@ def track(
 ) -> None:
     """Follow the parameters of a model through a record, or through a fleet of them."""
     with helpful():
-        inputs = [name.strip() for entry in u or [] for name in entry.split(",") if name.strip()]
-        bound = parse_model(model or f"arx:2,{2 if inputs else 0},intercept").bind(inputs)
+        outputs, inputs = listed(y), listed(u)
+        if not outputs:
+            raise ValueError("--y names no column.")
+        bound = parse_model(model or f"arx:2,{2 if inputs else 0},intercept", outputs)
+        bound = bound if bound.shared else bound.bind(inputs)
         chosen = parse_tracker(tracker, p or [], own)
         if write_to is not None:
             check_ending(write_to)
-        signals: Any = {"y": y, "u": inputs, "data": file, "time": time, "by": by or None}
+        if plot is not None and by and len(outputs) > 1:
+            raise ValueError("--plot: there is no picture of many records with several outputs; --report has some.")
+        several = len(outputs) > 1
+        signals: Any = {"y": outputs if several else outputs[0], "u": inputs, "data": file, "time": time}
+        signals |= {"by": by or None, "dt": parse_interval(dt), "units": parse_units(unit) or None}
         with progress.status("tracking (the first run of a model and tracker compiles it)"):
-            run: Any = run_track(bound, chosen, **signals, dt=parse_interval(dt), units=parse_units(unit))
+            run: Any = run_track(bound, chosen, **signals)
             summary = run.summary()
-        out.print(summary)
+        out.print(summary, markup=False)  # names of parameters hold brackets
         if write_to is not None:
             write(run, write_to)
         if plot is not None:
@@ -200,8 +212,13 @@ def lookup(what: str, name: str, known: dict[str, type[Kind]]) -> type[Kind]:
     return plain[wanted]
 
 
-def parse_model(text: str) -> Model:
-    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True)."""
+def listed(given: Sequence[str] | None) -> list[str]:
+    """Names that were repeated, or separated by commas."""
+    return [name.strip() for entry in given or [] for name in entry.split(",") if name.strip()]
+
+
+def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
+    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), for outputs of these names if they are several."""
     name, _, rest = text.partition(":")
     kind = lookup("model", name, models.found())
     known = {field.name: field for field in given_fields(kind)}
@@ -217,6 +234,12 @@ def parse_model(text: str) -> Model:
                 raise ValueError(f"--model {text}: too many numbers; {kind.__name__} takes {', '.join(known)}.")
             key, value = places[position], key
         add_setting(f"--model {text}", settings, known, key, parse_value(value, "/") if value else True)
+    if len(outputs) > 1:
+        if "ny" not in known:
+            raise ValueError(f"--model {text}: {kind.__name__} has one output, but --y names {', '.join(outputs)}.")
+        if settings.get("ny", len(outputs)) != len(outputs):
+            raise ValueError(f"--model {text}: ny={settings['ny']}, but --y names {', '.join(outputs)}.")
+        settings["ny"] = tuple(outputs)
     return build(f"--model {text}", kind, settings)
 
 

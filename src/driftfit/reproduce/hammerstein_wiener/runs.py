@@ -214,7 +214,16 @@ def fixes(seed: int, T: int = 20_000) -> dict[str, float]:
     return {name: float(np.linalg.norm(fit.xi - s.xi[0])) for name, fit in zip(FIXES, fits, strict=True)}
 
 
-def choice(name: str, seed: int, T: int = 2000) -> float:
-    """The ratio q / r that the likelihood of y prefers at the end of a record: without noise, at 30 or 20 dB."""
+def choice(name: str, seed: int, T: int = 5000) -> float:
+    """The ratio q / r of the largest likelihood of y over a record: without noise, at 30 or 20 dB."""
     s = example(1, seed, T=T) if name == "noise-free" else example(3, seed, T=T, snr_db=float(name.split()[0]))
-    return float(track_ratios(s.model, s.y, s.u).rho[-1])
+    found = track_ratios(s.model, s.y, s.u)
+    return float(found.rhos[int(np.argmax([concentrated(s.model, found.runs[j]) for j in range(len(found.rhos))]))])
+
+
+def concentrated(model: HammersteinWiener, run: Track) -> float:
+    """Log-likelihood of y after the first BURN samples, with the scale of noise and drift that maximises it."""
+    e, s = run.innovation[BURN:], run.innovation_std[BURN:] ** 2
+    variance = np.mean(e * e / s)
+    jacobian = model.log_jacobian(run.theta, run.y)[BURN:]
+    return float(np.sum(jacobian - 0.5 * np.log(variance * s)))
