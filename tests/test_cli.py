@@ -221,6 +221,7 @@ def test_values():
         ("polynomial/3", Polynomial(3)), ("Legendre/4/-2/2.5", Legendre(4, (-2, 2.5))),
         ("piecewise-linear/-1/0/1", PiecewiseLinear([-1, 0, 1])), ("bspline/2/-1/0/1", BSpline(2, [-1, 0, 1])),
         ("dead-zone/3", DeadZone(3)),
+        ("dead-zone/3/0.1/average", DeadZone(3, 0.1, "average")),
     ):  # fmt: skip
         model = cli.parse_model(f"hammerstein-wiener:1,2,input={words}")
         assert model == HammersteinWiener(1, 2, input=basis)
