@@ -4,7 +4,10 @@ Systems without a fault, records of 20,000 samples; "set" is one false alarm in 
 for each alarm that began, with two standard errors. ARX(2, 2) with Gaussian noise, with outliers (5 % are ten times as
 large), and one parameter that walks and stands at the very edge of its band, which is the worst case of a band alarm.
 
-Run: python benchmarks/alarm_rates.py [records a line, 20 by default]
+The second table is of fleets of 50 series, 10 of which have a fault, watched together: false alarms of all series in
+"every" samples, and of the series that are said to have had something the share that had nothing.
+
+Run: python benchmarks/alarm_rates.py [records a line, 20 by default] [fleets, 20 by default]
 """
 
 import sys
@@ -76,7 +79,40 @@ LINES: list[tuple[str, Callable[[int, float], tuple[int, int]]]] = [
 ]
 
 
-def main(records: int = 20) -> None:
+SERIES, FAULTY, LONG = 50, 10, 1500
+
+
+def watched_fleet(seed: int, kind: str, every: float) -> tuple[float, float, float, float]:
+    """(false alarms in samples without a fault, those expected, false discovery proportion, share of faults found)."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.normal(size=(2, SERIES, LONG))
+    gain = np.ones((SERIES, LONG))
+    gain[:FAULTY, 1000:] += rng.choice([-1.0, 1.0], FAULTY)[:, None] * rng.uniform(0.2, 1.2, FAULTY)[:, None]
+    held = Kalman(q=1e-4 if kind == "band" else 0.0, r=1.0, p0=10.0)
+    fleet = track(Regression(1), held, gain * u + v, u, by="row")
+    said = fleet.detect(kind, every=every, reference=500)
+    begun = sum(int(np.sum(row.alarms.onsets < (1000 if row.key < FAULTY else LONG))) for row in said.rows)
+    judged = FAULTY * 500 + (SERIES - FAULTY) * 1000
+    wrong = sum(key >= FAULTY for key in said.faulty)
+    found = len(said.faulty) - wrong
+    return begun, judged / (every * SERIES), wrong / max(len(said.faulty), 1), found / FAULTY
+
+
+def fleets(count: int) -> Table:
+    """Fleets watched together."""
+    title = f"{count} fleets of {SERIES} series of {LONG} samples, {FAULTY} with a fault, false discovery rate 0.05"
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
+    for head in ("alarm", "set", "false alarms", "expected", "said wrongly", "faults found"):
+        table.add_column(head, justify="left" if head == "alarm" else "right")
+    for kind in ("innovation", "band"):
+        for every in (100.0, 1000.0):
+            begun, expected, wrong, found = np.sum([watched_fleet(s, kind, every) for s in range(count)], axis=0)
+            told = (f"{begun:.0f}", f"{expected:.0f}", f"{wrong / count:.3f}", f"{100.0 * found / count:.0f} %")
+            table.add_row(f"{kind}, first 500 as reference", f"{every:g}", *told)
+    return table
+
+
+def main(records: int = 20, count: int = 20) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
     for head in ("alarm", "set", "measured", "from", "to"):
         table.add_column(head, justify="left" if head == "alarm" else "right")
@@ -88,7 +124,8 @@ def main(records: int = 20) -> None:
             ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
             table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
     Console(width=110).print(table)
+    Console(width=110).print(fleets(count))
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:2]))
+    main(*(int(given) for given in sys.argv[1:3]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+
 import numpy as np
 import polars as pl
 import pytest
@@ -9,6 +11,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
+from driftfit.outputs import Outputs
 
 OWN = '''
 from dataclasses import dataclass
@@ -106,3 +109,82 @@ def test_what_is_wrong_is_said_in_one_line(folder):
         )
         assert result.exit_code == 2
         assert said in " ".join(result.output.split())
+
+
+@pytest.fixture
+def tanks(tmp_path, monkeypatch):
+    """Two records of two outputs that see each other's past, in one file."""
+    rng = np.random.default_rng(1)
+    parts = []
+    for name in ("a", "b"):
+        u, y = rng.normal(size=120), np.zeros((120, 2))
+        for t in range(1, 120):
+            y[t, 0] = 0.5 * y[t - 1, 0] + 0.3 * y[t - 1, 1] + u[t - 1]
+            y[t, 1] = 0.4 * y[t - 1, 1] - u[t - 1]
+            y[t] += 0.1 * rng.normal(size=2)
+        columns = {"tank": [name] * 120, "level": y[:, 0], "flow": y[:, 1], "valve": u, "pump": rng.normal(size=120)}
+        parts.append(pl.DataFrame(columns))
+    parts[0].write_csv(tmp_path / "one.csv")
+    pl.concat(parts).write_csv(tmp_path / "all.csv")
+    monkeypatch.chdir(tmp_path)
+    return parts
+
+
+KALMAN = ("--tracker", "kalman", "-p", "q=1e-3", "-p", "r=0.1")
+TWO = ("--y", "level", "--y", "flow", "--model", "arx:1,1", *KALMAN)
+
+
+def test_several_outputs(tanks):
+    text = run("one.csv", *TWO, "--u", "valve", "--out", "two.parquet", "--plot", "two.png", "--report", "two.html")
+    assert "level\n" in text
+    assert "a1[flow<-level]" in text
+    data = tanks[0]
+    alone = track(
+        ARX(1, 1, ny=("level", "flow")), Kalman(q=1e-3, r=0.1), np.stack([data["level"], data["flow"]], 1),
+        data["valve"].to_numpy()[:, None],
+    )  # fmt: skip
+    table = pl.read_parquet("two.parquet")
+    assert np.array_equal(table["theta_a1[level<-flow]"], alone["level"].theta[:, 1])
+    assert np.array_equal(table["prediction[flow]"], alone.prediction[:, 1], equal_nan=True)
+    run("one.csv", "--y", "level,flow", "--u", "valve", "--model", "arx:1,1", *KALMAN, "--out", "two.npz")
+    assert np.array_equal(Outputs.load("two.npz").theta, alone.theta)
+    text = run("one.csv", "--y", "level,flow", "--u", "valve,pump", "--model", "regression:shared,ny=2", *KALMAN)
+    assert "theta1" in text
+
+
+def test_a_fleet_of_several_outputs(tanks):
+    text = run("all.csv", *TWO, "--u", "valve", "--by", "tank", "--out", "two.csv", "--report", "two.html")
+    assert "Series   4, 0 without a result" in text
+    assert "('b', 'flow')" in text
+    table = pl.read_csv("two.csv")
+    data = tanks[1]
+    alone = track(
+        ARX(1, 1, ny=("level", "flow")), Kalman(q=1e-3, r=0.1), np.stack([data["level"], data["flow"]], 1),
+        data["valve"].to_numpy()[:, None],
+    )  # fmt: skip
+    assert table.filter(tank="b")["theta_a1[level<-flow]"].to_numpy() == pytest.approx(alone.theta[:, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--model", "hammerstein-wiener:1,1", "--y", "level,flow"), "has one output, but --y names level, flow"),
+        (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but --y names level, flow"),
+        (("--y", "level,flow", "--by", "tank", "--plot", "x.png"), "no picture of many records"),
+        (("--y", "level,flow", "--by", "tank", "--out", "x.npz"), "one run"),
+        (("--y", "level,flow", "--unit", "flow=l"), "several outputs carry none"),
+        (("--y", ","), "names no column"),
+    ],
+)
+def test_what_several_outputs_cannot_have(tanks, arguments, said):
+    result = CliRunner().invoke(app, ["track", "all.csv", "--u", "valve", *KALMAN, *arguments])
+    assert result.exit_code == 2
+    assert said in " ".join(result.output.split())
+
+
+def test_the_package_is_the_command(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["driftfit", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("driftfit", run_name="__main__")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("driftfit ")

@@ -12,7 +12,7 @@ from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, t
 from driftfit.detect import Alarms
 from driftfit.judges.alarm_statistics import normal_scores
 from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
-from driftfit.judges.onsets import held, mean_limit, normal_limit, onsets, power_limit
+from driftfit.judges.onsets import chance, held, mean_limit, mean_rate, normal_limit, onsets, power_limit, power_rate
 from driftfit.judges.scale import core
 from driftfit.kernel import exp, kernel
 from driftfit.trackers.kalman import INDEPENDENT
@@ -214,7 +214,7 @@ def test_score_by_hand():
     labels = np.zeros(20, int)
     labels[6:12] = 1
     labels[17:] = 1
-    said = Alarms("band", 10.0, active, onsets(active), np.zeros((20, 1)), np.ones(1), ("b1",), 2, None)
+    said = Alarms("band", 10.0, active, onsets(active), np.zeros((20, 1)), np.ones(1), ("b1",), 2, 0.5, None)
     got = said.score(labels)
     assert (got.events, got.found, got.delay, got.false, got.normal) == (2, 1, 2.0, 2, 9)
     with pytest.raises(ValueError, match="20 samples"):
@@ -266,3 +266,33 @@ def test_a_calibration_needs_a_model_that_it_can_simulate():
     run = track(HammersteinWiener(1, 1), K, y, u)
     with pytest.raises(ValueError, match="calibration simulates"):
         run.detect("innovation", every=100.0, calibrate=True)
+
+
+def test_chance_of_an_extreme():
+    """Tiny where a fault is, not without one; from the rate of onsets, or simulated."""
+    y, u = arx_record(3000, 4)
+    run = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y, u)
+    quiet = run.detect("innovation")
+    loud = track(ARX(2, 2), Kalman(q=0.0, r=0.01), y + 0.3 * (np.arange(3000) > 2000), u).detect("innovation")
+    assert quiet.p > 0.01
+    assert loud.p < 1e-6
+    assert "Chance" in str(loud)
+    # a record that just reaches the limit of one alarm in its own length does so in 1 - exp(-1/2) of cases, twice
+    J, window = 2000, 20
+    limit = power_limit(window, 2.0 * J)
+    beyond = stats.chi2.sf(limit, window)
+    assert chance(power_rate(window), limit, beyond, J) == pytest.approx(1.0 - np.exp(-0.5), abs=0.01)
+    simulated = run.detect("innovation", every=500.0, calibrate=True)
+    assert 0.0 < simulated.p <= 1.0
+    assert np.isnan(track(ARX(2, 2), Kalman(q=0.0, r=0.01), y[:60], u[:60]).detect("innovation", window=50).p)
+
+
+@pytest.mark.parametrize("rate", [(power_rate(20), moving, 2), (mean_rate(20), moving, 1)])
+def test_chance_is_that_of_the_largest_of_many(rate):
+    """The share of a thousand records of 300 sums whose largest is beyond a limit; onsets come in clusters."""
+    (begins, start, top), sums, power = rate
+    g = np.random.default_rng(7).normal(size=(1000, 319)) ** power
+    largest = np.array([np.abs(sums(row, 20)).max() for row in g])
+    limit = float(np.quantile(largest, 0.9))
+    one = stats.chi2.sf(limit, 20) if power == 2 else 2.0 * stats.norm.sf(limit / np.sqrt(20.0))
+    assert 0.08 < chance((begins, start, top), limit, one, 300) < 0.18

@@ -47,8 +47,9 @@ def test_dead_zone_is_played_with_its_thresholds():
     for t in range(1, 42):
         y[t] = 0.5 * y[t - 1] + 2.0 * v[t - 1]
     theta = np.array([[-0.5, 2.0, 2.0 * 0.5, 2.0 * -0.25]])
-    got = model.play(theta, np.zeros((1, 1)), np.append(u, 0.0)[None, :, None], np.zeros((1, 41)), (-1.0, 1.0))
-    assert got[0] == pytest.approx(y[1:], abs=1e-12)
+    for played in (model, HammersteinWiener(1, 1, input=DeadZone(2.0, fed="average"))):
+        got = played.play(theta, np.zeros((1, 1)), np.append(u, 0.0)[None, :, None], np.zeros((1, 41)), (-1.0, 1.0))
+        assert got[0] == pytest.approx(y[1:], abs=1e-12)
 
 
 def test_drawn_bands_are_the_delta_method_where_that_is_exact_enough():

@@ -101,3 +101,63 @@ def test_outputs_of_one_record(tmp_path):
     shared = track(Regression(2, ny=2, shared=True), K, y, rows)
     assert shared.verdict().drifts
     shared.report(tmp_path / "shared.html")
+
+
+def test_alarms_of_a_fleet_share_one_rate(fleet):
+    """Each series is watched for its part of the rate; what is found is named, what is too short is told."""
+    said = fleet.detect("band", every=1000.0, reference=140)
+    assert set(said.faulty) == set(said.alarmed) == {f"<{k}>" for k in MOVED}
+    assert len(said) == 6
+    assert "too little" in said.failed["<6>"]
+    alone = fleet["<1>"].detect("band", every=7000.0, reference=140)
+    assert np.array_equal(said["<1>"].limits, alone.limits)
+    assert np.array_equal(said["<1>"].onsets, alone.onsets)
+    assert said.expected == pytest.approx(6 * 160 / 7000.0)
+    assert [row.q for row in said.rows] == pytest.approx(discoveries(np.array([row.alarms.p for row in said.rows])))
+    assert {row.key for row in said.rows[:2]} == {f"<{k}>" for k in MOVED}
+    table = said.table
+    assert len(table) == sum(len(row.alarms.onsets) for row in said.rows)
+    assert set(table["key"]) == {f"<{k}>" for k in MOVED}
+    assert said.rows[0].first.endswith(said.rows[0].alarms.cause(int(said.rows[0].alarms.onsets[0])))
+    text = str(said)
+    assert "one false alarm of all 6 series in 1000 samples" in text
+    assert "not judged, <6>" in text
+    with pytest.raises(KeyError, match="too little"):
+        said["<6>"]
+
+
+def test_every_series_may_have_a_reference_of_its_own(fleet):
+    bands = {key: {"b1[u]": (0.5, 1.5)} for key in fleet} | {"<4>": {"b1[u]": (0.5, 2.5)}}
+    said = fleet.detect("band", every=1000.0, reference=bands)
+    assert said.faulty == ("<1>",)
+    assert not said.failed
+
+
+def test_alarms_of_several_outputs():
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=(600, 1))
+    y = u * [1.0, -2.0] + 0.1 * rng.normal(size=(600, 2))
+    y[400:, 1] += 0.5
+    run = track(Regression(1, ny=("level", "flow")), Kalman(q=0.0, r=0.01), y, u)
+    said = run.detect("innovation", reference=300)
+    assert said.faulty == ("flow",)
+    assert 400 <= said["flow"].onsets[0] < 450
+
+
+def test_without_faults_few_series_are_accused():
+    """p-values of series without a fault are not too small."""
+    rng = np.random.default_rng(6)
+    u, v = rng.normal(size=(2, 200, 400))
+    fleet = track(Regression(1), Kalman(q=0.0, r=1.0), u + v, u, by="row")
+    p = np.array([row.alarms.p for row in fleet.detect("innovation", window=20).rows])
+    assert np.mean(p < 0.05) < 0.08
+    assert np.mean(p < 0.5) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [({"kind": "bands"}, "kind"), ({"level": 0.0}, "level"), ({"every": 0.5}, "every"), ({}, "where the parameters")],
+)
+def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
+    with pytest.raises(ValueError, match=match):
+        fleet.detect(**settings)

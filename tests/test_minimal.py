@@ -198,6 +198,43 @@ def test_the_likelihood_finds_the_drift():
     assert run.loglik == pytest.approx(tuned.loglik, rel=1e-6)
 
 
+def naive_dead_zone(y, u, fed, T):
+    """Kalman filter, one lag of w and two of v: functions of an input with the thresholds known before it."""
+    theta, P = np.full(7, 0.01), 1e4 * np.eye(7)
+    p, f, path = np.array([0.01, -0.01]), np.zeros((T, 3)), np.zeros((T, 7))
+    for t in range(T):
+        above, below = u[t] >= p[0], u[t] <= p[1]
+        f[t] = u[t] * (above or below), -1.0 * above, -1.0 * below
+        if t >= 2:
+            b = -f[[t - 1, t - 2]]
+            phi = np.concatenate([[y[t - 1]], b[:, 0], b[:, 1], b[:, 2]])
+            P = P + 1e-4 * np.eye(7)
+            K = P @ phi / (phi @ P @ phi + 1e-2)
+            theta = theta + K * (-y[t] - phi @ theta)
+            P = P - np.outer(K, phi @ P)
+            gain, products = theta[1:3], theta[3:].reshape(2, 2)
+            p = products @ gain / (gain @ gain) if fed == "least-squares" else np.mean(products / gain, axis=1)
+            p = np.clip(p, (0.0, -0.97 * 2.0), (0.97 * 2.0, 0.0))
+        path[t] = theta
+    return path
+
+
+@pytest.mark.parametrize("fed", ["least-squares", "average"])
+def test_thresholds_of_a_dead_zone_are_fed_back(fed):
+    rng = np.random.default_rng(3)
+    u = rng.uniform(-2.0, 2.0, 300)
+    v = np.where(u > 0.8, u - 0.8, np.where(u < -0.6, u + 0.6, 0.0))
+    y = np.zeros(300)
+    for t in range(2, 300):
+        y[t] = 0.5 * y[t - 1] + 0.7 * v[t - 1] + 0.3 * v[t - 2] + 0.02 * rng.normal()
+    model = HammersteinWiener(1, 2, input=DeadZone(2.0, fed=fed))
+    run = track(model, Kalman(q=1e-4, r=1e-2, p0=1e4, theta0=0.01), y, u)
+    assert_allclose(run.theta[2:], naive_dead_zone(y, u, fed, 300)[2:], atol=1e-8)
+    assert_allclose(run.blocks("average").c[-1, 1:], [0.8, -0.6], atol=0.1)
+    with pytest.raises(ValueError, match="least-squares"):
+        DeadZone(2.0, fed="svd")
+
+
 def test_the_furnace():
     """Item 16, and what can be known of it."""
     f = furnace(0, T=1500)

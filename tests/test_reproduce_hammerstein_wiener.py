@@ -10,6 +10,7 @@ from driftfit.reproduce.hammerstein_wiener import claims, runs, tables
 from driftfit.reproduce.hammerstein_wiener.figures import errors, parameters
 from driftfit.systems.hammerstein_wiener import example
 from driftfit.track import track
+from driftfit.trackers.kalman import Kalman
 
 
 def test_the_first_examples_have_the_reference_errors():
@@ -39,7 +40,7 @@ def made_up(scale=1.0):
     """Measurements that are the reference, times a number."""
     pair = {key: runs.Errors(scale * median, 1.0) for _, key, _, median, _ in tables.ROWS}
     plain = {key: scale * pair[key].median for key in pair if "step" in key or "run" in key or key == "nis"}
-    path = np.full(5000, 0.1)
+    path = np.full(5000, tables.RAW[4] / 3.0)
     furnace = runs.FurnaceRun(path, path, path, path, path)
     return tables.Found(
         [pair | plain], [dict.fromkeys(tables.ARRIVALS, 14.0)], [pair | plain], {4: [furnace]}, [furnace],
@@ -56,6 +57,26 @@ def test_tables_and_claims_read_what_was_measured():
     assert "0.41" in claims.noise(found).measured
     assert all(len(claim(found)) == 3 for claim in (claims.rivals, claims.separation, claims.drift, claims.order))
     assert "hammerstein-wiener" in reproductions()
+
+
+def test_one_step_is_inverted_on_the_range_of_the_record():
+    """Once a run has seen that range its own predictions are the same, and a range that lacks them clips."""
+    s = example(3, 200, T=1500, snr_db=20.0)
+    run = track(s.model, Kalman(q=1e-3, r=1.0, p0=1e8, theta0=0.01), s.y, s.u)
+    seen = max(s.y.argmin(), s.y.argmax()) + 1
+    assert seen < 1400
+    assert runs.one_step(run, s)[seen:] == pytest.approx(run.prediction[seen:], abs=1e-3)
+    extreme = s._replace(y=np.append(s.y[:-1], 40.0))
+    fast = track(s.model, runs.PAPER, s.y, s.u)
+    assert runs.rms(s.y0 - runs.one_step(fast, extreme)) > runs.rms(s.y0 - fast.prediction)
+
+
+def test_the_bias_is_the_mean_error():
+    """A tenth of the noise variance is a tenth of the bias, although the errors of single records do not shrink so."""
+    few = {db: [runs.misfit(db, 0.0, seed, T=1000) for seed in range(12)] for db in (40.0, 30.0)}
+    sizes = {db: np.linalg.norm(np.mean(rows, axis=0)) for db, rows in few.items()}
+    assert 0.06 < sizes[40.0] / sizes[30.0] < 0.16
+    assert np.median(np.linalg.norm(few[40.0], axis=1)) > 2.0 * sizes[40.0]
 
 
 def test_the_command_runs():

@@ -17,6 +17,9 @@
   its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
   rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
 
+``p`` is the chance that a record without a fault gets as extreme as this one: from the same rates (the least of the
+columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
+
 Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many
 runs as 50 every / T for a calibration.
 """
@@ -31,13 +34,14 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.judges.alarm_statistics import STATISTICS, Reference
+from driftfit.judges.alarm_statistics import STATISTICS, Reference, Watched
 from driftfit.judges.calibrate import limit_of, null_records
 from driftfit.judges.onsets import held, onsets
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import one_of, whole
 from driftfit.summary import WIDTH, facts, table_of
+from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,6 +82,8 @@ class Alarms:
         What the columns are: parameters, "power" and "mean" of the innovations, or "probability".
     start : int
         First sample that is judged; what comes before is the start of the run, or the reference.
+    p : number
+        Chance of an extreme like the largest here without a fault; NaN where nothing was judged.
     """
 
     kind: str
@@ -88,6 +94,7 @@ class Alarms:
     limits: Array
     names: tuple[str, ...]
     start: int
+    p: float
     run: Track = field(repr=False, compare=False)
 
     def cause(self, t: int) -> str:
@@ -110,6 +117,10 @@ class Alarms:
         delay = float(np.median(delays)) if delays else float("nan")
         return Score(len(first), len(delays), delay, int(false), int(np.sum(~wrong[self.start :])))
 
+    def span(self, t: int) -> tuple[str, str]:
+        """First and last time of the alarm that began at t."""
+        return self.run.time_text(t), self.run.time_text(self._end(t) - 1)
+
     def _end(self, t: int) -> int:
         """The sample after the alarm that began at t."""
         return t + int(np.argmin(np.append(self.active[t:], False)))
@@ -121,13 +132,13 @@ class Alarms:
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
             ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
             ("Alarms", f"{len(self.onsets)}"),
+            ("Chance", f"{p_text(self.p)} that a record without a fault gets as extreme as this one"),
         )
         table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
         for t in self.onsets[:20]:
             j = self.names.index(self.cause(int(t)))
-            stop = min(self._end(int(t)), len(self.active)) - 1
             numbers = (f"{self.statistic[t, j]:.4g}", f"{self.limits[j]:.4g}")
-            table.add_row(self.run.time_text(int(t)), self.run.time_text(stop), Text(self.names[j]), *numbers)
+            table.add_row(*self.span(int(t)), Text(self.names[j]), *numbers)
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
@@ -190,10 +201,25 @@ def detect(
         raise ValueError(f"detect: every must be a number of samples above 1; got {every!r}.")
     whole("detect", "window", window, 4)
     whole("detect", "hold", hold, 0)
-    statistic, limits, names, start = STATISTICS[kind](run, every, reference, window)
+    seen = STATISTICS[kind](run, every, reference, window)
+    statistic, limits, names, start, likely = seen
+    highest, judged = _highest(seen), int(np.isfinite(statistic[start:]).any(axis=1).sum())
     if calibrate or kind == "probability":
-        made = (STATISTICS[kind](null, every, reference, window) for null in null_records(run, every, at, seed))
-        limits = limit_of(((part[0], part[3]) for part in made), every)
+        made = [STATISTICS[kind](null, every, reference, window) for null in null_records(run, every, at, seed)]
+        limits = limit_of(((part.statistic, part.start) for part in made), every)
+        as_far = [np.max(_highest(part) / limits) >= np.max(highest / limits) for part in made]
+        p = (1.0 + sum(as_far)) / (1.0 + len(made))
+    else:
+        p = likely(highest, judged) if likely is not None else float("nan")
     with np.errstate(invalid="ignore"):
         active = held((statistic > limits).any(axis=1) & (np.arange(len(run)) >= start), hold)
-    return Alarms(kind, float(every), active, onsets(active), statistic, np.asarray(limits), names, start, run)
+    return Alarms(
+        kind, float(every), active, onsets(active), statistic, np.asarray(limits), names, start,
+        p if judged else float("nan"), run,
+    )  # fmt: skip
+
+
+def _highest(seen: Watched) -> Array:
+    """The largest value of each column, (c,), over the samples that are judged; -inf where there is none."""
+    part = seen.statistic[seen.start :]
+    return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))

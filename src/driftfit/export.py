@@ -157,14 +157,17 @@ def check_ending(path: str | PathLike[str]) -> str:
     return ending
 
 
-def write(result: Track | Fleet, path: str | PathLike[str]) -> None:
-    """Write a result: a table as .csv or .parquet, or a whole Track as .npz, by the ending of the name."""
+def write(result: Any, path: str | PathLike[str]) -> None:
+    """Write a result: a table as .csv or .parquet, or a whole run as .npz, by the ending of the name."""
     ending = check_ending(path)
-    if ending == ".parquet":
-        to_parquet(result, path)
-    elif ending == ".csv":
-        as_table(result).write_csv(Path(path))
-    elif isinstance(result, Track):
+    single = hasattr(result, "to_parquet")  # one output
+    if ending == ".npz" and hasattr(result, "save"):
         result.save(path)
+    elif ending == ".npz":
+        raise ValueError(f"{path}: an .npz file holds one run; write a fleet as .parquet, or fleet[key].save(...).")
+    elif ending == ".parquet" and single:
+        to_parquet(result, path)
+    elif ending == ".parquet":
+        outputs_table(result).write_parquet(Path(path))
     else:
-        raise ValueError(f"{path}: an .npz file holds one Track; write a fleet as .parquet, or fleet[key].save(...).")
+        (as_table(result) if single else outputs_table(result)).write_csv(Path(path))

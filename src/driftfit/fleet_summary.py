@@ -12,7 +12,7 @@ max_t |theta_t - theta_0| stands in units of its median over the fleet.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from io import StringIO
 from typing import TYPE_CHECKING
@@ -100,6 +100,16 @@ class FleetSummary:
 
 def summarise(fleet: Fleet) -> FleetSummary:
     """Build the summary of a fleet."""
+    dropped: Counter[str] = Counter()
+    for of_one in fleet.records.dropped.values():
+        dropped.update(of_one)
+    return summary_of(dict(fleet.items()), repr(fleet.model), fleet.failed, dict(dropped))
+
+
+def summary_of(
+    fleet: Mapping[Hashable, Track], model: str, failed: Mapping[Hashable, str], dropped: Mapping[str, int]
+) -> FleetSummary:
+    """Build the summary of runs by key, all with the same number of parameters."""
     runs = list(fleet.values())
     paths = [_path(run) for run in runs]
     excursion = np.array([path.excursion for path in paths])
@@ -107,11 +117,8 @@ def summarise(fleet: Fleet) -> FleetSummary:
     moved = np.array([path.moved for path in paths]) if scaled else excursion / _median(excursion)
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)
-    dropped: Counter[str] = Counter()
-    for of_one in fleet.records.dropped.values():
-        dropped.update(of_one)
     trackers = tuple(dict.fromkeys(repr(run.tracker) for run in runs))
-    return FleetSummary(repr(fleet.model), trackers, tuple(units), fleet.failed, dict(dropped), scaled)
+    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled)
 
 
 @dataclass(frozen=True)

@@ -141,10 +141,14 @@ def _verdict(said: Verdict, health: Diagnosis) -> str:
     return f'<div class="verdict">{lines}</div>'
 
 
-def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    """A table; cells are HTML already."""
-    top = "".join(f"<th>{head}</th>" for head in heads)
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
+def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]], words: Sequence[int] = ()) -> str:
+    """A table; cells are HTML already, and ``words`` the columns that are read as text, besides the first."""
+    kinds = [' class="words"' if column in words else "" for column in range(len(heads))]
+
+    def line(tag: str, cells: tuple[str, ...]) -> str:
+        return "".join(f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+
+    top, body = line("th", heads), "".join(f"<tr>{line('td', row)}</tr>" for row in rows)
     short = " short" if len(rows) <= SHORT else ""
     return (
         f'<div class="wide{short}"><table><caption>{escape(caption)}</caption>'

@@ -69,12 +69,13 @@ def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
         rows.append((escape(str(row.key)), escape(row.change), *numbers, *errors, marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
     more = f" The first {LISTED} of {len(said)}." if len(said) > LISTED else ""
-    return table(f"The clearest first.{more}", heads, rows)
+    return table(f"The clearest first.{more}", heads, rows, (1,))
 
 
 def _pictured(row: Judgement, run: Track) -> str:
     told = escape(" ".join(row.said.sentences))
-    return f"<h3>{escape(str(row.key))}</h3><p>{told}</p>{picture(parameter_figure(run), run, PARAMETERS)}"
+    shown = picture(parameter_figure(run), run, PARAMETERS)
+    return f'<div class="one"><h3>{escape(str(row.key))}</h3><p>{told}</p>{shown}</div>'
 
 
 def _health(health: ManyDiagnoses) -> str:

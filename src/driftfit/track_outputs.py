@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.drivers import output_type
+from driftfit.fleet_summary import FleetSummary, summary_of
 from driftfit.joint import drive, joint_tile, taken_over, trackers_of
+from driftfit.judges.methods import JudgedMany
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.outputs import Outputs
@@ -37,8 +39,12 @@ class Signals(NamedTuple):
     labels: Labels = PLAIN
 
 
-class OutputsFleet(dict[Hashable, Any]):
-    """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result."""
+class OutputsFleet(JudgedMany, dict[Hashable, Any]):
+    """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result.
+
+    Verdict, diagnosis, summary and report are over every output of every record, with keys (key, output); over every
+    record where its outputs share one theta.
+    """
 
     def __init__(
         self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str], by: Sequence[str] = ("series",)
@@ -48,6 +54,17 @@ class OutputsFleet(dict[Hashable, Any]):
 
     def __repr__(self) -> str:
         return f"Records of several outputs: {', '.join(map(repr, self))}"
+
+    def _runs(self) -> dict[Hashable, Track]:
+        found: dict[Hashable, Track] = {}
+        for key, run in self.items():
+            found |= {key: run.rows} if run.model.shared else {(key, name): run[name] for name in run.outputs}
+        return found
+
+    def summary(self) -> FleetSummary:
+        """Which outputs of which records moved most; printing it shows the first twenty."""
+        model = next((repr(run.model) for run in self.values()), "")
+        return summary_of(self._runs(), model, self.failed, {})
 
     def to_table(self, kind: str = "polars") -> Any:
         """All results as one table, the keys first."""

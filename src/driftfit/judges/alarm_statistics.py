@@ -1,17 +1,17 @@
 """What the alarms of `driftfit.detect` look at, and the limits that theory gives.
 
-Every function returns (statistic (T, c), limits (c,), names of the columns, first sample that is judged).
+Every function returns a `Watched`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
-from driftfit.judges.onsets import mean_limit, normal_limit, power_limit
+from driftfit.judges.onsets import chance, mean_limit, mean_rate, normal_limit, normal_rate, power_limit, power_rate
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import near, whole
@@ -19,7 +19,21 @@ from driftfit.settings import near, whole
 Reference = Mapping[str, tuple[float, float]] | int | None
 
 
-def _band(run: Track, every: float, reference: Reference, window: int) -> tuple[Array, Array, tuple[str, ...], int]:
+class Watched(NamedTuple):
+    """What an alarm looks at."""
+
+    statistic: Array
+    """(T, c)"""
+    limits: Array
+    """(c,)"""
+    names: tuple[str, ...]
+    start: int
+    """First sample that is judged."""
+    chance: Callable[[Array, int], float] | None
+    """Chance that a record without a fault reaches these highest values (c,) in so many samples; None: no theory."""
+
+
+def _band(run: Track, every: float, reference: Reference, window: int) -> Watched:
     """How many standard deviations parameters are outside their bands."""
     if not run.tracker.covariance:
         raise ValueError(f"detect: {type(run.tracker).__name__} carries no covariance, so no band can be judged.")
@@ -40,8 +54,14 @@ def _band(run: Track, every: float, reference: Reference, window: int) -> tuple[
     theta, std = run.theta[:, columns], run.std[:, columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         outside = np.maximum(theta - high, low - theta) / std
-    limits = np.array([normal_limit(rho, every * len(names)) for rho in _alike(theta[_burn(run) :], std[_burn(run) :])])
-    return np.where(np.isfinite(std), outside, np.nan), limits, names, start
+    rhos = _alike(theta[_burn(run) :], std[_burn(run) :])
+    limits = np.array([normal_limit(rho, every * len(names)) for rho in rhos])
+
+    def likely(highest: Array, J: int) -> float:
+        each = [chance(normal_rate(rho), z, special.ndtr(-z), J) for rho, z in zip(rhos, highest, strict=True)]
+        return min(1.0, len(each) * min(each))
+
+    return Watched(np.where(np.isfinite(std), outside, np.nan), limits, names, start, likely)
 
 
 def _alike(theta: Array, std: Array) -> Array:
@@ -71,9 +91,7 @@ def _burn(run: Track) -> int:
     return max(50, 5 * run.model.n)
 
 
-def _innovation(
-    run: Track, every: float, reference: Reference, window: int
-) -> tuple[Array, Array, tuple[str, ...], int]:
+def _innovation(run: Track, every: float, reference: Reference, window: int) -> Watched:
     """Windowed sums of squares and of innovations, over the samples that were used."""
     with np.errstate(invalid="ignore", divide="ignore"):
         g = run.innovation / run.innovation_std
@@ -94,7 +112,16 @@ def _innovation(
     statistic[:, 1] = np.abs(statistic[:, 1])
     power, mean = power_limit(window, 2.0 * every), mean_limit(window, 2.0 * every)
     limits = np.array([window + (power - window) * slack, mean * slack])
-    return _carried(statistic), limits, ("power", "mean"), start
+
+    def likely(highest: Array, J: int) -> float:
+        loud, aside = window + (highest[0] - window) / slack, highest[1] / slack
+        each = (
+            chance(power_rate(window), loud, special.chdtrc(window, max(loud, 0.0)), J),
+            chance(mean_rate(window), aside, 2.0 * special.ndtr(-aside / np.sqrt(window)), J),
+        )
+        return min(1.0, 2.0 * min(each))
+
+    return Watched(_carried(statistic), limits, ("power", "mean"), start, likely)
 
 
 def normal_scores(g: Array, known: Array) -> Array:
@@ -109,9 +136,7 @@ def _carried(statistic: Array) -> Array:
     return np.where((place >= 0)[:, None], statistic[place], np.nan)
 
 
-def _probability(
-    run: Track, every: float, reference: Reference, window: int
-) -> tuple[Array, Array, tuple[str, ...], int]:
+def _probability(run: Track, every: float, reference: Reference, window: int) -> Watched:
     """The probability of a change in the tracker's window."""
     if CHANGE in run.tracker.outputs:
         p = run._written(CHANGE)
@@ -123,7 +148,7 @@ def _probability(
             f"detect: {type(run.tracker).__name__} carries no probability of a change; track with Bank, or use "
             'kind="band" or kind="innovation".'
         )
-    return np.reshape(p, (len(run), -1))[:, :1], np.ones(1), ("probability",), _burn(run)
+    return Watched(np.reshape(p, (len(run), -1))[:, :1], np.ones(1), ("probability",), _burn(run), None)
 
 
 CHANGE, REPORT, HYPOTHESES = "window", "report", "hypotheses"

@@ -67,7 +67,9 @@ class Judgement:
         """The first of them in words."""
         moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
-        return f"{moved[0].name} {moved[0].before:.3g} to {moved[0].after:.3g}, {moved[0].when}{more}" if moved else ""
+        if not moved:
+            return ""
+        return f"{moved[0].name} {moved[0].before:.3g} to {moved[0].after:.3g} at {moved[0].when}{more}"
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,9 @@ class ManyVerdicts:
         for sentence in self.sentences:
             yield Text(f" {sentence}")
         table = table_of("The clearest first", "", "what moves most", "p", "q", "error", "LS", "pays", names=2)
+        table.columns[1].no_wrap = False  # words give way to numbers
+        for column, width in zip(table.columns[2:], (8, 8, 7, 7, 4), strict=True):
+            column.ratio, column.min_width = None, width
         for row in self.rows[:SHOWN]:
             errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
             table.add_row(Text(str(row.key)), Text(row.change), p_text(row.said.p), p_text(row.q), *errors)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
     from driftfit.judges.many import ManyDiagnoses, ManyVerdicts
+    from driftfit.judges.many_alarms import ManyAlarms
     from driftfit.kernel import Array
     from driftfit.result import Track
     from driftfit.simulate import Prediction
@@ -34,6 +35,24 @@ class JudgedMany:
         from driftfit.judges.many import diagnoses
 
         return diagnoses(self._runs())
+
+    def detect(
+        self,
+        kind: str = "band",
+        *,
+        every: float = 10_000.0,
+        level: float = 0.05,
+        reference: Any = None,
+        **settings: Any,
+    ) -> ManyAlarms:
+        """Alarms of all of them, one false in ``every`` samples of all together, and which of them had something.
+
+        ``level`` is a false discovery rate, ``reference`` one for all or a mapping from every key to its own; kinds and
+        other settings are those of `driftfit.detect`.
+        """
+        from driftfit.judges.many_alarms import alarms
+
+        return alarms(self._runs(), kind, every=every, level=level, reference=reference, **settings)
 
     def report(self, path: str | PathLike[str], title: str | None = None) -> None:
         """Write one self-contained HTML page: all of them in one table, the clearest with pictures."""

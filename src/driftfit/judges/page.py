@@ -10,6 +10,7 @@ body { margin: 0; background: var(--page); color: var(--ink);
   font: 1rem/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
 main { max-width: 64rem; margin: 0 auto; padding: 1.5rem; }
 h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2rem 0 .5rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .3rem; }
 .soft, figcaption, caption { color: var(--soft); font-size: .88rem; }
 .verdict { background: var(--card); border-left: .35rem solid var(--blue); padding: .8rem 1.1rem; margin: 1rem 0; }
 .verdict p { margin: .3rem 0; } .verdict p:first-child { font-size: 1.15rem; font-weight: 600; }
@@ -18,14 +19,14 @@ h1 { font-size: 1.6rem; margin: 0 0 .2rem; } h2 { font-size: 1.15rem; margin: 2r
 caption { text-align: left; padding-bottom: .3rem; caption-side: top; }
 td { font-size: .94rem; }
 th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap; }
-th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child { text-align: left; }
+th { font-weight: 600; font-size: .88rem; } th:first-child, td:first-child, .words { text-align: left; }
 .bad { color: var(--red); font-weight: 600; } .good { color: var(--good); }
 figure { margin: 1rem 0; } figure svg { width: 100%; height: auto; display: block; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.2rem; margin: .5rem 0; }
 dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margin: .2rem 0; }
 @media print { :root { --page: #ffffff; --ink: #000000; --soft: #444444; --rule: #bbbbbb; --card: #f4f4f4;
   --blue: #1f5fa8; --red: #c23b22; --grey: #777777; --good: #23713b; } html { font-size: 11px; }
-  figure, tr, li, .verdict, .short { break-inside: avoid; }
+  figure, tr, li, .verdict, .short, .one { break-inside: avoid; }
   h2, h3 { break-after: avoid; } main { max-width: none; padding: 0; }
   .wide { overflow: visible; } th, td { white-space: normal; } }
 """

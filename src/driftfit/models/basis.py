@@ -30,7 +30,7 @@ from driftfit.kernel import Array
 from driftfit.models import curve_kernels
 from driftfit.models.curves import Basis, Functions
 from driftfit.models.splines import BSpline, PiecewiseLinear
-from driftfit.settings import numbers, whole
+from driftfit.settings import numbers, one_of, whole
 
 __all__ = [
     "BSpline",
@@ -152,12 +152,17 @@ class Chebyshev(_Orthogonal):
 class DeadZone(Basis):
     """A dead zone between p2 < 0 < p1: v = u - p1 above it, u - p2 below, 0 inside; an input block only.
 
-    The thresholds are coefficients, and the functions use their estimates of the sample before, held within
-    0 .. 0.97 u_max and -0.97 u_max .. 0: a Gauss-Newton step in p. ``start`` is where both begin, in size.
+    The thresholds are coefficients, and the functions of an input use their estimates of the sample before it, held
+    within 0 .. 0.97 u_max and -0.97 u_max .. 0: a Gauss-Newton step in p. ``start`` is where both begin, in size.
+
+    A filter of products b_j c_k gives nb estimates of a threshold: ``fed`` says whether they are combined by least
+    squares, sum_j b_j (b_j c_k) / sum_j b_j^2 ("least-squares"), or by the mean of (b_j c_k) / b_j ("average", what
+    Feng and Hong have; a b_j near zero throws it off).
     """
 
     u_max: float
     start: float = 0.01
+    fed: str = "least-squares"
 
     code: ClassVar[int] = curve_kernels.DEAD_ZONE
     adaptive: ClassVar[bool] = True
@@ -165,6 +170,7 @@ class DeadZone(Basis):
     def __post_init__(self) -> None:
         self._set("u_max", numbers("DeadZone", "u_max", self.u_max, ndim=0, low=0.0, strict=True))
         self._set("start", numbers("DeadZone", "start", self.start, ndim=0, low=0.0))
+        one_of("DeadZone", "fed", self.fed, ("least-squares", "average"))
 
     @property
     def n(self) -> int:
@@ -172,7 +178,7 @@ class DeadZone(Basis):
 
     @property
     def own_numbers(self) -> Array:
-        return np.array([self.start, -self.start, self.u_max])
+        return np.array([self.start, -self.start, self.u_max, float(self.fed == "average")])
 
     @property
     def expected(self) -> tuple[float, float]:

@@ -4,7 +4,7 @@ The field ``blocks`` (size, L) begins with the numbers named below. `places_of` 
 begin. The machines behind the steps get the address of ``blocks`` for one lane, element i of which stands L numbers
 after element i - 1; the places are constants to them, so that their loops unroll.
 
-    f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, ..; the inputs themselves in u_past (nb + nk)
+    f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, .., of a dead zone with the thresholds known then
     g_past  (1 + na, n_out)   functions of the outputs t, t - 1, ..; their slopes in h_past
     d_now   (n_out)           coefficients (1, d_2 ..) before the sample
     trial, trial_bend         functions and slopes at a y that is tried; spare, slopes that nobody needs
@@ -33,16 +33,16 @@ range of medians of three, and what steps tell the machine and hear from it; HEA
 """
 
 (
-    NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, F_PAST, U_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
+    NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, F_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
     TRIAL_BEND, INTO, OUT, CURVE, BEND, LEVEL, D_SEEN, REACH,
-) = range(23)  # fmt: skip
+) = range(22)  # fmt: skip
 """Places: orders, whether the output block is the identity and the input basis depends on its own coefficients, and
 where the arrays begin.
 """
 
 
 Places = Array
-"""Whole numbers (23,), a constant to the compiler."""
+"""Whole numbers (22,), a constant to the compiler."""
 
 
 def _arrays(structure: Structure, nk: int, into: Array, out: Array) -> dict[int, Array]:
@@ -50,7 +50,7 @@ def _arrays(structure: Structure, nk: int, into: Array, out: Array) -> dict[int,
     na, nb, n_in, n_out, _ = structure
     outputs = np.full((1 + max(na, 1)) * n_out, np.nan)
     return {
-        F_PAST: np.full(n_in * (nb + nk), np.nan), U_PAST: np.full(nb + nk, np.nan), G_PAST: outputs, H_PAST: outputs,
+        F_PAST: np.full(n_in * (nb + nk), np.nan), G_PAST: outputs, H_PAST: outputs,
         SPARE: np.zeros(n_in), D_NOW: np.eye(1, n_out)[0], TRIAL: np.zeros(n_out), TRIAL_BEND: np.zeros(n_out),
         INTO: into, OUT: out,
         CURVE: np.zeros(GRID * n_out), BEND: np.zeros(GRID * n_out), LEVEL: np.zeros(GRID), D_SEEN: np.zeros(n_out),

@@ -55,7 +55,10 @@ def _inputs(model: HammersteinWiener, B: Array, u: Array) -> Array:
     if not model.into.adaptive:
         return model.into.value(u)
     b = B[:, :, 0]
-    upper, lower = (np.sum(b * B[:, :, k], axis=1) / np.sum(b * b, axis=1) for k in (1, 2))
+    if model.into.settings()["fed"] == "average":
+        upper, lower = (np.mean(B[:, :, k] / b, axis=1) for k in (1, 2))
+    else:
+        upper, lower = (np.sum(b * B[:, :, k], axis=1) / np.sum(b * b, axis=1) for k in (1, 2))
     most = INSIDE * float(model.into.settings()["u_max"])
     above, below = u >= np.clip(upper, 0.0, most)[:, None], u <= np.clip(lower, -most, 0.0)[:, None]
     known = np.where(np.isfinite(u), 0.0, np.nan)

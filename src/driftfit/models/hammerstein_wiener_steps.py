@@ -1,7 +1,8 @@
 """The compiled steps of `driftfit.models.hammerstein_wiener`.
 
-The record keeps the functions of the last inputs and outputs, so that each is evaluated once; only a basis that depends
-on its own coefficients is evaluated anew for all lags. The output is predicted from theta before the sample, by solving
+The record keeps the functions of the last inputs and outputs, so that each is evaluated once; a basis that depends on
+its own coefficients is evaluated with those known before the sample of the input. The output is predicted from theta
+before the sample, by solving
 
     g_1(y) + sum_k d_k g_k(y) = -(phi' theta over all columns but those of the present output)
 
@@ -44,7 +45,6 @@ from driftfit.models.block_memory import (
     SEEN,
     SPARE,
     STARTED,
-    U_PAST,
     VARIANCE,
     N,
     Places,
@@ -162,14 +162,15 @@ def complete(p: Places, phi: Array) -> bool:
 
 @core
 def thresholds(m: Array, p: Places, theta: Array) -> None:
-    """The coefficients of a dead zone, fed back."""
+    """The coefficients of a dead zone, fed back: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
     na, nb = p[NA], p[NB]
     x_c, at_bc, into = na + nb, na + nb + p[N_OUT] - 1, p[INTO]
     for k in range(2):
         total, size = 0.0, 0.0
-        for j in range(nb):
-            size += theta[na + j, 0] * theta[na + j, 0]
-            total += theta[na + j, 0] * theta[at_bc + k * nb + j, 0] if m[MINIMAL, 0] == 0.0 else 0.0
+        for j in range(nb if m[MINIMAL, 0] == 0.0 else 0):
+            gain, product = theta[na + j, 0], theta[at_bc + k * nb + j, 0]
+            size += 1.0 if m[into + 4, 0] > 0.0 else gain * gain
+            total += product / gain if m[into + 4, 0] > 0.0 else product * gain
         threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[x_c + k, 0]
         if abs(threshold) < LARGEST:
             top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
@@ -184,17 +185,11 @@ def _regress_work(into: Any, out: Any) -> Any:
 
     def regress_work(m: Array, p: Places, theta: Array, phi: Array) -> None:
         n_in, n_out, depth = p[N_IN], p[N_OUT], p[NB] + p[NK]
-        f, g, h, spare, u_past = p[F_PAST], p[G_PAST], p[H_PAST], p[SPARE], p[U_PAST]
+        f, g, h, spare = p[F_PAST], p[G_PAST], p[H_PAST], p[SPARE]
         if m[DT, 0] > GAP:
             forget(m, p)
-        if p[ADAPTIVE] > 0:
-            shift(m, u_past, 1, depth)
-            m[u_past, 0] = m[U, 0]
-            for j in range(depth):
-                input_at(m, p, m[u_past + j, 0], f + j * n_in, spare)
-        else:
-            shift(m, f, n_in, depth)
-            input_at(m, p, m[U, 0], f, spare)
+        shift(m, f, n_in, depth)
+        input_at(m, p, m[U, 0], f, spare)
         fill(m, p, phi)
         if m[STARTED, 0] == 0.0 and complete(p, phi):
             m[STARTED, 0] = 1.0

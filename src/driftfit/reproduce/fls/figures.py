@@ -36,8 +36,8 @@ def draw(folder: Path, seeds: Iterable[int]) -> None:
         records = [example(name, s) for s in numbers]
         found = [fits(d, MU[name])[method] for d in records]
         title = f"{name}, {method}, mu = {MU[name]:g}"
-        parameters(records, found, title).savefig(folder / f"fls_paper_{first:02d}.png", dpi=80)
-        outputs(records, found, title).savefig(folder / f"fls_paper_{second:02d}.png", dpi=80)
+        parameters(records, found, title).savefig(folder / f"fls_paper_{first:02d}.png", dpi=110)
+        outputs(records, found, title).savefig(folder / f"fls_paper_{second:02d}.png", dpi=110)
 
 
 def parameters(records: list[Simulated], found: list[Fit], title: str) -> Figure:
@@ -78,6 +78,7 @@ def outputs(records: list[Simulated], found: list[Fit], title: str) -> Figure:
     error.plot(fit.one_step, color=BLUE, lw=1.1)
     error.plot(d.y - after, color=RED, lw=0.8, ls="--")
     error.set_ylabel("error")
+    error.legend(**ABOVE)
     error.set_xlabel("sample")
     for axis in (signal, error):
         axis.grid(alpha=0.25, lw=0.5)
@@ -87,7 +88,7 @@ def outputs(records: list[Simulated], found: list[Fit], title: str) -> Figure:
 def _band(axis: Axes, values: Array) -> None:
     """What 95 % of the seeds span."""
     low, high = np.nanquantile(values, (0.025, 0.975), axis=0)
-    axis.fill_between(np.arange(values.shape[1]), low, high, color=BLUE, alpha=0.15, lw=0)
+    axis.fill_between(np.arange(values.shape[1]), low, high, color=BLUE, alpha=0.15, lw=0, label="95 % of the seeds")
 
 
 def _view(axis: Axes, values: Array) -> None:

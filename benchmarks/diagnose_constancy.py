@@ -1,0 +1,79 @@
+"""How often `diagnose` finds fault with constancy where the coefficients are constant.
+
+Regression on three inputs and ARX(2, 2), Gaussian noise, nothing moves. "loss" is what letting the coefficients move
+costs: the one-step error of the tracker over that of constant least squares, less one, median over the records. Three
+rules for "the drift is set too high", each beside constants that are not rejected (p above 0.05):
+
+    ratio     the errors of the record are more than 3 % larger than those of constants
+    worse     constants are better at all, at 1 % (paired test)
+    by 3 %    the errors are more than 3 % larger, at 1 % (paired test): what `diagnose` uses
+
+"constant" is a tracker that holds the coefficients, which has fault found where constancy is rejected at 1 %.
+
+Run: python benchmarks/diagnose_constancy.py [records a cell, 60 by default]
+"""
+
+import sys
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy import signal
+
+from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
+from driftfit.compare import errors
+from driftfit.diagnose import MATERIAL, holds_constant
+from driftfit.judges.constancy import constancy
+from driftfit.judges.paired import paired
+from driftfit.judges.regressors import regressors
+from driftfit.result import root_mean_square
+
+TRACKERS = {
+    "constant": Kalman(q=0.0, r=1.0), "AdaptiveKalman()": AdaptiveKalman(), "Kalman, q/r = 1e-4": Kalman(q=1e-4, r=1.0),
+    "Kalman, q/r = 1e-3": Kalman(q=1e-3, r=1.0), "Kalman, q/r = 1e-2": Kalman(q=1e-2, r=1.0),
+}  # fmt: skip
+
+
+def record(model: str, seed: int, T: int) -> tuple[np.ndarray, np.ndarray]:
+    """Outputs (T,) and inputs."""
+    rng = np.random.default_rng(seed)
+    if model == "regression":
+        u, e = rng.normal(size=(T, 3)), rng.normal(size=T)
+        return u @ [1.0, -1.0, 0.5] + e, u
+    u, e = rng.normal(size=T), rng.normal(size=T)
+    A, B = [1.0, -1.1, 0.5], [0.0, 1.0, 0.5]
+    return signal.lfilter(B, A, u) + signal.lfilter([1.0], A, e), u
+
+
+def judged(run: Track) -> tuple[float, bool, bool, bool]:
+    """(loss, ratio, worse, by 3 %); the first rule of a tracker that holds constants is its own."""
+    rows, error = regressors(run), errors(run)
+    p = constancy(rows.phi, rows.y).p_joint
+    own, steady = error.tracked[error.scored], error.constant_ls[error.scored]
+    loss = root_mean_square(own) / root_mean_square(steady)
+    if holds_constant(run):
+        return loss - 1.0, p < 0.01, p < 0.01, p < 0.01
+    kept = p > 0.05
+    return (
+        loss - 1.0, kept and loss > MATERIAL, kept and paired("", own, steady).p < 0.01,
+        kept and paired("", own, MATERIAL * steady).p < 0.01,
+    )  # fmt: skip
+
+
+def main(records: int = 60) -> None:
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Fault found, % of {records} constant records", width=100)
+    for head in ("model", "tracker", "T", "loss, %", "ratio", "worse", "by 3 %"):
+        table.add_column(head, justify="left" if head in ("model", "tracker") else "right")
+    for name, model in (("regression", Regression(3)), ("ARX(2, 2)", ARX(2, 2))):
+        for tracker, given in TRACKERS.items():
+            for T in (200, 1000, 5000):
+                rows = np.array([judged(track(model, given, *record(name, seed, T))) for seed in range(records)])
+                shares = (f"{100.0 * share:.1f}" for share in rows[:, 1:].mean(axis=0))
+                table.add_row(name, tracker, str(T), f"{100.0 * np.median(rows[:, 0]):.2f}", *shares)
+        table.add_section()
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main(*(int(given) for given in sys.argv[1:2]))

@@ -1,0 +1,5 @@
+"""``python -m driftfit``: the command line."""
+
+from driftfit.cli import main
+
+main()
