@@ -1,5 +1,7 @@
 """What the contract tests need to know of a tracker that they have never seen: numbers for its required settings."""
 
+from dataclasses import fields
+
 VALUES = {"q": 1e-3, "r": 0.1, "forgetting": 0.98, "mu": 1.0}
 """By the name of the setting, not of the tracker; 1 / (1 - forgetting) is 50 samples."""
 
@@ -16,6 +18,11 @@ def ready(kind, values=VALUES, **settings):
     unknown = set(kind.required) - values.keys() - settings.keys()
     assert not unknown, f"{kind.__name__}: give the required settings {sorted(unknown)} a value in contract_table.py"
     return kind(**{name: values[name] for name in kind.required if name not in settings} | settings)
+
+
+def forms(kind):
+    """The settings of every form that a tracker comes in."""
+    return [{}, {"form": "sqrt"}] if "form" in {field.name for field in fields(kind)} else [{}]
 
 
 def model_of(tracker, model):

@@ -20,7 +20,7 @@ Y, U = record(60, 11, (25,))
 
 @njit
 def matched(B, members, unknown, share, A):
-    merge.match(B, members, 2, 0, unknown, share, A, 0)
+    merge.match(B, members, 2, 0, unknown, share, A, 0, A)
 
 
 @njit

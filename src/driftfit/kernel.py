@@ -14,9 +14,9 @@ from __future__ import annotations
 import dis
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
-from types import CodeType, FunctionType
+from types import CellType, CodeType, FunctionType
 from typing import Any
 
 import numba
@@ -103,6 +103,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
     dispatcher = njit(error_model="numpy", nogil=True, cache=cache, **options)(function)
     dispatcher.identity = name
     dispatcher._set_uuid(name)
+    dispatcher.again = lambda other: _compiled(other, cache, **options)
     return dispatcher
 
 
@@ -208,6 +209,50 @@ def outside(function: Callable[..., Any]) -> Outside:
     _OUTSIDE[symbol] = dispatcher
     _MACHINES[symbol] = machine
     return machine
+
+
+def exchanged(functions: Sequence[Any], others: Mapping[Any, Any]) -> tuple[Any, ...]:
+    """Compiled functions, or machines, made anew with other functions in the place of some that they call.
+
+    ``others`` says what takes whose place, also where it is called through others. So a second form of a machine is the
+    first with some parts exchanged, and is compiled only where it is asked for.
+
+    Raises
+    ------
+    ValueError
+        If something whose place is taken is called nowhere.
+    """
+    found = {id(old): (old, new, new is old) for old, new in others.items()}
+    made = tuple(_again(function, found) for function in functions)
+    unused = [old.__name__ for old, new, asked in (found[id(old)] for old in others) if not asked]
+    if unused:
+        raise ValueError(f"exchanged: nothing calls {', '.join(unused)}.")
+    return made
+
+
+def _again(value: Any, found: dict[int, tuple[Any, Any, bool]]) -> Any:
+    if id(value) not in found:
+        found[id(value)] = value, _rebuilt(value, found), True
+    old, new, _ = found[id(value)]
+    found[id(value)] = old, new, True
+    return new
+
+
+def _rebuilt(value: Any, found: dict[int, tuple[Any, Any, bool]]) -> Any:
+    """The function itself where nothing in it is exchanged."""
+    inner = _OUTSIDE[value.symbol] if isinstance(value, Outside) else value
+    if not hasattr(inner, "again"):
+        return value
+    source = inner.py_func
+    used = {name: source.__globals__[name] for name in _globals(source.__code__) & source.__globals__.keys()}
+    new = {name: _again(one, found) for name, one in used.items()}
+    held = [cell.cell_contents for cell in source.__closure__ or ()]
+    hold = [_again(one, found) for one in held]
+    if all(new[name] is one for name, one in used.items()) and all(a is b for a, b in zip(held, hold, strict=True)):
+        return value
+    names, closure = source.__globals__ | new, tuple(CellType(one) for one in hold) or None
+    made = FunctionType(source.__code__, names, source.__name__, source.__defaults__, closure)
+    return outside(made) if isinstance(value, Outside) else inner.again(made)
 
 
 @intrinsic

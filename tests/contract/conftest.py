@@ -1,15 +1,21 @@
 """The contract: what every tracker that stands in the folder promises. A new file there is tested by being there."""
 
 import pytest
-from contract_table import model_of, ready
+from contract_table import forms, model_of, ready
 
 from driftfit import ARX
 from driftfit.trackers import found
 
+EVERY = {
+    name + "".join(f"({key}={value})" for key, value in form.items()): ready(kind, **form)
+    for name, kind in found().items()
+    for form in forms(kind)
+}
 
-@pytest.fixture(params=list(found().values()), ids=list(found()))
+
+@pytest.fixture(params=list(EVERY.values()), ids=list(EVERY))
 def tracker(request):
-    return ready(request.param)
+    return request.param
 
 
 @pytest.fixture

@@ -27,14 +27,14 @@ event.register("numba:compile", Count())
 EVERY_TRACKER = (
     COUNT
     + """
-from contract_table import model_of, ready
+from contract_table import forms, model_of, ready
 from driftfit import Live, Regression, track
 from driftfit.trackers import found
 
-for kind in found().values():
-    model = model_of(kind, Regression(1))
-    live = Live(model, ready(kind))
-    track(model, ready(kind), [1.0, 2.0], [1.0, 1.0])
+for tracker in [ready(kind, **form) for kind in found().values() for form in forms(kind)]:
+    model = model_of(tracker, Regression(1))
+    live = Live(model, tracker)
+    track(model, tracker, [1.0, 2.0], [1.0, 1.0])
     live.update(1.0, 1.0)
 print(json.dumps(Count.compiled))
 """

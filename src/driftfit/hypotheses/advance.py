@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.hypotheses.forecast import expect, expect_together
-from driftfit.hypotheses.forget import BEFORE, CAP, average, for_interval
+from driftfit.hypotheses.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.hypotheses.grow import grow
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import (
@@ -22,13 +22,11 @@ from driftfit.hypotheses.leaves import (
     NU,
     WEIGHT,
     S,
-    blur,
     increments,
     mixture,
     normalise,
     priors,
     regressors,
-    spread,
     standstill,
     variance_factor,
 )
@@ -108,13 +106,13 @@ def reduce(
         return int(L)
     flip(many)
     if kind == INTERACT:
-        return int(mix(B, L, prior, n, na, unknown, A, order, X[0], T, T2))
+        return int(mix(B, L, prior, n, na, unknown, A, order, X, T, T2))
     G = many[GROUPS]
     if alone:
         pick(T, expanded, H, Hm, parent, event, order, G, news, T2)
         kept = take(B, order, G, len(A), unknown, bases, A)
     else:
-        kept = combine(B, group, L, G, n, na, unknown, A, start, order, X[0], T, T2)
+        kept = combine(B, group, L, G, n, na, unknown, A, start, order, X, T, T2)
     now[KEPT] = min(kept, 1.0)
     return int(G)
 
@@ -207,11 +205,9 @@ def advance(
         )
     if not plain or now[IN_OK] == 0.0:
         regressors(phi, B, L, min(L, 1), n, na, Z)
-        if walks:
-            blur(B, L, n, prior, Hm, Qt, C, m, scratch[0])
-        else:
-            average(B, L, n, prior, Hm, Qt, maps, theta0, C, m, scratch)
-        spread(C, Z, m, L, n, na, g, expected)
+        foresee(
+            B, L, n, na, prior, Hm, Qt, maps, theta0, walks, now[IN_OK] > 0.0, C, m, Z, g, expected, scratch
+        )  # fmt: skip
         widen_by_lags(B, L, L, n, na, m, h)
     if not plain:
         now[Y_HAT], now[S2] = expect(
@@ -328,9 +324,9 @@ def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, la
 
 @core
 def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
-    """The one leaf that a bank starts from."""
+    """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
     n = len(theta)
-    at = FIRST + n
+    at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
     for row in range(LOG, FIRST):
         B[row, 0] = 0.0
     B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER
@@ -338,6 +334,7 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
         B[FIRST + i, 0] = theta[i]
         for j in range(i + 1):
             B[at, 0] = P[i, j]
+            P[i, j] *= unit
             at += 1
     for at in range(T.shape[1]):
         T[0, at] = 1.0 if at % (H + 1) == H else 0.0
@@ -398,6 +395,7 @@ def bank(table: int) -> None:
     many, now = wholes(t[MANY, 0], 1, COUNT)[0], floats(t[NOW, 0], 1, SIZE)[0]
     head = floats(t[REPORT, 0], 1, HEAD)[0]
     if many[SETTLED] != 1:
+        packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
         wait(
             packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 28),
             t[FLAGS, 0],
@@ -405,7 +403,6 @@ def bank(table: int) -> None:
         root = packed(t, 23)
         for row in range(len(root)):
             root[row, 0] = packed(t, 1)[row, 0]
-        packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
         note(packed(t, 26), many[CLOCK], 0.0, packed(t, 28))
         return

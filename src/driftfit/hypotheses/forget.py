@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.hypotheses.leaves import FIRST
-from driftfit.kernel import Array, core, exp
+from driftfit.hypotheses.leaves import FIRST, blur, spread
+from driftfit.kernel import Array, core, exp, part
 
 KEEP, RESET, KIND, GAIN = range(4)
 """Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an
@@ -199,6 +199,21 @@ def average(
     for i in range(n):
         for l in range(L):
             m[i, l] += B[FIRST + i, l]
+
+
+@part
+def foresee(
+    B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
+    used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
+) -> None:  # fmt: skip
+    """The rows z'C z and z'm of ``expected`` for every leaf with all that may happen to it, and m; and C, which no
+    caller needs where the sample is ``used``.
+    """
+    if walks:
+        blur(B, L, n, prior, Hm, Q, C, m, X[0])
+    else:
+        average(B, L, n, prior, Hm, Q, maps, places, C, m, X)
+    spread(C, Z, m, L, n, na, g, expected)
 
 
 def anchors_of(covariance: Array) -> Array:

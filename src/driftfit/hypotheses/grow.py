@@ -161,7 +161,7 @@ def grow(
     tri = n * (n + 1) // 2
     C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
     expected, likely = X[tri + 3 * n : tri + 3 * n + 2], tri + 3 * n + 2
-    columns = ahead(n, A, K, phi, na, Q, maps, places, own, Hm, C, m, Z, g, expected)
+    columns = ahead(n, A, K, phi, na, Q, maps, places, own, Hm, C, m, Z, X[tri + 2 * n :], expected)
     if na > 0:
         widen_by_lags(A, K, columns, n, na, m, expected[0])
     for j in range(Hm):

@@ -27,6 +27,19 @@ SMALL = 1e-9
 
 
 @core
+def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
+    """z' (keep C + Q) z of a leaf."""
+    lags, at, wide = FIRST + n + n * (n + 1) // 2, 0, 0.0
+    for i in range(n):
+        z = B[lags + i, l] if i < na else phi[i]
+        for j in range(i + 1):
+            other = B[lags + j, l] if j < na else phi[j]
+            wide += z * other * (keep * B[FIRST + n + at, l] + q[at]) * (1.0 if i == j else 2.0)
+            at += 1
+    return wide
+
+
+@core
 def density_parts(
     B: Array, L: int, top: float, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
     sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array,
@@ -40,15 +53,10 @@ def density_parts(
             continue
         unit = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
         for c in range(len(Q)):
-            mean, wide, at = 0.0, 0.0, 0
+            mean, wide = 0.0, width(B, l, n, na, phi, maps[c, 0], Q[c])
             for i in range(n):
                 z = B[lags + i, l] if i < na else phi[i]
                 mean += z * (theta0[i] if maps[c, 1] > 0.0 else B[FIRST + i, l])
-                for j in range(i + 1):
-                    other = B[lags + j, l] if j < na else phi[j]
-                    entry = maps[c, 0] * B[FIRST + n + at, l] + Q[c, at]
-                    wide += z * other * entry * (1.0 if i == j else 2.0)
-                    at += 1
             for j in range(Hm):
                 e = c * Hm + j
                 chance = (row[e] if same else P[event[l], e]) * B[WEIGHT, l] / mass
@@ -57,9 +65,9 @@ def density_parts(
                     continue
                 out[0, count], out[1, count] = B[CODE, l] // top, chance
                 if frozen:
-                    width = sensors[j, STUCK]
+                    stuck = sensors[j, STUCK]
                     out[2, count] = last
-                    out[3, count] = math.sqrt(width if width > 0.0 else -width * r * unit)
+                    out[3, count] = math.sqrt(stuck if stuck > 0.0 else -stuck * r * unit)
                 else:
                     out[2, count] = mean + sensors[j, VALUE]
                     out[3, count] = math.sqrt((wide + sensors[j, FACTOR] * r) * unit)

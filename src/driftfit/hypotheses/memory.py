@@ -42,6 +42,8 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
     parents, children = _room(max(shape.parents, K // H), Hd, Hm)
+    if bank.form == "sqrt":
+        parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     past = _eights(W * (H + 1))
     refilters, waits = shape.knobs[plan.KIND] == plan.REFILTER, shape.knobs[plan.WAIT] > 0.0
     return {
@@ -64,8 +66,13 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     }  # fmt: skip
 
 
-def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool) -> dict[str, Any]:
-    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver."""
+def packed(
+    arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool, factored: bool
+) -> dict[str, Any]:  # fmt: skip
+    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
+
+    Where covariances are ``factored`` no forecast comes from that of the mixture.
+    """
     table = np.zeros((core.ROWS, 3), int)
     flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
     for k, name in enumerate(PACKED):
@@ -78,7 +85,7 @@ def packed(arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: b
     table[core.FLAGS] = na, unknown, alike
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[core.PLAIN] = na == 0 and walks and noises, walks, 0
+    table[core.PLAIN] = na == 0 and walks and noises and not factored, walks, 0
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 

@@ -62,8 +62,22 @@ def freedom(t: float, start: float) -> float:
 
 
 @core
-def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array, A: Array, to: int) -> None:
-    """Column ``to`` of A from the members, which have the given shares, summing to 1."""
+def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
+    """The covariance of column ``to`` of A, whose mean stands there already; X is spare."""
+    for k in range(len(members)):
+        l = members[k]
+        pull = B[NU, l] / B[S, l] if unknown else 1.0
+        at = FIRST + n
+        for i in range(n):
+            away = pull * (B[FIRST + i, l] - A[FIRST + i, to])
+            for j in range(i + 1):
+                A[at, to] += share[k] * (B[at, l] + away * (B[FIRST + j, l] - A[FIRST + j, to]))
+                at += 1
+
+
+@core
+def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
+    """Column ``to`` of A from the members, which have the given shares, summing to 1; X is spare."""
     C, tri = FIRST + n, n * (n + 1) // 2
     heaviest, g, t = 0, 0.0, 0.0
     for k in range(len(members)):
@@ -85,15 +99,7 @@ def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array
             A[C + tri + i, to] += share[k] * B[C + tri + i, l]
         if unknown:
             t += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
-    for k in range(len(members)):
-        l = members[k]
-        pull = B[NU, l] / B[S, l] if unknown else 1.0
-        at = C
-        for i in range(n):
-            away = pull * (B[FIRST + i, l] - A[FIRST + i, to])
-            for j in range(i + 1):
-                A[at, to] += share[k] * (B[at, l] + away * (B[FIRST + j, l] - A[FIRST + j, to]))
-                at += 1
+    pool(B, members, n, unknown, share, A, to, X)
     merge_covariance(B, members, n, na, share, A, to)
     if unknown:
         A[NU, to] = freedom(t - math.log(g), B[NU, best])
@@ -123,12 +129,12 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 @core
 def combine(
     B: Array, group: Array, L: int, G: int, n: int, na: int, unknown: bool, A: Array, start: Array, order: Array,
-    share: Array, T: Array, T2: Array,
+    X: Array, T: Array, T2: Array,
 ) -> float:  # fmt: skip
     """A leaf in A, and a row of the table, for every group that `sort` put in order; T is that of the leaves. Returns
     the mass that is left.
     """
-    kept = 0.0
+    kept, share = 0.0, X[0]
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
         mass = 0.0
@@ -141,7 +147,7 @@ def combine(
             for row in range(len(A)):
                 A[row, k] = B[row, members[0]]
         else:
-            match(B, members, n, na, unknown, part, A, k)
+            match(B, members, n, na, unknown, part, A, k, X[1:])
             A[LOG, k] = math.log(mass)
         average(T, members, part, T2, k)
     return kept
@@ -169,11 +175,11 @@ def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array,
 
 @core
 def mix(
-    B: Array, L: int, prior: Array, n: int, na: int, unknown: bool, A: Array, order: Array, share: Array, T: Array,
+    B: Array, L: int, prior: Array, n: int, na: int, unknown: bool, A: Array, order: Array, X: Array, T: Array,
     T2: Array,
 ) -> int:  # fmt: skip
     """Interaction: leaf e of A goes on from all leaves that may lead to event e; returns the number of events."""
-    H = len(prior)
+    H, share = len(prior), X[0]
     for e in range(H):
         mass, count = 0.0, 0
         for l in range(L):
@@ -187,7 +193,7 @@ def mix(
             order[0], share[0], mass, count = 0, 1.0, 1.0, 1
         for k in range(count):
             share[k] /= mass
-        match(B, order[:count], n, na, unknown, share[:count], A, e)
+        match(B, order[:count], n, na, unknown, share[:count], A, e, X[1:])
         average(T, order[:count], share[:count], T2, e)
         A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
     return H

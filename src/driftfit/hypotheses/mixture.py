@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.hypotheses.advance import HELD, LEAVES, NEVER, SETTLED
+from driftfit.hypotheses.factored import product
 from driftfit.hypotheses.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.kernel import Array
 
@@ -44,9 +45,13 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     if lane["many"][SETTLED] != 1:
         return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
     B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
-    covs = np.zeros((B.shape[1], n, n))
     i, j = np.tril_indices(n)
-    covs[:, i, j] = covs[:, j, i] = B[FIRST + n : FIRST + n + len(i)].T
+    C = B[FIRST + n : FIRST + n + len(i)]
+    if tracker.form == "sqrt":
+        covs = product(C, n)
+    else:
+        covs = np.zeros((B.shape[1], n, n))
+        covs[:, i, j] = covs[:, j, i] = C.T
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
     ages = np.where(B[AGE] < NEVER, B[AGE], np.inf)

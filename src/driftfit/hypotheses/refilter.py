@@ -18,6 +18,14 @@ Y, NOISE, TIME = 0, 1, 2
 
 
 @core
+def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
+    """C + sum w_i Q_i of the root; X is spare."""
+    for k in range(n * (n + 1) // 2):
+        for e in range(len(Q)):
+            root[FIRST + n + k, 0] += weight[e] * Q[e, k]
+
+
+@core
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
     r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
@@ -34,9 +42,7 @@ def refilter(
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
     increments(Q, sizes, c, r, unknown, samples[0, TIME], factors, Qt)
-    for k in range(tri):
-        for e in range(H):
-            root[FIRST + n + k, 0] += weight[e] * Qt[e, k]
+    widen(root, n, weight, Qt, X[1:])
     for e in range(H):
         prior[e, 0] = 0.0
     prior[0, 0] = 1.0

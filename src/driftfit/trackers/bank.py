@@ -33,10 +33,11 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
-from driftfit.hypotheses import forget
+from driftfit.hypotheses import forget, square_root
 from driftfit.hypotheses import reduction as reductions
 from driftfit.hypotheses.advance import HEAD, PACKED, bank
 from driftfit.hypotheses.change import Change
+from driftfit.hypotheses.factored import factorise, widened
 from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.memory import SINGLE, arrays_of, packed
 from driftfit.hypotheses.prior import events, per_sample
@@ -45,7 +46,7 @@ from driftfit.hypotheses.sensor import Sensor
 from driftfit.hypotheses.steps import STEPS
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.settings import covariance, matrix, numbers, vector
+from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
@@ -74,6 +75,9 @@ class Bank(Tracker):
     lag_variance : bool
         Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
         are; see `driftfit.hypotheses.lags`. False takes them for certain.
+    form : "covariance" or "sqrt"
+        "sqrt" for collinear or badly scaled regressors, a wide prior and little noise: leaves keep factors U D U' of
+        their covariances (`driftfit.hypotheses.factored`), whose variances are positive by construction.
 
     Raises
     ------
@@ -89,6 +93,7 @@ class Bank(Tracker):
     p0: Any = None
     initial: Any = None
     lag_variance: bool = True
+    form: str = "covariance"
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
@@ -107,6 +112,7 @@ class Bank(Tracker):
         if self.p0 is not None:
             self._set("p0", covariance("Bank", "p0", self.p0))
         self._set("theta0", numbers("Bank", "theta0", self.theta0))
+        one_of("Bank", "form", self.form, ("covariance", "sqrt"))
         for name in ("transition", "initial"):
             value = getattr(self, name)
             self._set(name, None if value is None else _tuples(value))
@@ -231,11 +237,13 @@ class Bank(Tracker):
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
             arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
+            core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            if self.form == "sqrt":
+                factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
         return {  # memory first, where a cache line begins
-            **packed(arrays, n, na, nominal.r is None, self._alike),
+            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt"),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
@@ -267,10 +275,14 @@ class Bank(Tracker):
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)
         n = len(p)
-        diagonal = FIRST + n + np.array([i * (i + 3) // 2 for i in range(n)])
+        diagonal = np.array([i * (i + 3) // 2 for i in range(n)])
         B = self._leaves(lane)
         factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
-        B[diagonal] += p[:, None] / np.where(factor > 0.0, factor, 1.0)
+        more, C = p[:, None] / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
+        if self.form == "sqrt":
+            widened(C, more)
+        else:
+            C[diagonal] += more
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved alike, so that the mixture stands where it is said to."""
@@ -312,8 +324,9 @@ class Bank(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        bank.load()
-        return STEPS
+        machine, steps = square_root.made() if self.form == "sqrt" else (bank, STEPS)
+        machine.load()
+        return steps
 
 
 def _tuples(value: Any) -> Any:

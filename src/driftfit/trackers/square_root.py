@@ -57,9 +57,11 @@ def take_in(s: State, l: int) -> None:
 
 @kernel
 def read_out(s: State, l: int) -> None:
-    """theta and the lower triangle of P."""
+    """theta, which only a sample moves, and the lower triangle of P."""
     n = s.theta.shape[0]
-    solve(s.S, s.d, s.theta, l)
+    solve(s.S, s.d, s.row, l)
+    for i in range(n):
+        s.theta[i, l] = s.row[i, l] if s.ok[l] > 0.0 else s.theta[i, l]
     invert(s.S, s.R, l)
     for i in range(n):
         for j in range(i + 1):

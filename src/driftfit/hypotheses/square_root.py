@@ -1,0 +1,382 @@
+"""The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
+
+It is the machine of `driftfit.hypotheses.advance` with those parts exchanged that work on covariances, so that
+everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
+`driftfit.hypotheses.factored`; every part here says which one it takes the place of. Covariances of changes are
+factorised once a sample.
+
+A walk is an `add` for every column of its factor, exponential forgetting scales D, the directional one is an `add`, the
+stabilised one n of `absorb`, a partial reset adds up what is left of the columns, and merging condenses all columns of
+the members and their distances from the mean. Until the tree begins, the one filter keeps a covariance.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from driftfit.drivers import TrackerSteps
+from driftfit.eights import WIDTH, fill, higher, load, lower, minus, over, plus, reaches, store, sum_of, times
+from driftfit.hypotheses import advance, forget, grow, leaves, lookahead, merge, refilter, steps
+from driftfit.hypotheses.factored import absorb, add, along, condense, factorise, raised
+from driftfit.hypotheses.forget import (
+    ANCHORS,
+    BEFORE,
+    CAP,
+    DIRECTIONAL,
+    EXPONENTIAL,
+    GAIN,
+    KEEP,
+    KIND,
+    MEAN,
+    PARTIAL,
+    RESET,
+    STABILISED,
+)
+from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
+from driftfit.kernel import Array, Outside, core, exchanged, kernel, part
+
+covariance_increments, covariance_begin = leaves.increments, advance.begin
+
+
+@part
+def increments(
+    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
+) -> None:
+    """`leaves.increments`, factorised."""
+    covariance_increments(Q, sizes, c, r, unknown, time, factors, out)
+    for i in range(len(Q)):
+        factorise(out[i], len(c), 0.0)
+
+
+@core
+def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
+    """`advance.begin`, factorised."""
+    covariance_begin(B, T, theta, P, nu, squares, many, H)
+    n = len(theta)
+    factorise(B[FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 1.0)
+
+
+@part
+def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
+    """`leaves.mixture`, multiplied out."""
+    variance_factor(B, L, unknown, X, n)
+    for i in range(n):
+        sums = fill(0.0)
+        for l in range(0, L, WIDTH):
+            sums = plus(sums, times(load(B, WEIGHT, l), load(B, FIRST + i, l)))
+        theta[i] = sum_of(sums)
+        for l in range(0, L, WIDTH):
+            store(X, i, l, minus(load(B, FIRST + i, l), fill(theta[i])))
+    C = B[FIRST + n :]
+    for i in range(n):
+        for j in range(i + 1):
+            sums = fill(0.0)
+            for l in range(0, L, WIDTH):
+                at = i * (i + 1) // 2
+                inner = load(C, at + i, l)
+                inner = times(inner, load(C, at + j, l)) if j < i else inner
+                for k in range(i + 1, n):
+                    at = k * (k + 1) // 2
+                    inner = plus(inner, times(load(C, at + k, l), times(load(C, at + i, l), load(C, at + j, l))))
+                entry = plus(times(inner, load(X, n, l)), times(load(X, i, l), load(X, j, l)))
+                sums = plus(sums, times(load(B, WEIGHT, l), entry))
+            P[i, j] = sum_of(sums)
+
+
+@core
+def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
+    """`leaves.spread`, but with f = U'z in g."""
+    for l in range(0, L, WIDTH):
+        y, k = fill(0.0), l if na > 0 else 0
+        for i in range(n):
+            y = plus(y, times(load(Z, i, k), load(m, i, l)))
+        store(expected, 0, l, along(C, n, l, Z, k, g, l))
+        store(expected, 1, l, y)
+
+
+@part
+def correct(
+    n: int, B: Array, at: int, columns: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
+    X: Array, row: int,
+) -> None:  # fmt: skip
+    """`grow.correct`; what the uncertainty of lags adds to z'C z counts as noise."""
+    b = X[row + 2 :].reshape(((X.shape[0] - row - 2) * X.shape[1] // WIDTH, WIDTH))
+    for l in range(0, columns, WIDTH):
+        h = fill(0.0)
+        for i in range(n):
+            f = load(g, i, l)
+            h = plus(h, times(f, times(load(C, i * (i + 3) // 2, l), f)))
+        lags, eps = minus(load(expected, 0, l), h), minus(fill(y), load(expected, 1, l))
+        a = absorb(C, l, n, g, l, plus(fill(noise), higher(lags, fill(0.0))), b, B, FIRST + n, at + l)
+        gain = over(eps, a)
+        store(X, row, l, times(eps, gain))
+        store(X, row + 1, l, a)
+        for i in range(n):
+            store(B, FIRST + i, at + l, plus(load(m, i, l), times(gain, load(b, i, 0))))
+
+
+@kernel
+def guard(C: Array, n: int, l: int, keep: float, cap: float) -> None:
+    """`forget.guard` on what was divided by the factor, before its walk."""
+    total, at = fill(0.0), 0
+    for j in range(n):
+        squares = fill(1.0)
+        for i in range(j):
+            squares = plus(squares, times(load(C, at + i, l), load(C, at + i, l)))
+        total = plus(total, times(load(C, at + j, l), squares))
+        at += j + 1
+    most = over(higher(fill(cap), over(total, fill(keep))), total)
+    for j in range(n):
+        at = j * (j + 3) // 2
+        store(C, at, l, times(load(C, at, l), lower(fill(1.0), most)))
+
+
+@kernel
+def renew(C: Array, m: Array, n: int, l: int, which: Array, mean: Array, V: Array) -> None:
+    """`forget.renew`: what is left of the columns; the new covariance is added as a walk."""
+    tri = n * (n + 1) // 2
+    for k in range(tri):
+        store(V, n + k, 0, load(C, k, l))
+        store(C, k, l, fill(0.0))
+    for i in range(n):
+        if which[i] > 0.0:
+            store(m, i, l, fill(mean[i]))
+    for k in range(n):
+        at = k * (k + 1) // 2
+        for i in range(k):
+            store(V, i, 0, fill(0.0) if which[i] > 0.0 else load(V, n + at + i, 0))
+        store(V, k, 0, fill(0.0 if which[k] > 0.0 else 1.0))
+        add(C, k + 1, l, V, load(V, n + at + k, 0))
+
+
+@kernel
+def toward(C: Array, n: int, l: int, z: Array, gain: float, V: Array) -> None:
+    """`forget.toward`."""
+    for i in range(n):
+        store(V, 2 * n + i, 0, fill(z[i]))
+    h, at = along(C, n, l, V[2 * n :], 0, V[n:], 0), 0
+    for j in range(n):
+        v = times(load(C, at + j, l), load(V, n + j, 0))
+        store(V, j, 0, v)
+        for i in range(j):
+            store(V, i, 0, plus(load(V, i, 0), times(load(C, at + i, l), v)))
+        at += j + 1
+    none = reaches(fill(0.0), h)
+    add(C, n, l, V, over(times(fill(gain), minus(fill(1.0), none)), plus(h, none)))
+
+
+@kernel
+def measure(C: Array, m: Array, n: int, l: int, w: Array, mean: Array, r: float, V: Array) -> None:
+    """`forget.measure`."""
+    away = fill(0.0)
+    for i in range(n):
+        store(V, 2 * n + i, 0, fill(w[i]))
+        away = plus(away, times(fill(w[i]), minus(fill(mean[i]), load(m, i, l))))
+    along(C, n, l, V[2 * n :], 0, V[n:], 0)
+    gain = over(away, absorb(C, l, n, V[n:], 0, fill(r), V, C, 0, l))
+    for i in range(n):
+        store(m, i, l, plus(load(m, i, l), times(gain, load(V, i, 0))))
+
+
+@kernel
+def develop_eight(
+    A: Array, of: int, n: int, c: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, to: int, V: Array
+) -> None:  # fmt: skip
+    """Eight leaves of A with change c, to the columns from ``to``; V has n + max(tri, 2 n) narrow rows."""
+    keep, kind = maps[c, KEEP], int(maps[c, KIND])
+    for k in range(n * (n + 1) // 2):
+        store(C, k, to, load(A, FIRST + n + k, of))
+    for j in range(n):
+        at = j * (j + 3) // 2
+        store(C, at, to, times(load(C, at, to), fill(keep)))
+        store(m, j, to, fill(places[MEAN, j]) if maps[c, RESET] > 0.0 else load(A, FIRST + j, of))
+    if kind == EXPONENTIAL:
+        guard(C, n, to, keep, places[CAP, 0])
+    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
+        renew(C, m, n, to, places[ANCHORS + c * n], places[MEAN], V)
+    raised(C, n, to, Q[c], fill(1.0), V)
+    if kind == DIRECTIONAL:
+        toward(C, n, to, places[BEFORE], maps[c, GAIN], V)
+    elif kind == STABILISED and maps[c, GAIN] > 0.0:
+        for k in range(n):
+            measure(C, m, n, to, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], V)
+
+
+@part
+def ahead(
+    n: int, A: Array, K: int, phi: Array, na: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array,
+    m: Array, Z: Array, g: Array, expected: Array,
+) -> int:  # fmt: skip
+    """`grow.ahead`. An eight may reach into the columns of the next change, which are written after it."""
+    V = g.reshape((g.shape[0] * g.shape[1] // WIDTH, WIDTH))
+    columns = K if own else K * len(Q)
+    for c in range(len(Q)):
+        of, to, count = (c * Hm, c * Hm, Hm) if own else (0, c * K, K)
+        for l in range(0, count, WIDTH):
+            develop_eight(A, of + l, n, c, Q, maps, places, C, m, to + l, V)
+    regressors(phi, A, K, columns // K, n, na, Z)
+    spread(C, Z, m, columns, n, na, g, expected)
+    return int(columns)
+
+
+@kernel
+def chance_of(prior: Array, c: int, Hm: int, l: int) -> Any:
+    """The probability of a change under any sensor."""
+    chance = load(prior, c * Hm, l)
+    for j in range(1, Hm):
+        chance = plus(chance, load(prior, c * Hm + j, l))
+    return chance
+
+
+@kernel
+def blur(B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, V: Array) -> None:
+    """`leaves.blur` of eight leaves."""
+    for k in range(n * (n + 1) // 2):
+        store(C, k, l, load(B, FIRST + n + k, l))
+    for c in range(len(Q)):
+        raised(C, n, l, Q[c], chance_of(prior, c, Hm, l), V)
+
+
+@kernel
+def average(
+    B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, V: Array
+) -> None:  # fmt: skip
+    """`forget.average` of eight leaves. Changes are merged one after the other, with their chances p so far and now:
+
+        C <- C + p_c C_c + p p_c / (p + p_c) d d',   m <- m + p_c / (p + p_c) d,   d = m_c - m
+
+    which subtracts nothing.
+    """
+    tri = n * (n + 1) // 2
+    one, mean, V, so_far = V[:tri], V[tri : tri + n], V[tri + n :], fill(0.0)
+    for k in range(tri):
+        store(C, k, l, fill(0.0))
+    for i in range(n):
+        store(m, i, l, load(B, FIRST + i, l))
+    for c in range(len(Q)):
+        chance = chance_of(prior, c, Hm, l)
+        develop_eight(B, l, n, c, Q, maps, places, one, mean, 0, V)
+        for k in range(n):
+            at = k * (k + 1) // 2
+            for i in range(k):
+                store(V, i, 0, load(one, at + i, 0))
+            store(V, k, 0, fill(1.0))
+            add(C, k + 1, l, V, times(chance, load(one, at + k, 0)))
+        both = plus(so_far, chance)
+        share = over(chance, plus(both, reaches(fill(0.0), both)))
+        for i in range(n):
+            away = minus(load(mean, i, 0), load(m, i, l))
+            store(V, i, 0, away)
+            store(m, i, l, plus(load(m, i, l), times(share, away)))
+        add(C, n, l, V, times(so_far, share))
+        so_far = both
+
+
+@kernel
+def walked(n: int, Q: Array, prior: Array, Hm: int, Z: Array, zl: int, l: int) -> Any:
+    """sum_c p_c z'Q_c z of eight leaves."""
+    total = fill(0.0)
+    for c in range(len(Q)):
+        wide = fill(0.0)
+        for k in range(n):
+            at = k * (k + 1) // 2
+            if Q[c, at + k] > 0.0:
+                f = load(Z, k, zl)
+                for i in range(k):
+                    f = plus(f, times(fill(Q[c, at + i]), load(Z, i, zl)))
+                wide = plus(wide, times(fill(Q[c, at + k]), times(f, f)))
+        total = plus(total, times(chance_of(prior, c, Hm, l), wide))
+    return total
+
+
+@core
+def foresee(
+    B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
+    used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
+) -> None:  # fmt: skip
+    """`forget.foresee`. Where all changes walk the variance of the forecast needs no factor of what may happen."""
+    V = X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
+    if not walks:
+        for l in range(0, L, WIDTH):
+            average(B, l, n, prior, Hm, Q, maps, places, C, m, V)
+        spread(C, Z, m, L, n, na, g, expected)
+        return
+    for l in range(0, L, WIDTH):
+        for i in range(n):
+            store(m, i, l, load(B, FIRST + i, l))
+    spread(B[FIRST + n :], Z, m, L, n, na, g, expected)
+    for l in range(0, L, WIDTH):
+        store(expected, 0, l, plus(load(expected, 0, l), walked(n, Q, prior, Hm, Z, l if na > 0 else 0, l)))
+        if not used:
+            blur(B, l, n, prior, Hm, Q, C, V)
+
+
+@core
+def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
+    """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
+    room = X.shape[0] * X.shape[1] // ((n + 2) * WIDTH) * WIDTH
+    W, count = X.reshape(X.shape[0] * X.shape[1])[: (n + 2) * room].reshape((n + 2, room)), 0
+    for k in range(len(members)):
+        l = members[k]
+        if count + n + 1 > room:
+            condense(W, count, n, A, to)
+            spill(A, to, n, 1.0, W, 0)
+            count = n
+        spill(B, l, n, share[k], W, count)
+        for i in range(n):
+            W[i, count + n] = B[FIRST + i, l] - A[FIRST + i, to]
+        W[n, count + n] = share[k] * (B[NU, l] / B[S, l] if unknown else 1.0)
+        count += n + 1
+    condense(W, count, n, A, to)
+
+
+@core
+def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
+    """The columns of a leaf's factor as columns of W, their D times ``share`` below them."""
+    at = FIRST + n
+    for j in range(n):
+        for i in range(j):
+            W[i, to + j] = B[at + i, l]
+        W[j, to + j] = 1.0
+        for i in range(j + 1, n):
+            W[i, to + j] = 0.0
+        W[n, to + j] = share * B[at + j, l]
+        at += j + 1
+
+
+@core
+def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
+    """`refilter.widen`."""
+    V = X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
+    for e in range(len(Q)):
+        raised(root[FIRST + n :], n, 0, Q[e], fill(weight[e]), V)
+
+
+@core
+def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
+    """`lookahead.width`."""
+    lags, wide, at = FIRST + n + n * (n + 1) // 2, 0.0, 0
+    for j in range(n):
+        f = B[lags + j, l] if j < na else phi[j]
+        own = f
+        for i in range(j):
+            z = B[lags + i, l] if i < na else phi[i]
+            f += B[FIRST + n + at + i, l] * z
+            own += q[at + i] * z
+        wide += keep * B[FIRST + n + at + j, l] * f * f + q[at + j] * own * own
+        at += j + 1
+    return wide
+
+
+@cache
+def made() -> tuple[Outside, TrackerSteps]:
+    """The machine and the steps that run it."""
+    others = {
+        leaves.increments: increments, leaves.mixture: mixture, advance.begin: begin,
+        forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
+        refilter.widen: widen, lookahead.width: width,
+    }  # fmt: skip
+    (machine,) = exchanged([advance.bank], others)
+    correct_step, begin_step = exchanged([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
+    return machine, steps.STEPS._replace(correct=correct_step, begin=begin_step)
