@@ -25,6 +25,7 @@ def test_probabilities_are_probabilities(run):
     np.testing.assert_allclose(told.lag_prob[there].sum(axis=1), 1.0, atol=1e-12)
     assert there[:8].sum() == 36  # one more floor a sample, until there are eight
     assert same(told.prob(3)[40], told.lag_prob[43, 3])
+    assert same(told.mode_prob, told.lag_prob[:, 0])
     assert ((told.window >= -1e-12) & (told.window <= 1.0)).all()
     assert told.log_evidence == pytest.approx(told.evidence.sum())
     assert told.kept.min() > 0.8

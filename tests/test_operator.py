@@ -117,6 +117,23 @@ def test_reset_widens_what_may_have_moved_and_leaves_the_rest():
     assert abs(live.theta[1] - 2.0) < 0.2
 
 
+@pytest.mark.parametrize("p0", [2.0, None])
+def test_reset_reaches_the_square_root(p0):
+    """Also while the start still knows nothing of a parameter."""
+    y, u = record()
+    streams = [Live(MODEL, Kalman(1e-3, 0.1, p0=p0, form=form)) for form in ("covariance", "sqrt")]
+    for t in range(100):
+        for live in streams:
+            if t in (2, 60):
+                live.reset("b1", p=4.0)
+            if t == 80:
+                live.reset("a1", theta=0.2)
+            live.update(y[t], u[t])
+        assert np.allclose(streams[1].theta, streams[0].theta, rtol=1e-9, atol=1e-12), t
+        spanned = np.isfinite(streams[0].std)
+        assert np.allclose(streams[1].std[spanned], streams[0].std[spanned], rtol=1e-9), t
+
+
 def test_reset_is_in_the_units_of_theta_for_relative_covariances():
     y, u = record()
     live = Live(MODEL, RLS(0.98))

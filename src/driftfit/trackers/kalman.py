@@ -20,14 +20,14 @@ Departures: one triangle of P is kept; an exact diffuse start (`driftfit.tracker
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import State, kernel
+from driftfit.kernel import Array, State, kernel
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers import square_root
@@ -130,6 +130,16 @@ class Kalman(Tracker):
     def _root(self, n: int) -> Mapping[str, Any]:
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
         return square_root.state(matrix("Kalman", "q", self.q, n), vector("Kalman", "theta0", self.theta0, n), p0)
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        super().widen(lane, p)
+        if self.form == "sqrt":
+            square_root.widen(lane["S"], lane["d"], p)
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        super().place(lane, which, values)
+        if self.form == "sqrt":
+            lane["d"][:] = lane["S"] @ lane["theta"]
 
     @property
     def steps(self) -> TrackerSteps:
