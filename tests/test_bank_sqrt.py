@@ -210,6 +210,9 @@ def test_stream_record_lane_and_file_agree_bit_for_bit(tmp_path):
     run = track(Regression(N), bank, Y, U)
     out, _ = run_lanes(Regression(N), [bank], Y[:, None], U[:, :, None], run._known[:, :, None])
     assert same(out["theta"][..., 0], run.theta)
+    fleet = track(Regression(N), [replace(bank, form="covariance"), bank], Y, U)
+    assert same(fleet[1].theta, run.theta)
+    assert not same(fleet[0].theta, run.theta)
     live = Live(Regression(N), bank)
     for t in range(T):
         live.update(Y[t], U[t])

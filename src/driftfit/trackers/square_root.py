@@ -41,7 +41,7 @@ def widen(S: Array, d: Array, p: Array) -> None:
     """Let theta move by variances p, in place: `spread` on arrays of one lane, by one orthogonal triangle."""
     n = len(d)
     rows = np.block([[np.eye(n), np.zeros((n, n + 1))], [-S * np.sqrt(p), S, d[:, None]]])
-    left = np.linalg.qr(rows, mode="r")[n : 2 * n, n:]
+    left = np.asarray(np.linalg.qr(rows, mode="r"))[n : 2 * n, n:]
     left *= np.where(np.diag(left) < 0.0, -1.0, 1.0)[:, None]
     S[:], d[:] = left[:, :n], left[:, n]
 
