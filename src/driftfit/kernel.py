@@ -134,7 +134,9 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    return only_linked(_compiled(function, **_PLAIN))
+    made = only_linked(_compiled(function, **_PLAIN))
+    made.again = core
+    return made
 
 
 def part(function: Callable[..., Any]) -> Any:
@@ -142,7 +144,9 @@ def part(function: Callable[..., Any]) -> Any:
 
     Passing a few dozen arrays may cost more than the work on them.
     """
-    return only_linked(_compiled(function, forceinline=True, **_PLAIN))
+    made = only_linked(_compiled(function, forceinline=True, **_PLAIN))
+    made.again = part
+    return made
 
 
 def sized(function: Callable[..., Any]) -> Any:
