@@ -1,6 +1,7 @@
 """Separation: exact products, gauges, generalised least squares, and what the methods do when it becomes hard."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from driftfit import AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.blocks.constant import fit_constant
 from driftfit.blocks.least_squares import jacobian, refine
 from driftfit.blocks.paths import split
-from driftfit.blocks.product_drift import product_drift, track_products
+from driftfit.blocks.product_drift import product_drift, renewed, track_products
 from driftfit.blocks.ratios import track_ratios
 from driftfit.blocks.separate import METHODS
 from driftfit.models.basis import Legendre, Polynomial
@@ -294,3 +295,18 @@ def test_a_drift_of_the_shape_of_products():
     assert found.theta.shape == (1500, 14)
     with pytest.raises(ValueError, match="one variance, or those"):
         product_drift(s.model, xi, (1.0, 2.0))
+
+
+@pytest.mark.parametrize("intercept", [False, True])
+def test_a_stream_renews_the_drift_of_products_as_a_record_does(intercept):
+    s = example(1, 1, T=120)
+    model, q = replace(s.model, intercept=intercept), (1e-6, 2e-6, 3e-6, 4e-6)
+    record = track_products(model, s.y, s.u, q=q, r=1e-6, every=40)
+    live = Live(model, Kalman(q=4e-6 * np.eye(model.n), r=1e-6, p0=1e8, theta0=0.01))
+    for t in range(120):
+        if t in (40, 80):
+            live = renewed(live, q)
+        live.update(float(s.y[t]), float(s.u[t]))
+        assert same(live.theta, record.theta[t])
+    with pytest.raises(ValueError, match="full matrix q"):
+        renewed(Live(model, Kalman(q=1e-6, r=1e-6)), q)

@@ -1,4 +1,4 @@
-"""Eight numbers at once, for machines whose rows are short.
+"""Eight numbers at once, or four, for machines whose rows are short.
 
 A compiler that vectorises a loop of unknown length puts checks before it and a remainder after it, which cost more than
 the loop where rows have a dozen entries. A loop over eights has neither:
@@ -24,6 +24,7 @@ from driftfit.kernel import ARTANH, EXP, LOG2, LOG2_HIGH, LOG2_LOW, ROUND, kerne
 WIDTH = 8
 _I64 = ir.IntType(64)
 _EIGHT, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
+_FOUR = ir.VectorType(ir.DoubleType(), 4)
 
 
 class Eight(types.Type):
@@ -33,13 +34,26 @@ class Eight(types.Type):
         super().__init__(name="driftfit.Eight")
 
 
+class Four(types.Type):
+    """Four floats: amid a filter of single numbers a few eights made the whole filter slower than they saved."""
+
+    def __init__(self) -> None:
+        super().__init__(name="driftfit.Four")
+
+
 @register_default(Eight)
 class _Vector(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _EIGHT)
 
 
-eight = Eight()
+@register_default(Four)
+class _Shorter(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _FOUR)
+
+
+eight, four = Eight(), Four()
 
 
 def _named(name: str, build: Any) -> Any:
@@ -65,6 +79,14 @@ def _load(context: Any, array: Any, row: Any, column: Any) -> Any:
     return eight(array, types.intp, types.intp), build
 
 
+def _load_four(context: Any, array: Any, row: Any, column: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        first = _place(context, builder, signature.args[0], *given)
+        return builder.load(builder.bitcast(first, _FOUR.as_pointer()), align=8)
+
+    return four(array, types.intp, types.intp), build
+
+
 def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         builder.store(given[3], _place(context, builder, signature.args[0], *given[:3]), align=8)
@@ -78,6 +100,13 @@ def _fill(context: Any, value: Any) -> Any:
         return _spread(builder, given[0], _EIGHT)
 
     return eight(types.float64), build
+
+
+def _fill_four(context: Any, value: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return _spread(builder, given[0], _FOUR)
+
+    return four(types.float64), build
 
 
 def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
@@ -100,7 +129,7 @@ def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
 def _spread(builder: Any, value: Any, kind: Any) -> Any:
     """One number in all places of a vector."""
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+    everywhere = ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
     return builder.shuffle_vector(one, one, everywhere)
 
 
@@ -169,7 +198,7 @@ def _two(operation: str) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return getattr(builder, operation)(*given)
 
-        return eight(eight, eight), build
+        return a(a, a), build
 
     return typed
 
@@ -179,6 +208,14 @@ def _reaches(context: Any, a: Any, b: Any) -> Any:
         return _one_where(builder, builder.fcmp_ordered(">=", *given))
 
     return eight(eight, eight), build
+
+
+def _reached(context: Any, a: Any, b: Any) -> Any:
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        bits = builder.bitcast(builder.fcmp_ordered(">=", *given), ir.IntType(given[0].type.count))
+        return builder.ctpop(builder.zext(bits, _I64))
+
+    return types.int64(a, a), build
 
 
 def _sum(context: Any, value: Any) -> Any:
@@ -231,6 +268,10 @@ equal, below = _named("equal", _compare("==")), _named("below", _compare("<"))
 """1 where entries [at] to [at + 7] of whole numbers are a value, or below it, 0 elsewhere."""
 gathered = _named("gathered", _gather)
 """Entries [row, order[k]] to [row, order[k + 7]] of a matrix."""
+reached = _named("reached", _reached)
+"""How many of the first are at least the second, of eights or of fours."""
+load_four, fill_four = _named("load_four", _load_four), _named("fill_four", _fill_four)
+"""Entries [row, column] to [row, column + 3]; one number, four times."""
 sum_of = _named("sum_of", _sum)
 """The sum of the eight, in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))

@@ -4,7 +4,8 @@
 
 When b_j walks, so do all b_j c_k: the drift of theta is far from a multiple of the identity, and four numbers say
 more than a full matrix that nobody knows. J moves with xi, so the record is tracked in pieces, each with J at the end
-of the piece before; the filter goes on where it stood.
+of the piece before; the filter goes on where it stood. A stream does the same, with `renewed` between two samples, and
+gets the same bits. On example 1 of Feng and Hong (2021) pieces of 20 samples are as accurate as pieces of 100.
 
 Source: the covariance of a product to first order. Cost per sample: that of `Kalman` with a full q.
 """
@@ -12,11 +13,14 @@ Source: the covariance of a product to first order. Cost per sample: that of `Ka
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.blocks.paths import Separator
 from driftfit.kernel import Array
+from driftfit.live import Live
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.result import Track
 from driftfit.settings import numbers, whole
@@ -88,6 +92,38 @@ def track_products(
             run = track(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
             paths.append(run.blocks("gls").xi)
         runs.append(run)
-        last = paths[-1][-1]
-        xi = last if np.isfinite(last).all() else xi
+        xi = _separated(model, run.theta[-1], xi)
     return ProductTrack(np.concatenate(paths), np.concatenate([one.theta for one in runs]), tuple(runs))
+
+
+def renewed(live: Live, q: Any) -> Live:
+    """The stream, from its next sample on with the drift of products at its present separated parameters.
+
+    Parameters
+    ----------
+    live : Live
+        A `Kalman` with a full q on a `HammersteinWiener`; the first one with the largest of ``q`` times the identity.
+    q : number or four
+        Drift variances of a, b, c and d per sample.
+
+    Returns
+    -------
+    Live, one that goes on where the given one stands, which may be dropped. Cost: that of making a `Live`, about a
+    millisecond; the compiled steps are the same.
+    """
+    model, tracker = live.model, live.tracker
+    if not isinstance(model, HammersteinWiener) or not isinstance(tracker, Kalman) or np.ndim(tracker.q) != 2:
+        raise ValueError(
+            "renewed: takes a stream of a HammersteinWiener model and a Kalman filter with a full matrix q."
+        )
+    xi = _separated(model, live.theta, None)
+    if xi is None:
+        return live
+    return Live(model, replace(tracker, q=product_drift(model, xi, q)), dt=live.dt, warm_start=live)
+
+
+def _separated(model: HammersteinWiener, theta: Array, before: Any) -> Any:
+    """xi of one theta (n,) by "svd-joint", or what held before where that is not finite."""
+    groups = Separator(model)(theta, "svd-joint")
+    xi = model.structure.minimal(*groups, np.asarray(theta[-1]) if model.intercept else None)
+    return xi if np.isfinite(xi).all() else before

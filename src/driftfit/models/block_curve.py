@@ -22,31 +22,39 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
+from driftfit.eights import fill_four, load_four, plus, reached, times
 from driftfit.kernel import Array, core, part
 from driftfit.models.block_memory import (
     BEFORE,
     BEND,
     BOTTOM,
+    CELL,
+    COARSE,
     CURVE,
     D_NOW,
     D_SEEN,
     EARLIER,
+    EIGHT,
     FIRM_HIGH,
     FIRM_LOW,
     GRID,
     HIGHEST,
+    LATE,
     LEVEL,
     LOW,
     LOWEST,
+    MOVED,
     N_OUT,
     REACH,
     RISING,
+    ROW,
     STEP,
     TOP,
     TRIAL,
     TRIAL_BEND,
     Places,
 )
+from driftfit.models.block_values import Kind, level_of
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid goes beyond it, at both ends."""
@@ -54,10 +62,9 @@ FAR = 3.0
 """Times the range of medians of three, beyond it: an output farther away is believed in no further."""
 SAFE = 0.99
 """The bound on the change of d, less what rounding may take."""
-SMALL = 1e-5
-"""A Newton step of that share of a cell is the last: the next would be of its square."""
+FINE = 1e-8
+"""Share of a cell: a Newton step that leaves an error below it is the last."""
 STEPS = 8
-EIGHTH = GRID // 8
 WIDE = 10.0
 """Times as wide as needed: a grid that was laid for an absurd first output is laid anew."""
 
@@ -69,50 +76,51 @@ def believe(m: Array, y: float) -> None:
     m[EARLIER, 0], m[BEFORE, 0] = one, y
     if other == other:
         middle = max(min(one, other), min(max(one, other), y))
-        m[FIRM_LOW, 0], m[FIRM_HIGH, 0] = min(m[FIRM_LOW, 0], middle), max(m[FIRM_HIGH, 0], middle)
+        if middle < m[FIRM_LOW, 0] or middle > m[FIRM_HIGH, 0]:
+            m[FIRM_LOW, 0], m[FIRM_HIGH, 0] = min(m[FIRM_LOW, 0], middle), max(m[FIRM_HIGH, 0], middle)
+            m[MOVED, 0] = 1.0
         margin = FAR * (m[FIRM_HIGH, 0] - m[FIRM_LOW, 0])
         bottom, top = m[FIRM_LOW, 0] - margin, m[FIRM_HIGH, 0] + margin
         y = min(max(y, bottom), top)
         m[LOWEST, 0], m[HIGHEST, 0] = max(m[LOWEST, 0], bottom), min(m[HIGHEST, 0], top)
-    m[LOWEST, 0], m[HIGHEST, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y)
+    if y < m[LOWEST, 0] or y > m[HIGHEST, 0]:
+        m[LOWEST, 0], m[HIGHEST, 0], m[MOVED, 0] = min(m[LOWEST, 0], y), max(m[HIGHEST, 0], y), 1.0
 
 
 @part
 def level(m: Array, p: Places, at: int, i: int) -> Any:
-    """sum_k d_k times row i of the table at ``at``: the level (CURVE) or its slope (BEND) at a point of the grid."""
-    n_out, d = p[N_OUT], p[D_NOW]
-    row = at + i * n_out
-    total = m[row, 0]
-    for k in range(1, n_out):
-        total += m[d + k, 0] * m[row + k, 0]
+    """sum_k d_k times function k of the table at ``at``: the level (CURVE) or its slope (BEND) at a grid point."""
+    d, place = p[D_NOW], at + i
+    total = m[place, 0]
+    for k in range(1, p[N_OUT]):
+        total += m[d + k, 0] * m[place + k * ROW, 0]
     return total
 
 
 @part
-def beneath(m: Array, p: Places, at: int, apart: int, right: float) -> int:
-    """How many of the levels 1 to 7, so many points apart, are not above ``right``, where levels rise.
+def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
+    """How many of the eight levels from a place on are not above ``right``; rows are so many numbers long."""
+    d = p[D_NOW]
+    one, other = load_four(m, at, 0), load_four(m, at + 4, 0)
+    for k in range(1, p[N_OUT]):
+        weight = fill_four(m[d + k, 0])
+        one = plus(one, times(weight, load_four(m, at + k * row, 0)))
+        other = plus(other, times(weight, load_four(m, at + k * row + 4, 0)))
+    given = fill_four(right)
+    return reached(given, one) + reached(given, other)  # type: ignore[no-any-return]
 
-    Seven levels that do not wait for each other, instead of three halvings that do.
-    """
-    n_out, d = p[N_OUT], p[D_NOW]
-    row = apart * n_out
-    one, two, three = at + row, at + 2 * row, at + 3 * row
-    four, five, six, seven = at + 4 * row, at + 5 * row, at + 6 * row, at + 7 * row
-    a, b, c = m[one, 0], m[two, 0], m[three, 0]
-    e, f, g, h = m[four, 0], m[five, 0], m[six, 0], m[seven, 0]
-    for k in range(1, n_out):
-        weight = m[d + k, 0]
-        a += weight * m[one + k, 0]
-        b += weight * m[two + k, 0]
-        c += weight * m[three + k, 0]
-        e += weight * m[four + k, 0]
-        f += weight * m[five + k, 0]
-        g += weight * m[six + k, 0]
-        h += weight * m[seven + k, 0]
-    return (
-        int(a <= right) + int(b <= right) + int(c <= right) + int(e <= right) + int(f <= right) + int(g <= right)
-        + int(h <= right)
-    )  # fmt: skip
+
+@part
+def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int:
+    """The same where the numbers of a lane do not stand side by side."""
+    d, count = p[D_NOW], 0
+    for i in range(EIGHT):
+        place = at + i
+        total = m[place, 0]
+        for k in range(1, p[N_OUT]):
+            total += m[d + k, 0] * m[place + k * row, 0]
+        count += int(total <= right)
+    return count
 
 
 @core
@@ -131,8 +139,8 @@ def look(m: Array, p: Places) -> None:
         for k in range(1, n_out):
             most = 0.0
             for i in range(GRID - 1):
-                row = at + i * n_out + k
-                most = max(most, abs(m[row + n_out, 0] - m[row, 0]) / (m[levels + i + 1, 0] - m[levels + i, 0]))
+                place = at + k * ROW + i
+                most = max(most, abs(m[place + 1, 0] - m[place, 0]) / (m[levels + i + 1, 0] - m[levels + i, 0]))
             m[seen + k, 0], m[reach + k, 0] = m[d + k, 0], most
     else:
         for i in range(GRID // 2, GRID - 1):
@@ -143,8 +151,12 @@ def look(m: Array, p: Places) -> None:
 
 @core
 def on_envelope(m: Array, p: Places, right: float) -> float:
-    """The y at which the envelope has a level, between two of its ends."""
+    """The y at which the envelope has a level; the end of the grid for a level beyond it."""
     levels = p[LEVEL]
+    if right < m[levels, 0]:
+        return float(m[LOW, 0])
+    if right >= m[levels + GRID - 1, 0]:
+        return float(m[LOW, 0] + (GRID - 1) * m[STEP, 0])
     below, above = 0, GRID - 1
     while above - below > 1:
         middle = (below + above) // 2
@@ -178,68 +190,99 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
 
 
 @lru_cache
-def inverse_of(level_at: Any) -> Any:
-    """A part (m, p, right) that inverts the output block, from one that says level and slope at a y."""
+def locating(lanes: bool = False) -> Any:
+    """A part (m, p, right) that finds the cell of the grid for a level; returns it, or the y where none holds it."""
+    count = beneath_in_lane if lanes else beneath
 
-    def invert(m: Array, p: Places, right: float) -> Any:
-        step, start = m[STEP, 0], m[LOW, 0]
-        if not (step > 0.0 and abs(right) < LARGEST):
+    def locate(m: Array, p: Places, right: float) -> Any:
+        m[LATE, 0] = 0.0
+        if not (m[STEP, 0] > 0.0 and abs(right) < LARGEST):
             return np.nan
-        rising, at, last = rises(m, p), p[CURVE], GRID - 1
-        low = level(m, p, at, 0) if rising else m[p[LEVEL], 0]
-        high = level(m, p, at, last) if rising else m[p[LEVEL] + last, 0]
-        if right < low:
-            return start
-        if right >= high:
-            return start + last * step
-        if not rising:
+        if not rises(m, p):
             return on_envelope(m, p, right)
-        below = EIGHTH * beneath(m, p, at, EIGHTH, right)
-        below += beneath(m, p, at + below * p[N_OUT], 1, right)
-        below = min(below, last - 1)
+        below = EIGHT * count(m, p, p[COARSE], EIGHT, right)
+        below += count(m, p, p[CURVE] + below + 1, ROW, right)
+        m[CELL, 0], m[LATE, 0] = min(below, GRID - 2), 1.0
+        return right
+
+    return part(locate)
+
+
+@lru_cache
+def refining(level_at: Any) -> Any:
+    """A part (m, p, right) that solves in the cell that was found, given what says level and slope at a y."""
+
+    def refine(m: Array, p: Places, right: float) -> Any:
+        step, start, at, bends, below = m[STEP, 0], m[LOW, 0], p[CURVE], p[BEND], int(m[CELL, 0])
         before, after = level(m, p, at, below), level(m, p, at, below + 1)
-        rise, bends = after - before, p[BEND]
-        first, final = level(m, p, bends, below), level(m, p, bends, below + 1)
-        left = start + below * step
-        y = left + step * cubic((right - before) / rise, rise / step, first, final)
+        if right < before:
+            return start
+        if right >= after:
+            return start + (GRID - 1) * step
+        first, final, rise = level(m, p, bends, below), level(m, p, bends, below + 1), after - before
+        mean, left = rise / step, start + below * step
+        y = left + step * cubic((right - before) / rise, mean, first, final)
+        bend = abs(first - mean) + abs(final - mean)
         for _ in range(STEPS):
             value, slope = level_at(m, p, y)
             if not slope > 0.0:
                 break
             change = (right - value) / slope
             y = min(max(y + change, left), left + step)
-            if abs(change) <= SMALL * step:
+            if change * change * bend <= FINE * step * step * slope:
                 break
         return y
+
+    return part(refine)
+
+
+@lru_cache
+def inverse_of(level_at: Any, lanes: bool = False) -> Any:
+    """A part (m, p, right) that inverts the output block, from one that says level and slope at a y."""
+    locate, refine = locating(lanes), refining(level_at)
+
+    def invert(m: Array, p: Places, right: float) -> Any:
+        found = locate(m, p, right)
+        return refine(m, p, found) if m[LATE, 0] > 0.0 else found
 
     return part(invert)
 
 
 @lru_cache
+def inverting(out: Kind) -> Any:
+    """The same as a core, for any lane and for where it is seldom needed."""
+    return core(inverse_of(level_of(out), lanes=True).py_func)
+
+
+@lru_cache
 def laying(values: Any) -> Any:
-    """A part (m, p) that lays the grid anew where the outputs believed need another."""
+    """A core (m, p) that lays the grid anew where the outputs believed need another."""
 
     def lay(m: Array, p: Places) -> None:
+        m[MOVED, 0] = 0.0
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
         start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
         wide = high - low
         margin = WIDER * (wide if wide > 0.0 else max(abs(high), 1.0))
         short = (low < start and start > m[BOTTOM, 0]) or (high > end and end < m[TOP, 0])
         if low <= high and (m[STEP, 0] == 0.0 or short or end - start > WIDE * (wide + 2.0 * margin)):
-            n_out, g, h, curve, bend = (
-                p[N_OUT],
-                p[TRIAL],
-                p[TRIAL_BEND],
-                p[CURVE],
-                p[BEND],
-            )
             start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])
             m[LOW, 0], m[STEP, 0] = start, (end - start) / (GRID - 1)
-            for i in range(GRID):
-                values(m, p, min(start + i * m[STEP, 0], end), g, h)
-                for k in range(n_out):
-                    m[curve + i * n_out + k, 0] = m[g + k, 0]
-                    m[bend + i * n_out + k, 0] = m[h + k, 0]
+            table(m, p, end)
             m[p[REACH], 0] = np.inf
 
-    return part(lay)
+    def fill_table(m: Array, p: Places, end: float) -> None:
+        n_out, g, h, curve, bend, coarse = p[N_OUT], p[TRIAL], p[TRIAL_BEND], p[CURVE], p[BEND], p[COARSE]
+        for i in range(GRID):
+            values(m, p, min(m[LOW, 0] + i * m[STEP, 0], end), g, h)
+            for k in range(n_out):
+                m[curve + k * ROW + i, 0] = m[g + k, 0]
+                m[bend + k * ROW + i, 0] = m[h + k, 0]
+        for k in range(n_out):
+            beyond = np.inf if k == 0 else 0.0
+            m[curve + k * ROW + GRID, 0] = beyond
+            for j in range(EIGHT):
+                m[coarse + k * EIGHT + j, 0] = m[curve + k * ROW + EIGHT * (j + 1), 0] if j < EIGHT - 1 else beyond
+
+    table = part(fill_table)
+    return core(lay)

@@ -41,22 +41,19 @@ def legendre(x: float, p: Array, out: Array) -> None:
     before, now = 1.0, s
     for k in range(out.shape[0]):
         out[k] = now
-        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
-        before, now = now, after
+        now, before = s * now + (s * now - before) * ((k + 1) / (k + 2)), now
 
 
 @kernel
 def legendre_slopes(x: float, p: Array, out: Array) -> None:
     # P'_(k+1) = P'_(k-1) + (2 k + 1) P_k
-    s = (x - p[0]) / p[1]
+    s, scale = (x - p[0]) / p[1], 1.0 / p[1]
     before, now = 1.0, s
     slope_before, slope = 0.0, 1.0
     for k in range(out.shape[0]):
-        out[k] = slope / p[1]
-        after = ((2 * k + 3) * s * now - (k + 1) * before) / (k + 2)
-        slope_after = slope_before + (2 * k + 3) * now
-        before, now = now, after
-        slope_before, slope = slope, slope_after
+        out[k] = slope * scale
+        slope, slope_before = slope_before + (2 * k + 3) * now, slope
+        now, before = s * now + (s * now - before) * ((k + 1) / (k + 2)), now
 
 
 @kernel

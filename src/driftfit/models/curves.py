@@ -61,6 +61,11 @@ class Basis(Settings, ABC):
         return curve_kernels.evaluate
 
     @property
+    def kind(self) -> tuple[Any, int]:
+        """The machine and the code, which steps are made from."""
+        return self.evaluate, self.code
+
+    @property
     def own_numbers(self) -> Array:
         """Numbers of the basis, (k,)."""
         return np.zeros(0)

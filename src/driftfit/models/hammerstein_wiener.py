@@ -30,6 +30,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -40,7 +41,8 @@ from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
 from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
-from driftfit.models.hammerstein_wiener_steps import FLOOR, build
+from driftfit.models.block_rows import FLOOR
+from driftfit.models.hammerstein_wiener_steps import build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -141,18 +143,16 @@ class HammersteinWiener(Model):
         return self.out == IDENTITY
 
     def memory(self) -> Mapping[str, Any]:
-        bases = self.into.parameters, self.out.parameters
-        return {"blocks": memory(self.structure, self.nk, *bases, self.out.limits, self.output_noise)}
+        return {"blocks": _memory(self).copy()}
 
     @property
     def places(self) -> tuple[int, ...]:
         """Where everything stands in the memory of the steps."""
-        bases = self.into.parameters, self.out.parameters
-        return places_of(self.structure, self.nk, *bases, self.linear, self.into.adaptive)
+        return _places(self)
 
     @property
     def steps(self) -> ModelSteps:
-        return build(self.into.evaluate, self.out.evaluate, self.places)
+        return _steps(self)
 
     @property
     def reach(self) -> int:
@@ -241,3 +241,20 @@ class HammersteinWiener(Model):
                     UserWarning,
                     stacklevel=4,
                 )
+
+
+@lru_cache
+def _places(model: HammersteinWiener) -> tuple[int, ...]:
+    bases = model.into.parameters, model.out.parameters
+    return places_of(model.structure, model.nk, *bases, model.linear, model.into.adaptive)
+
+
+@lru_cache
+def _memory(model: HammersteinWiener) -> Array:
+    bases = model.into.parameters, model.out.parameters
+    return memory(model.structure, model.nk, *bases, model.out.limits, model.output_noise)
+
+
+@lru_cache
+def _steps(model: HammersteinWiener) -> ModelSteps:
+    return build(model.into.kind, model.out.kind, model.places)

@@ -45,21 +45,35 @@ def knowing(n: int) -> dict[str, Any]:
     return knowing_nothing(n) | {"rank": n}
 
 
+def product_with(entry: Any) -> Any:
+    """A kernel that fills s.g = P x from the lower triangle of P and returns x' P x, for x_i = entry(s, i, l)."""
+
+    @kernel
+    def product(s: State, l: int) -> float:
+        n = s.theta.shape[0]
+        for i in range(n):
+            g = 0.0
+            for j in range(i + 1):
+                g += s.P[i, j, l] * entry(s, j, l)
+            for j in range(i + 1, n):
+                g += s.P[j, i, l] * entry(s, j, l)
+            s.g[i, l] = g
+        total = 0.0
+        for i in range(n):
+            total += entry(s, i, l) * s.g[i, l]
+        return total
+
+    return product
+
+
 @kernel
-def symmetric_product(s: State, l: int) -> float:
-    """s.g = P phi from the lower triangle of P; returns phi' P phi."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        g = 0.0
-        for j in range(i + 1):
-            g += s.P[i, j, l] * s.phi[j, l]
-        for j in range(i + 1, n):
-            g += s.P[j, i, l] * s.phi[j, l]
-        s.g[i, l] = g
-    total = 0.0
-    for i in range(n):
-        total += s.phi[i, l] * s.g[i, l]
-    return total
+def regressor(s: State, i: int, l: int) -> float:
+    """phi_i."""
+    return s.phi[i, l]  # type: ignore[no-any-return]
+
+
+symmetric_product = product_with(regressor)
+"""s.g = P phi; returns phi' P phi."""
 
 
 @kernel

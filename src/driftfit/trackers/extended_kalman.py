@@ -34,6 +34,7 @@ from driftfit.models.block_products import Structure
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.diffuse import product_with
 from driftfit.trackers.each import told
 from driftfit.trackers.kalman import drift, drift_matrix
 
@@ -102,19 +103,13 @@ def linearised(structure: Structure) -> Any:
 
 
 @kernel
-def spread_of(s: State, l: int) -> float:
-    """s.g = P H' from the lower triangle of P; returns H P H'."""
-    n = s.theta.shape[0]
-    total = 0.0
-    for i in range(n):
-        g = 0.0
-        for j in range(i + 1):
-            g += s.P[i, j, l] * s.h_row[j, l]
-        for j in range(i + 1, n):
-            g += s.P[j, i, l] * s.h_row[j, l]
-        s.g[i, l] = g
-        total += s.h_row[i, l] * g
-    return total
+def slope(s: State, i: int, l: int) -> float:
+    """Entry i of H."""
+    return s.h_row[i, l]  # type: ignore[no-any-return]
+
+
+spread_of = product_with(slope)
+"""s.g = P H'; returns H P H'."""
 
 
 @lru_cache

@@ -142,7 +142,7 @@ class OutputError(Tracker):
     def steps_for(self, model: Model) -> TrackerSteps:
         structure_of("OutputError", model)
         assert isinstance(model, HammersteinWiener)
-        machine = output_error(model.out.evaluate, model.places)
+        machine = output_error(model.out.kind, model.places)
         for one in (model.out.evaluate, machine):  # the machine calls the other
             one.load()
         return _steps(machine)

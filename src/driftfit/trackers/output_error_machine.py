@@ -1,8 +1,8 @@
 """The machine behind `driftfit.trackers.output_error`: one sample on plain arrays, compiled once for all orders.
 
-S is the covariance of [w, xi], whose first n_w = max(na, 1) entries are the last outputs of the linear block. ``own``
-holds the numbers named below. What the model says of the present input and output stands in its memory
-(`driftfit.models.block_memory`).
+S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
+outputs of the linear block. ``own`` holds the numbers named below. What the model says of the present input and output
+stands in its memory (`driftfit.models.block_memory`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST
-from driftfit.kernel import Array, core, floats, outside
+from driftfit.kernel import Array, core, floats, outside, part
 from driftfit.models.block_curve import inverse_of, level, rises
 from driftfit.models.block_memory import (
     CURVE,
@@ -24,6 +24,7 @@ from driftfit.models.block_memory import (
     GRID,
     HIGHEST,
     IDENTITY,
+    LATE,
     LEVEL,
     LOWEST,
     N_IN,
@@ -38,7 +39,7 @@ from driftfit.models.block_memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.block_values import level_of, output_values
+from driftfit.models.block_values import Kind, level_of, output_values
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -63,6 +64,21 @@ def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
             total += m[d + k, 0] * m[g + (i + 1) * n_out + k, 0]
         w[i] = total if total == total else 0.0
         S[i, i] = p_w
+
+
+@part
+def product(S: Array, row: Array, moved: Array, total: float) -> float:
+    """moved = S row from the lower triangle; returns row' S row, added to a total."""
+    N = len(S)
+    for x in range(N):
+        value = 0.0
+        for z in range(x + 1):
+            value += S[x, z] * row[z]
+        for z in range(x + 1, N):
+            value += S[z, x] * row[z]
+        moved[x] = value
+        total += row[x] * value
+    return total
 
 
 @core
@@ -90,26 +106,16 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array,
     for x in range(x_c + n_in - 1 + n_out - 1, N):
         row[x] = -1.0
         total -= theta[x - n_w]
-    own = q_w
-    for x in range(N):
-        value = 0.0
-        for z in range(N):
-            value += S[x, z] * row[z]
-        moved[x] = value
-    for x in range(N):
-        own += row[x] * moved[x]
+    own = product(S, row, moved, q_w)
     for i in range(n_w - 1, 0, -1):
         w[i] = w[i - 1]
         for j in range(i, 0, -1):
             S[i, j] = S[i - 1, j - 1]
-            S[j, i] = S[i, j]
         for x in range(n_w, N):
-            S[i, x] = S[i - 1, x]
-            S[x, i] = S[i, x]
+            S[x, i] = S[x, i - 1]
     shrink = np.sqrt(LARGEST_VARIANCE / own) if own > LARGEST_VARIANCE else 1.0
     for x in range(1, N):
-        S[0, x] = shrink * (moved[x - 1] if x < n_w else moved[x])
-        S[x, 0] = S[0, x]
+        S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
     S[0, 0] = min(own, LARGEST_VARIANCE)
     w[0] = total
 
@@ -127,13 +133,7 @@ def absorb(
     row[0] = 1.0 / slope
     for k in range(1, n_out):
         row[x_d + k - 1] = -m[g + k, 0] / slope
-    s = r
-    for x in range(N):
-        value = 0.0
-        for z in range(N):
-            value += S[x, z] * row[z]
-        moved[x] = value
-        s += row[x] * value
+    s: float = product(S, row, moved, r)
     if ok:
         for x in range(N):
             k = moved[x] / s
@@ -143,7 +143,6 @@ def absorb(
                 theta[x - n_w] += k * e
             for z in range(x + 1):
                 S[x, z] -= k * moved[z]
-                S[z, x] = S[x, z]
     return s
 
 
@@ -182,7 +181,7 @@ def hold(m: Array, p: Places, w: Array) -> None:
 
 
 @lru_cache
-def _work(out: Any) -> Any:
+def _work(out: Kind) -> Any:
     """One sample, for the functions of an output basis."""
     fill_trial, invert = output_values(out), inverse_of(level_of(out))
 
@@ -193,7 +192,7 @@ def _work(out: Any) -> Any:
         na, nb, n_in, n_out, d = p[NA], p[NB], p[N_IN], p[N_OUT], p[D_NOW]
         n_w, n_x = len(w), len(theta)
         for i in range(n_x):
-            for j in range(n_x):
+            for j in range(i + 1):
                 S[n_w + i, n_w + j] += q[i, j] * own[TIME]
         for k in range(n_out - 1):
             m[d + k + 1, 0] = theta[na + nb + n_in - 1 + k]
@@ -217,7 +216,7 @@ def _work(out: Any) -> Any:
         own[E] = y - y_hat if used else 0.0
         r = own[R] * m[GIVEN, 0] if used else own[R]
         own[S2] = absorb(own[E], max(slope, FLATTEST), m, p, r, used, theta, w, S, row, moved)
-        m[PREDICTED, 0] = y_hat
+        m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
         follow_power(m, p, theta, own)
         for i in range(n_x):
             for j in range(i + 1):
@@ -227,7 +226,7 @@ def _work(out: Any) -> Any:
 
 
 @lru_cache
-def output_error(out: Any, p: tuple[int, ...]) -> Any:
+def output_error(out: Kind, p: tuple[int, ...]) -> Any:
     """The machine for the functions of an output basis and the places of a model."""
     work, orders = _work(out), np.array(p)
 
