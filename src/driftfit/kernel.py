@@ -134,7 +134,7 @@ def core(function: Callable[..., Any]) -> Any:
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
     and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
     """
-    made = only_linked(_compiled(function, **_PLAIN))
+    made = only_linked(_compiled(function, cache=True, **_PLAIN))
     made.again = core
     return made
 
@@ -144,7 +144,7 @@ def part(function: Callable[..., Any]) -> Any:
 
     Passing a few dozen arrays may cost more than the work on them.
     """
-    made = only_linked(_compiled(function, forceinline=True, **_PLAIN))
+    made = only_linked(_compiled(function, cache=True, forceinline=True, **_PLAIN))
     made.again = part
     return made
 

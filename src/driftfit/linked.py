@@ -31,6 +31,10 @@ class Linked(JITCodeLibrary):
         """There is none: nothing was emitted."""
         return 0
 
+    def serialize_using_object_code(self) -> Any:
+        """What is kept on disk: there is no object code."""
+        return self.serialize_using_bitcode()
+
 
 class LinkedDispatcher(CPUDispatcher):
     """A function that Numba compiles for others to take in."""
@@ -57,17 +61,21 @@ def only_linked(dispatcher: Any) -> Any:
 def _library_of(name: str) -> Iterator[None]:
     """While it lasts, what is compiled under this name becomes `Linked`; of nested ones the inner stands."""
     codegen = cpu_target.target_context.codegen()
-    create, set_env = codegen.create_library, codegen.set_env
+    create, restore, set_env = codegen.create_library, codegen.unserialize_library, codegen.set_env
 
     def create_linked(called: str, **options: Any) -> Any:
         return Linked(codegen, called, **options) if called == name else create(called, **options)
+
+    def restore_linked(stored: Any) -> Any:
+        return Linked._unserialize(codegen, stored) if stored[0] == name else restore(stored)
 
     def set_env_of_emitted(env_name: str, env: Any) -> None:
         if codegen._engine.is_symbol_defined(env_name):
             set_env(env_name, env)
 
-    codegen.create_library, codegen.set_env = create_linked, set_env_of_emitted
+    changed = {"create_library": create_linked, "unserialize_library": restore_linked, "set_env": set_env_of_emitted}
     try:
+        vars(codegen).update(changed)
         yield
     finally:
-        codegen.create_library, codegen.set_env = create, set_env
+        vars(codegen).update(create_library=create, unserialize_library=restore, set_env=set_env)
