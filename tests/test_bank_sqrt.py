@@ -10,7 +10,7 @@ from support import arx_record, damaged, run_lanes, same
 from test_bank import N, R, changes, record
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.hypotheses import advance, leaves, merge
+from driftfit.hypotheses import leaves, merge, start
 from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.factored import factorise, widened
 from driftfit.hypotheses.factored import product as multiplied
@@ -269,7 +269,7 @@ def test_the_form_is_named():
 
 def test_parts_that_nothing_calls_are_named():
     with pytest.raises(ValueError, match="nothing calls match"):
-        exchanged([advance.begin], {merge.match: leaves.spread})
+        exchanged([start.begin], {merge.match: leaves.spread})
 
 
 @pytest.mark.parametrize("form", ["covariance", "sqrt"])

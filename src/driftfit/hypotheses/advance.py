@@ -7,21 +7,14 @@ no leaf is dropped. The reduction that was planned waits for the next sample tha
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
 
 from driftfit.hypotheses.forecast import expect, expect_together
 from driftfit.hypotheses.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.hypotheses.grow import grow
-from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
+from driftfit.hypotheses.lags import push, shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import (
-    AGE,
     FIRST,
-    LOG,
-    NU,
     WEIGHT,
-    S,
     increments,
     mixture,
     normalise,
@@ -50,26 +43,52 @@ from driftfit.hypotheses.plan import (
     number,
 )
 from driftfit.hypotheses.refilter import NOISE, TIME, Y, histories, refilter
-from driftfit.kernel import Array, core, floats, kernel, outside, part, wholes
-
-LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, COUNT = (
-    range(13)
-)
-"""Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
-it begins with the next sample.
-"""
-WAITING, READY = 0, -1
-(
-    IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, IN_VALID, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, SIZE,
-) = range(19)  # fmt: skip
-"""Numbers of the present sample: what comes in, and what goes out."""
-GROWTH = 1e8
-"""Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
-NEVER = 1e9
-"""Floors since the last change of a leaf that has none, or more."""
-HEAD = 4
-"""Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
+from driftfit.hypotheses.start import GROWTH, trace, wait
+from driftfit.hypotheses.table import (
+    AT,
+    CLOCK,
+    COUNT,
+    COV,
+    EVIDENCE,
+    EXPANDED,
+    FADE,
+    FLAGS,
+    FLIPPED,
+    FLOORS,
+    GROUPS,
+    HEAD,
+    HELD,
+    IMPOSSIBLE,
+    IN_DT,
+    IN_NOISE,
+    IN_OK,
+    IN_SEEN,
+    IN_TIME,
+    IN_Y,
+    KEPT,
+    LAST,
+    LEAST,
+    LEAVES,
+    MANY,
+    NOW,
+    PARENTS,
+    PHI,
+    PLAIN,
+    POWERS,
+    REPORT,
+    ROWS,
+    S2,
+    SETTLED,
+    SIZE,
+    STORED,
+    THETA,
+    WINDOW,
+    Y_HAT,
+    R,
+    packed,
+    whole,
+)  # fmt: skip
+from driftfit.kernel import Array, core, floats, outside, part, wholes
 
 
 @part
@@ -145,18 +164,6 @@ def plan(
         many[GROUPS] = beam(B, L, knobs, links, Hm, group, X)
     elif kind == HYBRID:
         many[GROUPS] = hybrid(B, L, knobs, bases, group, slots, links[3], X)
-
-
-@core
-def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) -> None:
-    """Output lags of leaves that took no sample in: y where it was seen, else what each expected."""
-    at = FIRST + n + n * (n + 1) // 2
-    for i in range(na - 1, 0, -1):
-        for l in range(L):
-            B[at + i, l] = B[at + i - 1, l]
-    if na > 0:
-        for l in range(L):
-            B[at, l] = y if seen else y_hat[l]
 
 
 @part
@@ -308,47 +315,6 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
     return K
 
 
-@core
-def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lag_prob: Array, na: int) -> None:
-    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    n, H = len(theta), lag_prob.shape[1]
-    lag_prob[0, 0] = 1.0
-    y_hat = B[WEIGHT, :1]
-    y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
-    push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
-    now[LAST] = now[IN_Y] if now[IN_SEEN] > 0.0 else now[LAST]
-    many[CLOCK] += 1
-    if many[SETTLED] == READY:
-        begin(B, T, theta, P, now[TIMES], max(now[SQUARES], now[LEAST] * now[TIMES]), many, H)
-
-
-@core
-def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
-    """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
-    n = len(theta)
-    at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
-    for row in range(LOG, FIRST):
-        B[row, 0] = 0.0
-    B[WEIGHT, 0], B[NU, 0], B[S, 0], B[AGE, 0] = 1.0, nu, squares, NEVER
-    for i in range(n):
-        B[FIRST + i, 0] = theta[i]
-        for j in range(i + 1):
-            B[at, 0] = P[i, j]
-            P[i, j] *= unit
-            at += 1
-    for at in range(T.shape[1]):
-        T[0, at] = 1.0 if at % (H + 1) == H else 0.0
-    many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
-
-
-@core
-def trace(P: Array) -> float:
-    total = 0.0
-    for i in range(len(P)):
-        total += P[i, i]
-    return total
-
-
 @part
 def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
     """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
@@ -358,63 +324,33 @@ def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
         ring[row, 1 + e] = lag_prob[len(lag_prob) - 1, e]
 
 
-PACKED = (
-    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
-    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "news", "lag_prob", "decided",
-)  # fmt: skip
-"""Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
-shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
-"""
-GIVEN, FACTORS = PACKED.index("given"), PACKED.index("factors")
-PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
-BASE, REPORT, PHI, C, THETA, P, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
-"""Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
-and whether the noise is unknown and events are independent; of PLAIN whether all leaves have one regressor, all changes
-are walks and all sensors differ in their noise alone, and whether all changes are walks; and how many rows there are.
-"""
-
-
-@kernel
-def packed(t: Array, k: int) -> Any:
-    """One of the packed arrays, of floats."""
-    return floats(t[BASE if k < PLACES - 2 else REPORT, 0] + t[k, 0], t[k, 1], t[k, 2])
-
-
-@kernel
-def whole(t: Array, k: int) -> Any:
-    """One of the packed arrays, of whole numbers."""
-    return wholes(t[BASE, 0] + t[k, 0], t[k, 1], t[k, 2])
-
-
 @outside
 def bank(table: int) -> None:
-    """`advance` on the arrays of a table."""
+    """One sample, by the table of a bank. Only here, where Numba lets a function own memory, can arrays be made of
+    addresses; so they are handed to `advance`, into which this writes them.
+    """
     t = wholes(table, ROWS, 3)
     n = t[THETA, 1]
     many, now = wholes(t[MANY, 0], 1, COUNT)[0], floats(t[NOW, 0], 1, SIZE)[0]
+    theta, cov = floats(t[THETA, 0], 1, n)[0], floats(t[COV, 0], n, n)
+    A, B, T, X = packed(t, AT.A), packed(t, AT.B), packed(t, AT.T), packed(t, AT.X)
+    theta0, root, lag_prob = packed(t, AT.theta0), packed(t, AT.root), packed(t, AT.lag_prob)
     head = floats(t[REPORT, 0], 1, HEAD)[0]
-    if many[SETTLED] != 1:
-        packed(t, 13)[CAP, 0] = GROWTH * trace(floats(t[P, 0], n, n))
-        wait(
-            packed(t, 1), packed(t, 2), many, now, floats(t[THETA, 0], 1, n)[0], floats(t[P, 0], n, n), packed(t, 28),
-            t[FLAGS, 0],
+    if many[SETTLED] == 1:
+        advance(
+            A, B, T, packed(t, AT.T2), X, whole(t, AT.links), whole(t, AT.group)[0], whole(t, AT.slots)[0], many, now,
+            packed(t, AT.prior), floats(t[PHI, 0], 1, n)[0], packed(t, AT.Q), packed(t, AT.sizes),
+            floats(t[POWERS, 0], 1, n)[0], packed(t, AT.factors)[0], packed(t, AT.maps), theta0, packed(t, AT.sensors),
+            packed(t, AT.chain), packed(t, AT.initial)[0], packed(t, AT.given)[0], packed(t, AT.loss),
+            packed(t, AT.knobs)[0], packed(t, AT.bases)[0], packed(t, AT.stamps)[0], packed(t, AT.decided),
+            packed(t, AT.parts), root, packed(t, AT.samples), packed(t, AT.Qt), packed(t, AT.news), lag_prob, theta,
+            cov, t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0, t[PLAIN, 1] > 0,
         )  # fmt: skip
-        root = packed(t, 23)
+        head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
+    else:
+        theta0[CAP, 0] = GROWTH * trace(cov)
+        wait(B, T, many, now, theta, cov, lag_prob, t[FLAGS, 0])
         for row in range(len(root)):
-            root[row, 0] = packed(t, 1)[row, 0]
+            root[row, 0] = B[row, 0]
         head[0], head[1], head[2], head[3] = 0.0, 0.0, 1.0, 1.0
-        note(packed(t, 26), many[CLOCK], 0.0, packed(t, 28))
-        return
-    advance(
-        packed(t, 0), packed(t, 1), packed(t, 2), packed(t, 3), packed(t, 4), whole(t, 5), whole(t, 6)[0],
-        whole(t, 7)[0], many, now, packed(t, 8),
-        floats(t[PHI, 0], 1, n)[0], packed(t, 9), packed(t, 10), floats(t[C, 0], 1, n)[0], packed(t, 11)[0],
-        packed(t, 12), packed(t, 13), packed(t, 14), packed(t, 15), packed(t, 16)[0], packed(t, 17)[0],
-        packed(t, 18), packed(t, 19)[0], packed(t, 20)[0], packed(t, 21)[0], packed(t, 29), packed(t, 22),
-        packed(t, 23), packed(t, 24), packed(t, 25), packed(t, 27), packed(t, 28), floats(t[THETA, 0], 1, n)[0],
-        floats(t[P, 0], n, n), t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0,
-        t[PLAIN, 1] > 0,
-    )  # fmt: skip
-    head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
-    note(packed(t, 26), many[CLOCK], now[WINDOW], packed(t, 28))
+    note(packed(t, AT.ring), many[CLOCK], head[1], lag_prob)

@@ -25,6 +25,18 @@ def covariance_row(n: int, na: int) -> int:
 
 
 @core
+def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) -> None:
+    """Output lags of leaves that took no sample in: y where it was seen, else what each expected."""
+    at = FIRST + n + n * (n + 1) // 2
+    for i in range(na - 1, 0, -1):
+        for l in range(L):
+            B[at + i, l] = B[at + i - 1, l]
+    if na > 0:
+        for l in range(L):
+            B[at, l] = y if seen else y_hat[l]
+
+
+@core
 def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
     at = covariance_row(n, na)

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.hypotheses.advance import CLOCK, IMPOSSIBLE, REPORTED_TO
 from driftfit.hypotheses.events import Event, Told, all_of
 from driftfit.hypotheses.memory import SINGLE
 from driftfit.hypotheses.mixture import Mixture, mixture_of
+from driftfit.hypotheses.table import CLOCK, IMPOSSIBLE, REPORTED_TO
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:

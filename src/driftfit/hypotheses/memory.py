@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.eights import WIDTH
-from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import forget, plan
-from driftfit.hypotheses.advance import HEAD, PACKED, REPORTED
 from driftfit.hypotheses.forecast import FROZEN, VALUE
 from driftfit.hypotheses.leaves import FIRST
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.past import news_of
+from driftfit.hypotheses.table import FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def packed(
 
     Where covariances are ``factored`` no forecast comes from that of the mixture.
     """
-    table = np.zeros((core.ROWS, 3), int)
+    table = np.zeros((ROWS, 3), int)
     flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
     for k, name in enumerate(PACKED):
         array, into = np.ascontiguousarray(arrays[name]), flat[name in REPORTED]
@@ -81,11 +80,11 @@ def packed(
             into.append(np.zeros(-sum(part.size for part in into) % WIDTH))  # a cache line begins
         table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
         into.append(array.ravel().view(np.float64))
-    table[core.THETA, 1] = n
-    table[core.FLAGS] = na, unknown, alike
+    table[THETA, 1] = n
+    table[FLAGS] = na, unknown, alike
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[core.PLAIN] = na == 0 and walks and noises and not factored, walks, 0
+    table[PLAIN] = na == 0 and walks and noises and not factored, walks, 0
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 

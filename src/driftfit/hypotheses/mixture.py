@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from driftfit.hypotheses.advance import HELD, LEAVES, NEVER, SETTLED
 from driftfit.hypotheses.factored import product
 from driftfit.hypotheses.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
+from driftfit.hypotheses.table import HELD, LEAVES, NEVER, SETTLED
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:

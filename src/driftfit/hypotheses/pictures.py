@@ -58,8 +58,8 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
     """
     bank: Any = live.tracker
     lane = live.lane()
-    from driftfit.hypotheses.advance import LEAVES
     from driftfit.hypotheses.reduction import GPB, Decide
+    from driftfit.hypotheses.table import LEAVES
 
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")

@@ -141,7 +141,7 @@ class Hypotheses:
     @property
     def impossible(self) -> int:
         """Samples that no leaf allowed; they were not used."""
-        from driftfit.hypotheses.advance import IMPOSSIBLE
+        from driftfit.hypotheses.table import IMPOSSIBLE
 
         return int(self.run._tile["many"][0, IMPOSSIBLE, self.run._lane])
 

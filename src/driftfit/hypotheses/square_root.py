@@ -15,13 +15,13 @@ from functools import cache
 
 from driftfit.drivers import TrackerSteps
 from driftfit.eights import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
-from driftfit.hypotheses import advance, forget, grow, leaves, lookahead, merge, refilter, steps
+from driftfit.hypotheses import advance, forget, grow, leaves, lookahead, merge, refilter, start, steps
 from driftfit.hypotheses.factored import absorb, along, condense, factorise, raised
 from driftfit.hypotheses.factored_changes import average, blur, develop_eight, walked
 from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
 from driftfit.kernel import Array, Outside, core, exchanged, part
 
-covariance_increments, covariance_begin = leaves.increments, advance.begin
+covariance_increments, covariance_begin = leaves.increments, start.begin
 
 
 @part
@@ -36,7 +36,7 @@ def increments(
 
 @core
 def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
-    """`advance.begin`, factorised."""
+    """`start.begin`, factorised."""
     covariance_begin(B, T, theta, P, nu, squares, many, H)
     n = len(theta)
     factorise(B[FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 1.0)
@@ -201,7 +201,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 def made() -> tuple[Outside, TrackerSteps]:
     """The machine and the steps that run it."""
     others = {
-        leaves.increments: increments, leaves.mixture: mixture, advance.begin: begin,
+        leaves.increments: increments, leaves.mixture: mixture, start.begin: begin,
         forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
         refilter.widen: widen, lookahead.width: width,
     }  # fmt: skip

@@ -5,24 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.hypotheses.advance import (
+from driftfit.hypotheses.advance import bank
+from driftfit.hypotheses.grow import FLOOR
+from driftfit.hypotheses.table import (
     ADDRESSES,
+    AT,
     BASE,
     COUNT,
-    FACTORS,
-    GIVEN,
+    COV,
     IN_DT,
     IN_NOISE,
     IN_OK,
     IN_SEEN,
     IN_TIME,
-    IN_VALID,
     IN_Y,
     LEAST,
     MANY,
     NOW,
     PHI,
     PLACES,
+    POWERS,
     READY,
     REPORT,
     ROWS,
@@ -34,12 +36,8 @@ from driftfit.hypotheses.advance import (
     TIMES,
     WAITING,
     Y_HAT,
-    bank,
-)
-from driftfit.hypotheses.advance import C as AT_C
-from driftfit.hypotheses.advance import P as AT_P
-from driftfit.hypotheses.advance import R as NOISE
-from driftfit.hypotheses.grow import FLOOR
+    R,
+)  # fmt: skip
 from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.diffuse import enter, measurement, spanned_variance
@@ -66,9 +64,9 @@ def point(s: State) -> None:
     s.table[BASE, 0, 0] = s.memory.ctypes.data
     s.table[REPORT, 0, 0] = s.report.ctypes.data
     s.table[PHI, 0, 0] = s.phi.ctypes.data
-    s.table[AT_C, 0, 0] = s.c.ctypes.data
+    s.table[POWERS, 0, 0] = s.c.ctypes.data
     s.table[THETA, 0, 0] = s.theta.ctypes.data
-    s.table[AT_P, 0, 0] = s.P.ctypes.data
+    s.table[COV, 0, 0] = s.P.ctypes.data
     s.table[MANY, 0, 0] = s.many.ctypes.data
     s.table[NOW, 0, 0] = s.now.ctypes.data
 
@@ -99,8 +97,8 @@ def among(s: State, l: int) -> None:
     for k in range(ROWS):
         for i in range(3):
             table[k, i] = s.table[k, i, l]
-    table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[AT_C, 0] = memory, report, vectors, vectors + 8 * n
-    table[THETA, 0], table[AT_P, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
+    table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[POWERS, 0] = memory, report, vectors, vectors + 8 * n
+    table[THETA, 0], table[COV, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
     for k in range(N):
         floats(memory, 1, N)[0, k] = s.memory[k, l]
     for i in range(n):
@@ -133,8 +131,8 @@ def tell(s: State, l: int) -> None:
     """What the machine is told of this sample."""
     s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
-    s.now[IN_OK, l], s.now[IN_SEEN, l], s.now[IN_VALID, l] = s.ok[l], s.seen[l], s.valid[l]
-    s.now[NOISE, l], s.now[LEAST, l] = s.r[l], FLOOR * s.power[l] + 1e-300
+    s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
+    s.now[R, l], s.now[LEAST, l] = s.r[l], FLOOR * s.power[l] + 1e-300
 
 
 @kernel
@@ -191,8 +189,8 @@ def keep(o: State, s: State, l: int) -> None:
 def told(s: State, known: Array, t: int, l: int) -> None:
     """Priors of the joint events of this sample, then factors of the drift of every change."""
     row = t if known.shape[0] > 1 else 0
-    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
-    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    given, factors = s.table[AT.given, 0, l] // 8, s.table[AT.factors, 0, l] // 8
+    H, Hd = s.table[AT.given, 2, l], s.table[AT.factors, 2, l]
     for e in range(H):
         s.memory[given + e, l] = known[row, 3 + e, l]
     for i in range(Hd):

@@ -34,11 +34,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.hypotheses import advance as core
 from driftfit.hypotheses import change as changes_
 from driftfit.hypotheses import forget, square_root
 from driftfit.hypotheses import reduction as reductions
-from driftfit.hypotheses.advance import HEAD, PACKED, bank
+from driftfit.hypotheses.advance import bank
 from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.factored import factorise, widened
 from driftfit.hypotheses.leaves import FIRST, NU, S
@@ -46,7 +45,9 @@ from driftfit.hypotheses.memory import SINGLE, arrays_of, packed
 from driftfit.hypotheses.prior import events, per_sample
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.hypotheses.sensor import Sensor
+from driftfit.hypotheses.start import GROWTH, begin
 from driftfit.hypotheses.steps import STEPS
+from driftfit.hypotheses.table import COUNT, FADE, HEAD, LAST, LEAVES, PACKED, SIZE, R
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
@@ -232,16 +233,16 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        now, many = np.zeros(core.SIZE), np.zeros(core.COUNT, int)
-        now[core.LAST], now[core.R] = np.nan, 1.0
-        now[core.FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        now, many = np.zeros(SIZE), np.zeros(COUNT, int)
+        now[LAST], now[R] = np.nan, 1.0
+        now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            arrays["theta0"][forget.CAP] = core.GROWTH * np.trace(P0) or np.inf
-            core.begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["theta0"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
+            begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
             if self.form == "sqrt":
                 factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
@@ -297,7 +298,7 @@ class Bank(Tracker):
         """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
         start, rows, columns = lane["table"][PACKED.index("B")]
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return B[:, : max(int(lane["many"][core.LEAVES]), 1)]
+        return B[:, : max(int(lane["many"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
         """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
