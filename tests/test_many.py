@@ -156,7 +156,19 @@ def test_without_faults_few_series_are_accused():
 
 @pytest.mark.parametrize(
     ("settings", "match"),
-    [({"kind": "bands"}, "kind"), ({"level": 0.0}, "level"), ({"every": 0.5}, "every"), ({}, "where the parameters")],
+    [
+        ({"kind": "bands"}, "kind"),
+        ({"level": 0.0}, "level"),
+        ({"level": "high"}, "level"),
+        ({"every": 0.5}, "every"),
+        ({"every": "ten"}, "every"),
+        ({"every": np.inf}, "every"),
+        ({}, "where the parameters"),
+        ({"reference": {}}, "names"),
+        ({"reference": {"b1[u]": 1.0}}, "low <= high"),
+        ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
+        ({"reference": {"<1>": 140}}, "nothing for <0>, <2>"),
+    ],
 )
 def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
     with pytest.raises(ValueError, match=match):

@@ -30,6 +30,7 @@ from rich.text import Text
 
 from driftfit.detect import Alarms, detect
 from driftfit.judges.many import SHOWN, discoveries, printed
+from driftfit.settings import numbers
 from driftfit.summary import facts, table_of
 from driftfit.verdict import p_text
 
@@ -147,11 +148,16 @@ def alarms(
 
     if not runs:
         raise ValueError("detect: there is no run with a result to watch.")
+    level = numbers("detect", "level", level, ndim=0)
     if not 0.0 < level < 1.0:
         raise ValueError(f"detect: level must lie between 0 and 1; got {level!r}.")
-    if not every > 1.0:
-        raise ValueError(f"detect: every must be a number of samples above 1; got {every!r}.")
-    own = isinstance(reference, Mapping) and all(key in reference for key in runs)
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    own = isinstance(reference, Mapping) and any(key in reference for key in runs)
+    lacking = [str(key) for key in runs if own and key not in reference]
+    if lacking:
+        raise ValueError(
+            f"detect: reference has nothing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
+        )
 
     def watch(key: Hashable) -> Alarms | ValueError:
         known = reference[key] if own else reference
