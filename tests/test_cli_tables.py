@@ -174,6 +174,8 @@ def test_a_fleet_of_several_outputs(tanks):
         (("--y", "level,flow", "--by", "tank", "--out", "x.npz"), "one run"),
         (("--y", "level,flow", "--unit", "flow=l"), "several outputs carry none"),
         (("--y", ","), "names no column"),
+        (("--y", "level", "--y", "level"), "--y level,level: an output is named once"),
+        (("--y", "level,flow", "--u", "valve"), "inputs must be names, each once"),
     ],
 )
 def test_what_several_outputs_cannot_have(tanks, arguments, said):
