@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from driftfit.judges.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judges.page import READING
 from driftfit.report import PARAMETERS, document, parameter_figure, picture, section, table
+from driftfit.summary import key_text
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
         numbers = (escape(p_text(row.said.p)), escape(p_text(row.q)))
         errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
         marked = f'<span class="bad">{out}</span>' if out else "0"
-        rows.append((escape(str(row.key)), escape(row.change), *numbers, *errors, marked))
+        rows.append((escape(key_text(row.key)), escape(row.change), *numbers, *errors, marked))
     heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
     more = f" The first {LISTED} of {len(said)}." if len(said) > LISTED else ""
     return table(f"The clearest first.{more}", heads, rows, (1,))
@@ -75,7 +76,7 @@ def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
 def _pictured(row: Judgement, run: Track) -> str:
     told = escape(" ".join(row.said.sentences))
     shown = picture(parameter_figure(run), run, PARAMETERS)
-    return f'<div class="one"><h3>{escape(str(row.key))}</h3><p>{told}</p>{shown}</div>'
+    return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{told}</p>{shown}</div>'
 
 
 def _health(health: ManyDiagnoses) -> str:
@@ -83,7 +84,9 @@ def _health(health: ManyDiagnoses) -> str:
         "How many are out of bounds.", ("check", "series"), [(name, str(k)) for name, k in health.counts.items()]
     )
     worst = [key for key in health.worst[:PICTURED] if not health[key].ok]
-    told = "".join(f"<li><b>{escape(str(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst)
+    told = "".join(
+        f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
+    )
     return counts + (f"<ul>{told}</ul>" if told else "")
 
 
@@ -95,7 +98,10 @@ def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) ->
     pairs = [
         ("Model", models[0] if len(models) == 1 else f"{len(models)} different ones"),
         ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
-        ("Without a result", "; ".join(f"{key}: {reason}" for key, reason in list(failed.items())[:20]) or "none"),
+        (
+            "Without a result",
+            "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20]) or "none",
+        ),
         ("Made by", f"driftfit {__version__}"),
     ]
     return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"
