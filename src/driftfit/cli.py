@@ -103,7 +103,7 @@ def track(
         str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
     ] = None,
     write_to: Annotated[
-        Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (a Track).")
+        Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (one run).")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")] = None,
     report: Annotated[

@@ -10,6 +10,8 @@ from collections.abc import Hashable, Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from driftfit.judges.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judges.page import READING
 from driftfit.report import PARAMETERS, document, parameter_figure, picture, section, table
@@ -23,6 +25,8 @@ LISTED = 200
 """Rows of the table."""
 PICTURED = 4
 """Runs with pictures."""
+NAMED = 4
+"""Fewer runs, or models, than these are named and not counted."""
 LEVEL = 0.05
 
 MANY = """<p>Each row was judged by itself. Where many are tested some look as if they moved by chance: q is the share
@@ -34,7 +38,7 @@ def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapp
     if not runs:
         raise ValueError("report: there is no run with a result to report on.")
     said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
-    heading = title or f"{len(runs)} series"
+    heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
     counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
     shown = [row for row in said.rows[:PICTURED] if row.drifts] or list(said.rows[:1])
@@ -45,7 +49,10 @@ def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapp
             f'<p class="soft">{escape(counted)}</p>',
             _verdict(said, health),
             section("All series", _rows(said, health)),
-            section("Those that move most clearly", "".join(_pictured(row, runs[row.key]) for row in shown)),
+            section(
+                "Those that move most clearly" if said.drifting else "The clearest",
+                "".join(_pictured(row, runs[row.key]) for row in shown),
+            ),
             section("Diagnostics", _health(health)),
             section("Settings, and what was left out", _settings(runs, failed)),
             section("How to read this", MANY + READING),
@@ -56,6 +63,8 @@ def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapp
 def _verdict(said: ManyVerdicts, health: ManyDiagnoses) -> str:
     out = sum(not one.ok for one in health.of.values())
     state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
+    if not any(np.isfinite(check.value) for one in health.of.values() for check in one.checks):
+        state = "No diagnostic can be told."
     lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
     return f'<div class="verdict">{lines}</div>'
 
@@ -96,7 +105,7 @@ def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) ->
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
     pairs = [
-        ("Model", models[0] if len(models) == 1 else f"{len(models)} different ones"),
+        ("Model", "; ".join(models) if len(models) < NAMED else f"{len(models)} different ones"),
         ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
         (
             "Without a result",

@@ -111,6 +111,8 @@ class ManyVerdicts:
             "average (false discovery rate)."
             if drifting
             else f"In none of {tested} is a drift found. One that is small beside the noise cannot be ruled out."
+            if tested
+            else ""
         )
         names = Counter(name for row in self.rows for name in row.moving).most_common(3)
         which = f"Most often it is {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
