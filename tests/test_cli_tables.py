@@ -146,6 +146,7 @@ def test_several_outputs(tanks):
     table = pl.read_parquet("two.parquet")
     assert np.array_equal(table["theta_a1[level<-flow]"], alone["level"].theta[:, 1])
     assert np.array_equal(table["prediction[flow]"], alone.prediction[:, 1], equal_nan=True)
+    assert np.array_equal(table["valve"], data["valve"])
     run("one.csv", "--y", "level,flow", "--u", "valve", "--model", "arx:1,1", *KALMAN, "--out", "two.npz")
     assert np.array_equal(Outputs.load("two.npz").theta, alone.theta)
     text = run("one.csv", "--y", "level,flow", "--u", "valve,pump", "--model", "regression:shared,ny=2", *KALMAN)
@@ -155,7 +156,8 @@ def test_several_outputs(tanks):
 def test_a_fleet_of_several_outputs(tanks):
     text = run("all.csv", *TWO, "--u", "valve", "--by", "tank", "--out", "two.csv", "--report", "two.html")
     assert "Series   4, 0 without a result" in text
-    assert "('b', 'flow')" in text
+    assert "b, flow" in text
+    assert "farthest" in text  # heads are not cut
     table = pl.read_csv("two.csv")
     data = tanks[1]
     alone = track(
@@ -174,6 +176,8 @@ def test_a_fleet_of_several_outputs(tanks):
         (("--y", "level,flow", "--by", "tank", "--out", "x.npz"), "one run"),
         (("--y", "level,flow", "--unit", "flow=l"), "several outputs carry none"),
         (("--y", ","), "names no column"),
+        (("--y", "level", "--y", "level"), "--y level,level: an output is named once"),
+        (("--y", "level,flow", "--u", "valve"), "inputs must be names, each once"),
     ],
 )
 def test_what_several_outputs_cannot_have(tanks, arguments, said):

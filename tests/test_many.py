@@ -94,7 +94,9 @@ def test_outputs_of_one_record(tmp_path):
     assert said.drifting == ("flow",)
     assert run.diagnose()["level"]["noise level"].ok
     run.report(tmp_path / "outputs.html")
-    assert "flow" in (tmp_path / "outputs.html").read_text()
+    page = (tmp_path / "outputs.html").read_text()
+    assert "<h1>level, flow</h1>" in page
+    assert "Those that move most clearly" in page
     rows = np.stack([u, u[:, ::-1]], axis=1)
     theta = np.column_stack([np.ones(T), gain])
     y = np.einsum("toi,ti->to", rows, theta) + 0.1 * rng.normal(size=(T, 2))
@@ -156,8 +158,30 @@ def test_without_faults_few_series_are_accused():
 
 @pytest.mark.parametrize(
     ("settings", "match"),
-    [({"kind": "bands"}, "kind"), ({"level": 0.0}, "level"), ({"every": 0.5}, "every"), ({}, "where the parameters")],
+    [
+        ({"kind": "bands"}, "kind"),
+        ({"level": 0.0}, "level"),
+        ({"level": "high"}, "level"),
+        ({"every": 0.5}, "every"),
+        ({"every": "ten"}, "every"),
+        ({"every": np.inf}, "every"),
+        ({}, "where the parameters"),
+        ({"reference": {}}, "names"),
+        ({"reference": {"b1[u]": 1.0}}, "low <= high"),
+        ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
+        ({"reference": {"<1>": 140}}, "nothing for <0>, <2>"),
+    ],
 )
 def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
     with pytest.raises(ValueError, match=match):
         fleet.detect(**settings)
+
+
+def test_a_page_about_nothing_says_so(tmp_path):
+    """Neither that no drift was found, nor that the diagnostics are within their limits."""
+    run = track(Regression(1, ny=("level", "flow")), K, np.full((200, 2), np.nan), np.ones((200, 1)))
+    run.report(tmp_path / "nothing.html")
+    page = (tmp_path / "nothing.html").read_text()
+    assert "2 cannot be tested" in page
+    assert "No diagnostic can be told" in page
+    assert not any(claim in page for claim in ("In none of", "within limits", "move most clearly"))

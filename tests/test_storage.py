@@ -187,3 +187,10 @@ def test_a_path_may_be_text_and_is_written_over(tmp_path):
     for q in (1e-3, 1e-2):
         track(ARX(2, 2), Kalman(q=q, r=0.1), Y, U).save(path)
     assert Track.load(path).tracker.q == 1e-2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="rights of files as POSIX has them")
+def test_others_may_read_a_file_where_they_may_read_any(saved):
+    path, _ = saved
+    (path.parent / "plain").write_text("")
+    assert path.stat().st_mode == (path.parent / "plain").stat().st_mode

@@ -103,7 +103,7 @@ def track(
         str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
     ] = None,
     write_to: Annotated[
-        Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (a Track).")
+        Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (one run).")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")] = None,
     report: Annotated[
@@ -116,11 +116,17 @@ def track(
         outputs, inputs = listed(y), listed(u)
         if not outputs:
             raise ValueError("--y names no column.")
+        if len(set(outputs)) < len(outputs):
+            raise ValueError(f"--y {','.join(outputs)}: an output is named once.")
         bound = parse_model(model or f"arx:2,{2 if inputs else 0},intercept", outputs)
         bound = bound if bound.shared else bound.bind(inputs)
         chosen = parse_tracker(tracker, p or [], own)
-        if write_to is not None:
-            check_ending(write_to)
+        if write_to is not None and check_ending(write_to) == ".npz" and by:
+            raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
+        if report is not None:
+            from driftfit.report import check_path
+
+            check_path(report)
         if plot is not None and by and len(outputs) > 1:
             raise ValueError("--plot: there is no picture of many records with several outputs; --report has some.")
         several = len(outputs) > 1

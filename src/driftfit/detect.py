@@ -39,7 +39,7 @@ from driftfit.judges.calibrate import limit_of, null_records
 from driftfit.judges.onsets import held, onsets
 from driftfit.kernel import Array
 from driftfit.result import Track
-from driftfit.settings import one_of, whole
+from driftfit.settings import numbers, one_of, whole
 from driftfit.summary import WIDTH, facts, table_of
 from driftfit.verdict import p_text
 
@@ -197,8 +197,7 @@ def detect(
         For a kind that is unknown, a reference that does not fit, or a tracker that has not what the kind needs.
     """
     one_of("detect", "kind", kind, KINDS)
-    if not every > 1.0:
-        raise ValueError(f"detect: every must be a number of samples above 1; got {every!r}.")
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
     whole("detect", "window", window, 4)
     whole("detect", "hold", hold, 0)
     seen = STATISTICS[kind](run, every, reference, window)

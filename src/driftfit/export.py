@@ -86,7 +86,7 @@ def units_of(result: Track | Fleet) -> dict[str, str]:
 
 
 def outputs_table(runs: Outputs | Shared | OutputsFleet, kind: str = "polars") -> Any:
-    """Records of several outputs: each result with its output in brackets, parameters under their names."""
+    """Records of several outputs: each result with its output in brackets, inputs and parameters under their names."""
     one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
     if isinstance(runs, dict):
         parts = []
@@ -105,6 +105,9 @@ def _of_outputs(run: Outputs | Shared) -> pl.DataFrame:
         columns[_free(output)] = run.y[:, j]
         columns |= {f"{name}[{output}]": getattr(run, name)[:, j] for name in _OWN}
     shared = run.model.shared
+    if not shared:
+        inputs = run.labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[1]))
+        columns |= {_free(name): run.u[:, j] for j, name in enumerate(inputs) if _free(name) not in columns}
     for j, names in enumerate([run.names] if shared else run.names):
         theta, std = (run.theta, run.std) if shared else (run.theta[:, j], run.std[:, j])
         for i, name in enumerate(names):

@@ -24,7 +24,7 @@ from rich.text import Text
 from driftfit.compare import persistence
 from driftfit.kernel import Array
 from driftfit.result import root_mean_square
-from driftfit.summary import WIDTH, counts, facts, table_of
+from driftfit.summary import WIDTH, counts, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.fleet import Fleet
@@ -78,7 +78,7 @@ class FleetSummary:
         yield facts(*pairs)
         yield from self._ranking()
         for key, reason in list(self.failed.items())[:SHOWN]:
-            yield Text(f" no result for {key}: {reason}")
+            yield Text(f" no result for {key_text(key)}: {reason}")
 
     def _ranking(self) -> RenderResult:
         what = "std" if self.scaled else "x median"
@@ -87,7 +87,7 @@ class FleetSummary:
         for unit in self.units[:SHOWN]:
             numbers = (unit.start, unit.farthest, unit.last, unit.error, unit.persistence)
             moved = f"{unit.moved:.1f}" if np.isfinite(unit.moved) else "-"
-            table.add_row(Text(str(unit.key)), Text(unit.parameter), moved, *(f"{value:.4g}" for value in numbers))
+            table.add_row(Text(key_text(unit.key)), Text(unit.parameter), moved, *(f"{value:.4g}" for value in numbers))
         yield table
         if len(self.units) > SHOWN:
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")

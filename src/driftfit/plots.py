@@ -11,6 +11,7 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.settings import near
+from driftfit.summary import key_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,7 +75,7 @@ def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: fl
         run = fleet[unit.key]
         draw_parameter(axis, run, i, level)
         views.append(axis.get_ylim())
-        axis.set_title(str(unit.key), fontsize=9)
+        axis.set_title(key_text(unit.key), fontsize=9)
         axis.tick_params(labelsize=8)
         axis.set_ylabel("")
         date_axis(axis, run)

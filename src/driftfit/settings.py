@@ -148,6 +148,14 @@ def near(wrong: str, known: Collection[str]) -> str:
     return f"did you mean {' or '.join(close)}?" if close else f"there is {', '.join(known) or 'none'}."
 
 
+def input_names(owner: str, name: str, given: Sequence[str]) -> tuple[str, ...]:
+    """Names of inputs, each once: parameters and columns of tables are called after them."""
+    names = tuple(str(one) for one in given)
+    if len(set(names)) < len(names):
+        raise ValueError(f"{owner}: {name} must be names, each once; got {names!r}.")
+    return names
+
+
 def output_names(owner: str, ny: Any) -> tuple[str, ...]:
     """Names of the outputs, given their number or the names themselves: ("y",), or ("y1", "y2", ..)."""
     if isinstance(ny, int | np.integer):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Mapping
 from datetime import datetime, timedelta
 from importlib import import_module
@@ -53,9 +53,10 @@ def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[
     """Write a header and arrays, all or nothing."""
     target = os.path.abspath(os.fspath(path))
     text = json.dumps({"format": FORMAT, **header}, default=_encode)
-    handle, name = tempfile.mkstemp(dir=os.path.dirname(target), prefix=".driftfit-")
+    name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
+    file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with file:
             np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
             file.flush()
             os.fsync(file.fileno())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from io import StringIO
 from typing import TYPE_CHECKING
@@ -124,6 +124,11 @@ def _span(run: Track) -> str:
         return ""
     first, last = (run.time_text(t) for t in (0, -1))
     return f"{first} to {last}"
+
+
+def key_text(key: Hashable) -> str:
+    """The key of a series as text; that of several columns without brackets."""
+    return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
 
 
 def counts(dropped: Mapping[str, int]) -> str:

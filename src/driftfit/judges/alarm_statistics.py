@@ -41,11 +41,9 @@ def _band(run: Track, every: float, reference: Reference, window: int) -> Watche
     if isinstance(reference, Mapping):
         unknown = [name for name in reference if name not in run.names]
         if unknown:
-            raise ValueError(f"detect: there is no parameter {unknown[0]!r}; {near(unknown[0], run.names)}")
+            raise ValueError(f"detect: there is no parameter {unknown[0]!r}; {near(str(unknown[0]), run.names)}")
         names = tuple(reference)
-        low, high = (np.array([float(pair[side]) for pair in reference.values()]) for side in (0, 1))
-        if not (low <= high).all():
-            raise ValueError(f"detect: a reference band is (low, high) with low <= high; got {dict(reference)!r}.")
+        low, high = _edges(reference)
     else:
         stop = _reference(run, reference, start)
         names, part = run.names, run.theta[start:stop]
@@ -62,6 +60,19 @@ def _band(run: Track, every: float, reference: Reference, window: int) -> Watche
         return min(1.0, len(each) * min(each))
 
     return Watched(np.where(np.isfinite(std), outside, np.nan), limits, names, start, likely)
+
+
+def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
+    """(low, high) of every band, (2, c)."""
+    try:
+        edges = np.array([[float(edge) for edge in pair] for pair in reference.values()]).T
+    except (TypeError, ValueError):
+        edges = np.zeros(0)
+    if edges.ndim != 2 or len(edges) != 2 or not (edges[0] <= edges[1]).all():
+        raise ValueError(
+            f"detect: a reference names parameters, each with a band (low, high), low <= high; got {dict(reference)!r}."
+        )
+    return edges
 
 
 def _alike(theta: Array, std: Array) -> Array:

@@ -27,6 +27,7 @@ def rotate(R: Array, row: Array, size: Array, theta: Array) -> None:
     n = theta.shape[0]
     for i in range(n):
         size[i] = np.hypot(size[i], row[i])
+    for i in range(n):
         if row[i] != 0.0:
             length = np.hypot(R[i, i], row[i])
             c, s = R[i, i] / length, row[i] / length

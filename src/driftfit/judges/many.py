@@ -24,7 +24,7 @@ from rich.text import Text
 
 from driftfit.diagnose import Diagnosis, diagnose
 from driftfit.kernel import Array
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import WIDTH, key_text, table_of
 from driftfit.verdict import Verdict, p_text, verdict
 
 if TYPE_CHECKING:
@@ -111,6 +111,8 @@ class ManyVerdicts:
             "average (false discovery rate)."
             if drifting
             else f"In none of {tested} is a drift found. One that is small beside the noise cannot be ruled out."
+            if tested
+            else ""
         )
         names = Counter(name for row in self.rows for name in row.moving).most_common(3)
         which = f"Most often it is {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
@@ -126,7 +128,7 @@ class ManyVerdicts:
 
         return polars.DataFrame(
             {
-                "key": [str(row.key) for row in self.rows],
+                "key": [key_text(row.key) for row in self.rows],
                 "p": [row.said.p for row in self.rows],
                 "q": [row.q for row in self.rows],
                 "drifts": [row.drifts for row in self.rows],
@@ -148,7 +150,7 @@ class ManyVerdicts:
             column.ratio, column.min_width = None, width
         for row in self.rows[:SHOWN]:
             errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
-            table.add_row(Text(str(row.key)), Text(row.change), p_text(row.said.p), p_text(row.q), *errors)
+            table.add_row(Text(key_text(row.key)), Text(row.change), p_text(row.said.p), p_text(row.q), *errors)
         yield table
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
@@ -198,7 +200,7 @@ class ManyDiagnoses:
         """One row a run with every number, as a polars table."""
         import polars
 
-        rows = [{"key": str(key)} | {c.name: c.value for c in said.checks} for key, said in self.of.items()]
+        rows = [{"key": key_text(key)} | {c.name: c.value for c in said.checks} for key, said in self.of.items()]
         out = [len(said.sentences) for said in self.of.values()]
         return polars.DataFrame(rows, infer_schema_length=None).with_columns(polars.Series("out_of_bounds", out))
 
@@ -209,7 +211,7 @@ class ManyDiagnoses:
         yield table
         table = table_of("The worst first", "", "what is out of bounds", names=2)
         for key in [key for key in self.worst if not self.of[key].ok][:SHOWN]:
-            table.add_row(Text(str(key)), Text(", ".join(c.name for c in self.of[key].checks if not c.ok)))
+            table.add_row(Text(key_text(key)), Text(", ".join(c.name for c in self.of[key].checks if not c.ok)))
         yield table
 
     def __str__(self) -> str:

@@ -30,7 +30,8 @@ from rich.text import Text
 
 from driftfit.detect import Alarms, detect
 from driftfit.judges.many import SHOWN, discoveries, printed
-from driftfit.summary import facts, table_of
+from driftfit.settings import numbers
+from driftfit.summary import facts, key_text, table_of
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class ManyAlarms:
         for row in self.rows:
             said = row.alarms
             for t in map(int, said.onsets):
-                cells = (str(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
+                cells = (key_text(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
                 for column, cell in zip(columns.values(), cells, strict=True):
                     column.append(cell)
         return polars.DataFrame(columns, strict=False)
@@ -128,12 +129,12 @@ class ManyAlarms:
         table = table_of("The most extreme first", "", "alarms", "the first", "p", "q", "", names=1)
         for row in self.rows[:SHOWN]:
             numbers = (p_text(row.alarms.p), p_text(row.q), "something" if row.faulty else "")
-            table.add_row(Text(str(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
+            table.add_row(Text(key_text(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
         yield table
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
         for key, reason in list(self.failed.items())[:SHOWN]:
-            yield Text(f" not judged, {key}: {reason}")
+            yield Text(f" not judged, {key_text(key)}: {reason}")
 
     def __str__(self) -> str:
         return printed(self)
@@ -147,11 +148,16 @@ def alarms(
 
     if not runs:
         raise ValueError("detect: there is no run with a result to watch.")
+    level = numbers("detect", "level", level, ndim=0)
     if not 0.0 < level < 1.0:
         raise ValueError(f"detect: level must lie between 0 and 1; got {level!r}.")
-    if not every > 1.0:
-        raise ValueError(f"detect: every must be a number of samples above 1; got {every!r}.")
-    own = isinstance(reference, Mapping) and all(key in reference for key in runs)
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    own = isinstance(reference, Mapping) and any(key in reference for key in runs)
+    lacking = [key_text(key) for key in runs if own and key not in reference]
+    if lacking:
+        raise ValueError(
+            f"detect: reference has nothing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
+        )
 
     def watch(key: Hashable) -> Alarms | ValueError:
         known = reference[key] if own else reference

@@ -26,7 +26,7 @@ import numpy as np
 from driftfit.drivers import LARGEST, ModelSteps
 from driftfit.kernel import Array, State, kernel
 from driftfit.models.base import Model
-from driftfit.settings import one_of, output_names, whole
+from driftfit.settings import input_names, one_of, output_names, whole
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
@@ -79,7 +79,7 @@ class ARX(Model):
         elif isinstance(self.inputs, int | np.integer):
             self._set("inputs", whole("ARX", "inputs", self.inputs, 0))
         elif self.inputs is not None:
-            self._set("inputs", tuple(str(name) for name in self.inputs))
+            self._set("inputs", input_names("ARX", "inputs", self.inputs))
         elif self.inputs is None and counts:
             self._set("inputs", counts.pop() if len(counts) == 1 else None)
         elif self.inputs is None and self.nb == 0:

@@ -152,12 +152,25 @@ class Chebyshev(_Orthogonal):
 class DeadZone(Basis):
     """A dead zone between p2 < 0 < p1: v = u - p1 above it, u - p2 below, 0 inside; an input block only.
 
-    The thresholds are coefficients, and the functions of an input use their estimates of the sample before it, held
-    within 0 .. 0.97 u_max and -0.97 u_max .. 0: a Gauss-Newton step in p. ``start`` is where both begin, in size.
+    In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u outside the dead zone, f_2 = -1 above it and
+    f_3 = -1 below it, 0 elsewhere. Where it begins the functions of an input take from the estimates of p1 and p2 of
+    the sample before it, held within 0 .. 0.97 u_max and -0.97 u_max .. 0: a Gauss-Newton step in p.
 
-    A filter of products b_j c_k gives nb estimates of a threshold: ``fed`` says whether they are combined by least
-    squares, sum_j b_j (b_j c_k) / sum_j b_j^2 ("least-squares"), or by the mean of (b_j c_k) / b_j ("average", what
-    Feng and Hong have; a b_j near zero throws it off).
+    Parameters
+    ----------
+    u_max : number
+        The largest size of the input, above 0.
+    start : number
+        Where both thresholds begin, in size.
+    fed : "least-squares" or "average"
+        A filter of products has nb estimates of each threshold, the products b_j p1 beside the b_j. They are fed back
+        as sum_j b_j (b_j p1) / sum_j b_j^2, or as the mean over j of (b_j p1) / b_j, which Feng and Hong (2021) have
+        and a b_j near zero throws off. With minimal parameters (`ExtendedKalman`) p1 and p2 are estimated themselves.
+
+    Raises
+    ------
+    ValueError
+        For a u_max that is not above 0, a start below 0, or another ``fed``.
     """
 
     u_max: float

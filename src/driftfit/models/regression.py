@@ -20,7 +20,7 @@ import numpy as np
 from driftfit.drivers import ModelSteps
 from driftfit.kernel import Array, State, kernel, nothing
 from driftfit.models.base import Model
-from driftfit.settings import output_names, whole
+from driftfit.settings import input_names, output_names, whole
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Regression(Model):
         elif isinstance(given, int | np.integer):
             self._set("regressors", whole("Regression", "regressors", given, 0))
         elif given is not None:
-            self._set("regressors", tuple(str(name) for name in given))
+            self._set("regressors", input_names("Regression", "regressors", given))
         if not isinstance(self.ny, int):
             self._set("ny", output_names("Regression", self.ny))
         if self.shared and len(self.outputs) == 1:

@@ -98,7 +98,7 @@ def order(found: Found) -> Claim:
     return Claim(
         "A higher order is more accurate (example 4)",
         "we could not reproduce it with raw powers",
-        f"Er of (67) is {raw}; its b part is {100 * share:.1f} % of that, and the gauge d_1 = 1 has no b = 0.0378. "
+        f"Er of (67) is {raw}; its b part is {100 * share:.1f} % of that, and with d_1 = 1 b_1 is not 0.0378. "
         f"Legendre polynomials of order 4 have squared errors of a of {end([r.a for r in found.legendre]):.0e} and of "
         f"p of {end([r.p for r in found.legendre]):.0e}, and the local gain is {gains(found)[-1]:.2f} of the true one.",
     )
