@@ -119,10 +119,11 @@ def _regress_work(into: Kind, out: Kind, lanes: bool) -> Any:
         if p[IDENTITY] == 0:
             if seen:
                 right = locate(m, p, right)
-                believe(m, y)
             else:
                 right = invert(m, p, right)
                 m[LATE, 0] = 0.0
+        if seen:
+            believe(m, y)
         m[PREDICTED, 0] = right
         if not seen:
             output_at(m, p, right, g, h)
