@@ -9,10 +9,11 @@ from driftfit.hypotheses.advance import bank
 from driftfit.hypotheses.grow import FLOOR
 from driftfit.hypotheses.table import (
     ADDRESSES,
-    AT,
     BASE,
     COUNT,
     COV,
+    FACTORS,
+    GIVEN,
     IN_DT,
     IN_NOISE,
     IN_OK,
@@ -189,8 +190,8 @@ def keep(o: State, s: State, l: int) -> None:
 def told(s: State, known: Array, t: int, l: int) -> None:
     """Priors of the joint events of this sample, then factors of the drift of every change."""
     row = t if known.shape[0] > 1 else 0
-    given, factors = s.table[AT.given, 0, l] // 8, s.table[AT.factors, 0, l] // 8
-    H, Hd = s.table[AT.given, 2, l], s.table[AT.factors, 2, l]
+    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
+    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
     for e in range(H):
         s.memory[given + e, l] = known[row, 3 + e, l]
     for i in range(Hd):

@@ -36,7 +36,8 @@ PACKED = (
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
 """
 AT: Any = namedtuple("AT", PACKED)(*range(len(PACKED)))
-"""Rows of the table by the names of the arrays."""
+"""Rows of the table by the names of the arrays, for the machine."""
+GIVEN, FACTORS = AT.given, AT.factors
 PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
 BASE, REPORT, PHI, POWERS, THETA, COV, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
 """Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
