@@ -2,7 +2,7 @@
 
 Numba optimises every function and emits its machine code when it is compiled, also where all that ever happens to it is
 that a larger one takes it in, which is then optimised once more. In a machine of a hundred parts, six deep, that was
-three quarters of the time of compiling it.
+three fifths of the time of compiling it.
 
 This leans on Numba's own parts: the library of code that a compilation makes, and the environment that Python errors
 need, which such functions do not raise.
