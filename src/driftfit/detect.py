@@ -27,7 +27,6 @@ runs as 50 every / T for a calibration.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from io import StringIO
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -40,7 +39,7 @@ from driftfit.judges.onsets import held, onsets
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import numbers, one_of, whole
-from driftfit.summary import WIDTH, facts, table_of
+from driftfit.summary import Printed, facts, table_of
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ class Score(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Alarms:
+class Alarms(Printed):
     """What `Track.detect` returns; printing it shows a table.
 
     Attributes
@@ -142,11 +141,6 @@ class Alarms:
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
     def plot(self, labels: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded."""

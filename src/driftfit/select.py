@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from io import StringIO
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +40,7 @@ from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.signals import as_inputs, as_output, check_ready, factor, intervals, noise_of
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
@@ -68,7 +67,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Printed):
     """What `select` returns; printing it shows the table.
 
     Attributes
@@ -153,11 +152,6 @@ class Selection:
         yield Text(f" best: {self.best}")
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
     def plot(self, most: int = 20) -> Figure:
         """How far structures are below the best, with standard errors, and where in time they lost it."""
