@@ -12,6 +12,7 @@ from numba import types
 from driftfit.drivers import INPUTS, drivers, tile_type
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.roles import check_roles
 from driftfit.settings import near, numbers, vector, whole
 from driftfit.signals import as_numbers, check_ready, factor, interval_of, noise_of
 from driftfit.smoothers.fixed_lag import FixedLag, Window
@@ -50,6 +51,8 @@ class Live:
 
     def __new__(cls, model: Model, *args: Any, **kwargs: Any) -> Any:
         """A stream with several outputs is a `LiveOutputs`."""
+        tracker = args[0] if args else kwargs.get("tracker")
+        check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         if len(model.outputs) == 1:
             return super().__new__(cls)
         from driftfit.live_outputs import LiveOutputs

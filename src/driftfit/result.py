@@ -76,6 +76,19 @@ class Track(Judged):
         self.labels = labels
         self._start = start
 
+    def __reduce__(self) -> Any:
+        """A copy, and what is sent to another process, leaves the other series of a fleet's tile behind."""
+        out, tile = self._out, self._tile
+        if tile["theta"].shape[-1] > 1:
+            tile = fresh_tile(self.model, self.tracker)
+            for name in storage.fields(tile):
+                tile[name][0, ..., 0] = self._tile[name][0, ..., self._lane]
+            out = np.empty(len(self), output_type(tile, self.tracker.outputs, "cov" if "P" in _names(out) else "std"))
+            for name in _names(out):
+                out[name][..., 0] = self._written(name)
+        signals = (self.y, self.u, self._time, self._known)
+        return type(self), (self.model, self.tracker, *signals, out, tile, 0, self.labels, self._start)
+
     def _written(self, name: str) -> Array:
         """A field of what the driver wrote, for this lane."""
         field: Array = self._out[name][..., self._lane]
