@@ -1,6 +1,6 @@
 """Alarms: rates of false alarms by simulation, what they find, and how they are scored."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -10,7 +10,7 @@ from support import arx_record
 
 from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.detect import Alarms
-from driftfit.judges.alarm_statistics import normal_scores
+from driftfit.judges.alarm_rule import AlarmRule, normal_scores
 from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
 from driftfit.judges.onsets import chance, held, mean_limit, mean_rate, normal_limit, onsets, power_limit, power_rate
 from driftfit.judges.scale import core
@@ -214,9 +214,17 @@ def test_score_by_hand():
     labels = np.zeros(20, int)
     labels[6:12] = 1
     labels[17:] = 1
-    said = Alarms("band", 10.0, active, onsets(active), np.zeros((20, 1)), np.ones(1), ("b1",), 2, 0.5, None)
-    got = said.score(labels)
-    assert (got.events, got.found, got.delay, got.false, got.normal) == (2, 1, 2.0, 2, 9)
+    rule = AlarmRule("band", 10.0, ("b1",), (1.0,))
+    said = Alarms(rule, active, onsets(active), np.zeros((20, 1)), 2, 0.5, None)
+    assert said.score(labels) == (2, 1, 2.0, 2, 9)
+    # an alarm that was on before the label is false, and finds nothing however long it stays
+    early = np.zeros(20, bool)
+    early[5:10] = True
+    got = replace(said, active=early, onsets=onsets(early)).score(labels)
+    assert (got.found, got.false, np.isnan(got.delay)) == (0, 1, True)
+    again = early.copy()
+    again[8] = False
+    assert replace(said, active=again, onsets=onsets(again)).score(labels) == (2, 1, 3.0, 1, 9)
     with pytest.raises(ValueError, match="20 samples"):
         said.score(labels[:5])
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, core, floats, kernel, outside, part
+from driftfit.kernel import Array, State, Step, core, floats, kernel, outside, part
 from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverting, laying, locating, refining
 from driftfit.models.block_memory import (
@@ -205,3 +205,18 @@ def build(into: Kind, out: Kind, p: tuple[int, ...]) -> ModelSteps:
             machine.load()
 
     return ModelSteps(regress, push, ready)
+
+
+@lru_cache
+def applying(into: Kind, p: tuple[int, ...]) -> Step:
+    """The step that takes an input after its sample: its functions, and the row of the next sample laid out again."""
+    input_at, orders = input_values(into), np.array(p)
+
+    @kernel
+    def apply(s: State, l: int) -> None:
+        s.blocks[U, l] = s.u[0, l]
+        m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
+        input_at(m, orders, m[U, 0], orders[F_PAST], orders[SPARE])
+        fill(m, orders, orders[NOW], 1, m[SEEN, 0] > 0.0)
+
+    return apply

@@ -53,6 +53,8 @@ class Tracker(Settings, ABC):
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
+    adapts: ClassVar[bool] = False
+    """Whether it finds drift and noise as it goes, so that its innovations are normal again soon after a fault."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
 
