@@ -11,6 +11,7 @@ from typing import Any
 from driftfit.drivers import INPUTS, tile_type
 from driftfit.kernel import Array, Driver, Step
 from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
 
 
 class _Later:
@@ -26,15 +27,16 @@ NOTHING, INPUT, IGNORED = 0, 1, 2
 """What `Live.apply` is expected to bring: nothing, the input of the last sample, or that of one that was ignored."""
 
 
-def applier(model: Model, tile: Array) -> Any:
+def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
     """``apply(tile, u)`` for the tiles of this type; ValueError where outputs need the input of their own sample."""
-    if model.apply is None:
+    step = tracker.apply_for(model)
+    if step is None:
         raise ValueError(
             f"Live.update: no input was given, but {model!r} needs the input of a sample to predict its output "
             "(a regression, or nk = 0): update(y, u), with u=None where it is not known. In a control loop, where u is "
             "chosen after y has been read, take a model with nk of at least 1, and update(y), then apply(u)."
         )
-    return _compiled(model.apply).entry(tile_type(tile), INPUTS)
+    return _compiled(step).entry(tile_type(tile), INPUTS)
 
 
 @lru_cache(maxsize=256)

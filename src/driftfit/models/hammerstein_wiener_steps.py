@@ -211,12 +211,15 @@ def build(into: Kind, out: Kind, p: tuple[int, ...]) -> ModelSteps:
 def applying(into: Kind, p: tuple[int, ...]) -> Step:
     """The step that takes an input after its sample: its functions, and the row of the next sample laid out again."""
     input_at, orders = input_values(into), np.array(p)
+    now, following, n = p[NOW], p[NEXT], p[N]
 
     @kernel
     def apply(s: State, l: int) -> None:
         s.blocks[U, l] = s.u[0, l]
         m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
         input_at(m, orders, m[U, 0], orders[F_PAST], orders[SPARE])
-        fill(m, orders, orders[NOW], 1, m[SEEN, 0] > 0.0)
+        fill(m, orders, following, 1, m[SEEN, 0] > 0.0)
+        for i in range(n):
+            s.blocks[now + i, l] = s.blocks[following + i, l]
 
     return apply

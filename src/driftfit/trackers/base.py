@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.settings import Settings
 from driftfit.trackers.each import roots
@@ -82,6 +82,10 @@ class Tracker(Settings, ABC):
     def steps_for(self, model: Model) -> TrackerSteps:
         """The steps for a bound model."""
         return self.steps
+
+    def apply_for(self, model: Model) -> Step | None:
+        """The step that takes in an input after its sample (`Model.apply`), for a bound model."""
+        return model.apply
 
     def names_for(self, model: Model) -> tuple[str, ...]:
         """Names of the entries of theta."""
