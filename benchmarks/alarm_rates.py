@@ -112,7 +112,7 @@ def fleets(count: int) -> Table:
     return table
 
 
-def main(records: int = 20, count: int = 20) -> None:
+def main(records: int = 20, many: int = 20) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
     for head in ("alarm", "set", "measured", "from", "to"):
         table.add_column(head, justify="left" if head == "alarm" else "right")
@@ -124,7 +124,7 @@ def main(records: int = 20, count: int = 20) -> None:
             ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
             table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
     Console(width=110).print(table)
-    Console(width=110).print(fleets(count))
+    Console(width=110).print(fleets(many))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from driftfit.kernel import Array
-from driftfit.late import INPUT, applier
+from driftfit.late import INPUT
 from driftfit.settings import near, numbers, vector, whole
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ class Asked(_OfStream):
 
         inputs, tile = future(self.model, h, u), resting(self.model, self.tracker, self._tile)
         if self._awaits == INPUT:
-            applier(self.model, self.tracker, tile)(tile, inputs[0])
+            cast("Live", self)._placing()(tile, inputs[0])
             inputs = np.vstack([inputs[1:], np.full((1, self.model.m), np.nan)])
         return forecast_from(self.model, self.tracker, tile, inputs)
 

@@ -54,6 +54,7 @@ class LiveOutputs(storage.Kept):
         self._cold = before is None
         self._ignored = 0
         self._alarms: dict[str, LiveAlarm] = {}
+        self._place: Any = None
         self._rows = row_model(self.model, self.trackers[0]) if self.model.shared else self.model
         self._tile = joint_tile(self._rows, self.trackers, taken_over(warm_start, self._rows, self.trackers))
         self._out = np.empty(1, output_type(self._tile, self.trackers[0].outputs))
@@ -70,7 +71,7 @@ class LiveOutputs(storage.Kept):
         check_applied(self._awaits)
         later = u is LATER and self._rows.m > 0
         if later:
-            applier(self.model, self.trackers[0], self._tile)
+            self._placing()
         interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
         if not interval > 0.0:
             self._ignored += 1
@@ -98,7 +99,13 @@ class LiveOutputs(storage.Kept):
         if inputs.shape != (self._rows.m,):
             raise ValueError(f"Live.apply: u must have shape ({self._rows.m},); got shape {np.shape(u)}.")
         if self._awaits == INPUT:
-            applier(self.model, self.trackers[0], tile)(tile, inputs)
+            self._placing()(tile, inputs)
+
+    def _placing(self) -> Any:
+        """What puts inputs in their places; ValueError for a model that needs them at once."""
+        if self._place is None:
+            self._place = applier(self.model, self.trackers[0], self._tile)
+        return self._place
 
     @property
     def awaits(self) -> bool:
@@ -150,7 +157,8 @@ class LiveOutputs(storage.Kept):
         absent = [name for name in rules if name not in self.model.outputs]
         if self.model.shared or absent:
             raise ValueError(
-                f"Live.detect: rules are for the outputs {self.model.outputs}, each with a theta of its own."
+                f"Live.detect: rules are for outputs with a theta of their own; got {list(rules)}, and the outputs are "
+                f"{', '.join(self.model.outputs)}."
             )
         for name, rule in rules.items():
             lane = self.model.outputs.index(name)
