@@ -147,13 +147,15 @@ def test_alarms_of_several_outputs():
 
 
 def test_without_faults_few_series_are_accused():
-    """p-values of series without a fault are not too small."""
+    """p-values of series without a fault are not too small, and not much too large."""
     rng = np.random.default_rng(6)
     u, v = rng.normal(size=(2, 200, 400))
     fleet = track(Regression(1), Kalman(q=0.0, r=1.0), u + v, u, by="row")
     p = np.array([row.alarms.p for row in fleet.detect("innovation", window=20).rows])
-    assert np.mean(p < 0.05) < 0.08
-    assert np.mean(p < 0.5) > 0.2
+    for level in (0.01, 0.05, 0.2, 0.5):
+        assert np.mean(p < level) < level + 2.0 * np.sqrt(level * (1.0 - level) / 200)
+    assert np.mean(p < 0.2) > 0.08
+    assert np.mean(p < 0.5) > 0.3
 
 
 @pytest.mark.parametrize(
