@@ -270,7 +270,7 @@ def _warn_of_following(run: Track) -> None:
     """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
     warnings.warn(
         f"detect: {type(run.tracker).__name__} finds its own drift and noise, so it follows a fault away: its "
-        "innovations are soon normal again, and a slow fault never shows in them. Watch where the parameters are, "
+        "innovations are soon normal again, and a slow fault hardly shows in them. Watch where the parameters are, "
         'detect("band", reference=...), or track with numbers that are fitted to the reference and then stay, '
         "tune(model, Kalman(), ...).tracker.",
         UserWarning,

@@ -168,9 +168,7 @@ def grid(kind: type[Model], **choices: Any) -> list[Model]:
     out; ValueError where none is left.
     """
     if not (isinstance(kind, type) and issubclass(kind, Model)):
-        raise TypeError(
-            f"grid: it makes the models itself, so give the class, as in grid(ARX, na=[1, 2]); got {kind!r}."
-        )
+        raise TypeError(f"grid: it makes the models, so give their class, as in grid(ARX, na=[1, 2]); got {kind!r}.")
     options = [value if isinstance(value, list | range) else [value] for value in choices.values()]
     models: list[Model] = []
     refused = ""
