@@ -45,3 +45,8 @@ def run_lanes(model, trackers, y, u, known):
 def same(a, b):
     """Equal bit for bit, NaN being equal to NaN."""
     return np.array_equal(np.asarray(a), np.asarray(b), equal_nan=True)
+
+
+def rows_of(text):
+    """What a printed table says, line by line: the words of each."""
+    return [line.split() for line in str(text).splitlines() if line.split()]

@@ -35,7 +35,8 @@ class LiveSystem:
 
     def poles(self) -> Array:
         """Poles, (na,) complex, the largest first."""
-        return system.poles(self)[0]
+        poles: Array = system.poles(self)[0]
+        return poles
 
     def largest_pole(self) -> Response:
         """Magnitude of the largest pole, with its standard deviation; below 1 the system is stable."""

@@ -213,7 +213,6 @@ def applying(into: Kind, p: tuple[int, ...]) -> Step:
     input_at, orders = input_values(into), np.array(p)
     now, following, n = p[NOW], p[NEXT], p[N]
 
-    @kernel
     def apply(s: State, l: int) -> None:
         s.blocks[U, l] = s.u[0, l]
         m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
@@ -222,4 +221,5 @@ def applying(into: Kind, p: tuple[int, ...]) -> Step:
         for i in range(n):
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
-    return apply
+    step: Step = kernel(apply)
+    return step

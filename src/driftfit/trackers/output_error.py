@@ -71,14 +71,14 @@ def _applying(place: Step, p: tuple[int, ...]) -> Step:
     """The input also counts for the usual power of v."""
     orders = np.array(p)
 
-    @kernel
     def apply(s: State, l: int) -> None:
         place(s, l)
         m, n = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0]
         theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, SIZE)[0]
         follow_power(m, orders, theta, own)
 
-    return apply
+    step: Step = kernel(apply)
+    return step
 
 
 @dataclass(frozen=True)
