@@ -2,9 +2,9 @@
 
     y_t = x_t' coef_t + intercept_t (+ a_1 y_(t-1) + .. + a_lags y_(t-lags)) + noise
 
-Rows are samples in order of time, and coefficients drift from row to row. `fit` tracks the rows from first to last;
-`coef_` are the coefficients after the last row, which `predict` uses for rows that come after it; `coef_path_` are those
-after every row. `partial_fit` goes on where the rows before ended.
+Rows are samples in order of time, and coefficients drift from row to row. `fit` tracks the rows from first to last.
+Coefficients after the last row (`coef_`) are those that `predict` uses for rows after it; `coef_path_` has those after
+every row. `partial_fit` goes on where the rows before ended.
 
 Order is all here: a shuffled split (``KFold(shuffle=True)``, ``train_test_split`` with its default) lets the estimator
 look ahead and scores what could not have been predicted. Use ``TimeSeriesSplit``.
