@@ -1,12 +1,11 @@
 """Alarms: rates of false alarms by simulation, what they find, and how they are scored."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import pytest
 from scipy import signal, stats
-from support import arx_record, rows_of
+from support import Doubtful, arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
 from driftfit.detect import Alarms
@@ -14,7 +13,7 @@ from driftfit.judges.alarm_rule import AlarmRule, normal_scores
 from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
 from driftfit.judges.onsets import chance, held, mean_limit, mean_rate, normal_limit, onsets, power_limit, power_rate
 from driftfit.judges.scale import core
-from driftfit.kernel import exp, kernel
+from driftfit.kernel import kernel
 from driftfit.trackers.kalman import INDEPENDENT
 
 K = Kalman(q=1e-3, r=0.01)
@@ -125,32 +124,6 @@ def test_normal_scores_bound_outliers():
     assert np.mean(scores**2) == pytest.approx(1.0, abs=0.06)
     assert np.abs(scores).max() < 4.0
     assert np.isnan(normal_scores(np.array([np.nan]), known)[0])
-
-
-@kernel
-def store(o, s, l):
-    o.window[l] = s.window[l]
-
-
-@kernel
-def doubt(s, l):
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l]
-    s.window[l] = 1.0 - exp(-0.5 * s.ok[l] * s.e[l] * s.e[l] / s.s[l])
-
-
-@dataclass(frozen=True)
-class Doubtful(Kalman):
-    """A Kalman filter that calls the share of smaller innovations a probability."""
-
-    outputs: ClassVar[tuple[str, ...]] = ("window",)
-
-    def state(self, n):
-        return {**super().state(n), "window": 0.0}
-
-    @property
-    def steps(self):
-        return INDEPENDENT._replace(report=doubt, store=store)
 
 
 def test_probability_alarm_is_calibrated_by_simulation():

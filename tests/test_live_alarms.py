@@ -1,20 +1,18 @@
 """Alarms, forecasts and systems on a stream: what `Track` says of the record, bit for bit, also across a file."""
 
 import pickle
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import ClassVar
 
 import numpy as np
 import pytest
-from support import arx_record, damaged, same
+from support import Doubtful, arx_record, damaged, same
+from test_bank import N, R, changes
+from test_bank import record as jumping
 
-from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
 from driftfit.judges.alarm_rule import AlarmRule
 from driftfit.judges.calibrate import null_records
-from driftfit.kernel import exp, kernel
 from driftfit.live_alarm import LiveAlarm
-from driftfit.trackers.kalman import INDEPENDENT
 
 K = Kalman(q=1e-4, r=0.01)
 T, CUT, FAULT = 900, 500, 700
@@ -26,32 +24,6 @@ def record():
     path = np.tile([1.2, -0.5, 1.0, 0.4], (T, 1))
     path[FAULT:, 2] += 0.5
     return damaged(*arx_record(T, 5, theta=path), share=0.02)
-
-
-@kernel
-def store(o, s, l):
-    o.window[l] = s.window[l]
-
-
-@kernel
-def doubt(s, l):
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l]
-    s.window[l] = 1.0 - exp(-0.5 * s.ok[l] * s.e[l] * s.e[l] / s.s[l])
-
-
-@dataclass(frozen=True)
-class Doubtful(Kalman):
-    """A Kalman filter that calls the share of smaller innovations a probability."""
-
-    outputs: ClassVar[tuple[str, ...]] = ("window",)
-
-    def state(self, n):
-        return {**super().state(n), "window": 0.0}
-
-    @property
-    def steps(self):
-        return INDEPENDENT._replace(report=doubt, store=store)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +68,21 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     assert [onset.time for onset in told] == [float(t) for t in begun]
     assert all(onset.statistic > onset.limit == rule.limits[rule.names.index(onset.cause)] for onset in told)
     assert alarm.onsets() == []
+
+
+def test_the_probability_of_a_bank():
+    y, u = jumping(150, 5, (40, 90))
+    bank = Bank(changes(), [Sensor.nominal(R)], reduce=Beam(9), p0=2.0)
+    rule = AlarmRule("probability", 100.0, ("probability",), (0.5,))
+    said = track(Regression(N), bank, y, u).detect(rule, start=5)
+    live = Live(Regression(N), bank)
+    alarm = live.detect(rule, wait=5)
+    for t in range(150):
+        live.update(y[t], u[t])
+        assert alarm.active == said.active[t]
+        assert t < 5 or same(alarm.statistic, said.statistic[t])
+    assert [onset.sample for onset in alarm.onsets()] == said.onsets.tolist()
+    assert all(min(abs(t - jump) for t in said.onsets) < 4 for jump in (40, 90))
 
 
 def test_the_start_of_an_estimate_is_no_alarm(record):

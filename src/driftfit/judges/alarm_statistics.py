@@ -110,8 +110,8 @@ def _carried(statistic: Array) -> Array:
 
 
 def chance_of(run: Track, rule: AlarmRule) -> Chance:
-    """The chance of an extreme by theory; of a simulated limit there is none, and it is NaN."""
-    if rule.simulated:
+    """The chance of an extreme by theory; of probabilities and simulated limits there is none, and it is NaN."""
+    if rule.simulated or rule.kind == "probability":
         return lambda highest, J: float("nan")
     if rule.kind == "band":
         rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
