@@ -47,7 +47,7 @@ class Reduction(Settings, ABC):
 
 def knobs(kind: int, **values: float) -> Array:
     """The vector of settings."""
-    vector = np.zeros(9)
+    vector = np.zeros(7)
     vector[plan.KIND], vector[plan.TAU], vector[plan.WAIT] = kind, -1.0, -1.0
     for name, value in values.items():
         vector[getattr(plan, name.upper())] = value
@@ -158,24 +158,20 @@ class IMM(Reduction):
 class Beam(Reduction):
     """The heaviest leaves (M-algorithm); ties go to the earlier leaf.
 
-    ``window`` is how many floors of the past are remembered for the probabilities of events. ``life`` protects leaves
-    younger than so many floors since their last change, ``only_best_jumps`` lets only the heaviest parent jump (AFMM);
-    neither gains clearly. The mass that was dropped is missing from the evidence; it is reported. Cost: leaves times H.
+    ``window`` is how many floors of the past are remembered for the probabilities of events. The mass that was dropped
+    is missing from the evidence; it is reported. Cost: leaves times H.
     """
 
     leaves: int = 9
     window: int = 8
-    life: int = 0
-    only_best_jumps: bool = False
 
     def __post_init__(self) -> None:
-        for name, low in (("leaves", 1), ("window", 1), ("life", 0)):
-            self._set(name, whole("Beam", name, getattr(self, name), low))
+        for name in ("leaves", "window"):
+            self._set(name, whole("Beam", name, getattr(self, name), 1))
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("Beam", Hd * Hm * self.leaves, 1, "use fewer leaves")
-        vector = knobs(plan.BEAM, leaves=self.leaves, life=self.life, best=float(self.only_best_jumps))
-        return Shape(self.leaves, children, self.window, 1, vector, np.ones(3))
+        return Shape(self.leaves, children, self.window, 1, knobs(plan.BEAM, leaves=self.leaves), np.ones(3))
 
 
 @dataclass(frozen=True)

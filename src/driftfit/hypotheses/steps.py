@@ -142,6 +142,7 @@ def correct(s: State, l: int) -> None:
         tell(s, l)
         run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
+        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]  # a fault code counts as missing, in lags too
         learn_scales(s, l)
     else:
         only_drift(s, l)
@@ -164,7 +165,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     if counts:
         learn_start(s, l)
     tell(s, l)
-    s.now[Y_HAT, l] = s.y_hat[l]
+    s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
     s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
     ready = s.rank[l] == s.theta.shape[0] and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
     s.many[SETTLED, l] = READY if ready else WAITING

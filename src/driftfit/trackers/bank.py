@@ -47,13 +47,16 @@ from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.hypotheses.sensor import Sensor
 from driftfit.hypotheses.start import GROWTH, begin
 from driftfit.hypotheses.steps import STEPS
-from driftfit.hypotheses.table import COUNT, FADE, HEAD, LAST, LEAVES, PACKED, SIZE, R
+from driftfit.hypotheses.table import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, R
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
+
+FAR = 100.0
+"""Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,7 @@ class Bank(Tracker):
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """The sensors, likewise."""
-        return self.sensors or (Sensor.nominal(),)
+        return self.sensors or (Sensor.nominal(limit=FAR),)
 
     @property
     def reduction(self) -> Reduction:
@@ -178,6 +181,16 @@ class Bank(Tracker):
     def _alike(self) -> bool:
         P = self._events[0]
         return bool((P[0] == P).all())
+
+    @property
+    def _apart(self) -> bool:
+        """Whether changes are events that know nothing of earlier ones, so that a gap is one floor."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
+            return False
+        P = self._events[0].reshape(-1, Hd, Hm)
+        product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
+        return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
     @property
     def change_names(self) -> tuple[str, ...]:
@@ -234,7 +247,7 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         now, many = np.zeros(SIZE), np.zeros(COUNT, int)
-        now[LAST], now[R] = np.nan, 1.0
+        now[LAST], now[R], now[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
         now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
@@ -247,7 +260,7 @@ class Bank(Tracker):
                 factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
         return {  # memory first, where a cache line begins
-            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt"),
+            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
@@ -320,8 +333,11 @@ class Bank(Tracker):
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         told = run.hypotheses
         kinds = [event.kind for event in told.found()]
-        faults = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
-        said = [("Events", f"{kinds.count('change')} changes{faults}; see run.hypotheses.events()")]
+        wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
+        said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
+        faults = int(run._tile["many"][0, FAULTS, run._lane])
+        if faults:
+            said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
         return tuple(said)
