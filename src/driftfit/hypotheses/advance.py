@@ -28,7 +28,7 @@ from driftfit.hypotheses.leaves import (
     variance_factor,
 )
 from driftfit.hypotheses.merge import combine, mix, sort, take
-from driftfit.hypotheses.past import marginals, pick, shift, write_out
+from driftfit.hypotheses.past import marginals, pick, shift, summary, write_out
 from driftfit.hypotheses.plan import (
     BEAM,
     CUT,
@@ -51,9 +51,11 @@ from driftfit.hypotheses.start import GROWTH, trace, wait
 from driftfit.hypotheses.table import (
     AGAIN,
     AT,
+    BESIDE,
     CLOCK,
     COUNT,
     COV,
+    ELAPSED,
     EVIDENCE,
     EXPANDED,
     FADE,
@@ -185,10 +187,12 @@ def advance(
     A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, gap: Array, lag_prob: Array,
-    theta: Array, cov: Array, na: int, unknown: bool, same: bool, plain: bool, walks: bool, apart: bool,
+    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, gap: Array, moving: Array,
+    lag_prob: Array, theta: Array, cov: Array, na: int, unknown: bool, same: bool, plain: bool, walks: bool,
+    apart: bool,
 ) -> None:  # fmt: skip
-    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite.
+    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite, or
+    the chain of the changes.
     The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`. Where
     changes are independent events (``apart``) a gap is one floor, of which ``gap`` tells.
     """
@@ -199,9 +203,12 @@ def advance(
     T, T2 = (T2, T) if many[FLIPPED] > 0 else (T, T2)
     noise, dt, used = now[IN_NOISE], now[IN_DT], now[IN_OK] > 0.0
     told, first = given[0] == given[0], many[FLOORS] == 0
+    if given[H] == given[H]:
+        chained(given[H:], P, Hm, moving)
+        P, same = moving, False
     wide = apart and (many[OPEN] > 0 or dt != 1.0 or not used)
     plain = plain and many[OPEN] == 0  # the covariance of the mixture then has more in it than that of the leaves
-    row = given if told else initial if first else P[0]
+    row = given[:H] if told else initial if first else P[0]
     alike = same or told or first
     now[EVIDENCE] = 0.0
     for k in range(len(decided)):
@@ -399,13 +406,30 @@ def lone_density(now: Array) -> float:
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)
 
 
+@core
+def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
+    """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
+    H = len(P)
+    Hd = H // Hm
+    for j in range(Hm):
+        for to in range(Hm):
+            share = 0.0
+            for i in range(Hd):
+                share += P[j, i * Hm + to]
+            for i in range(Hd):
+                for k in range(Hd):
+                    moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
+
+
 @part
-def note(ring: Array, clock: int, window: float, lag_prob: Array) -> None:
-    """Remember the probability of a change in the window, and what is known at last of the event W - 1 floors back."""
+def note(ring: Array, clock: int, window: float, now: Array, lag_prob: Array) -> None:
+    """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
+    known at last of the event W - 1 floors back.
+    """
     row = (clock - 1) % len(ring)
-    ring[row, 0] = window
+    ring[row, 0], ring[row, 1], ring[row, 2] = window, now[IN_OK], now[ELAPSED]
     for e in range(lag_prob.shape[1]):
-        ring[row, 1 + e] = lag_prob[len(lag_prob) - 1, e]
+        ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 @outside
@@ -431,8 +455,8 @@ def bank(table: int) -> None:
             packed(t, AT.chain), packed(t, AT.initial)[0], packed(t, AT.given)[0], packed(t, AT.loss),
             packed(t, AT.knobs)[0], packed(t, AT.bases)[0], packed(t, AT.stamps)[0], packed(t, AT.decided),
             packed(t, AT.parts), root, packed(t, AT.samples), packed(t, AT.Qt), packed(t, AT.news), packed(t, AT.gap),
-            lag_prob, theta, cov, t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0, t[PLAIN, 0] > 0, t[PLAIN, 1] > 0,
-            t[PLAIN, 2] > 0,
+            packed(t, AT.moving), lag_prob, theta, cov, t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,
+            t[PLAIN, 0] > 0, t[PLAIN, 1] > 0, t[PLAIN, 2] > 0,
         )  # fmt: skip
         head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
     if not begun:
@@ -441,4 +465,6 @@ def bank(table: int) -> None:
         for row in range(len(root)):
             root[row, 0] = B[row, 0]
         head[0], head[1], head[2], head[3] = lone_density(now), 0.0, 1.0, 1.0
-    note(packed(t, AT.ring), many[CLOCK], head[1], lag_prob)
+    now[ELAPSED] += now[IN_DT]
+    summary(lag_prob, packed(t, AT.brief))
+    note(packed(t, AT.ring), many[CLOCK], head[1], now, lag_prob)

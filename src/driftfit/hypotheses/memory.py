@@ -14,7 +14,7 @@ from driftfit.hypotheses.gap import SINCE
 from driftfit.hypotheses.leaves import FIRST
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.past import news_of
-from driftfit.hypotheses.table import FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA
+from driftfit.hypotheses.table import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
@@ -56,13 +56,14 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "factors": np.ones(Hd), "theta0": places,
         "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
         "sensors": np.array([sensor.row() for sensor in bank.all_sensors]),
-        "chain": chain, "initial": initial, "given": np.full(H, np.nan),
+        "chain": chain, "initial": initial, "given": np.full(H + Hd * Hd, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd + 1, wide)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, BESIDE + H)), "Qt": np.zeros((Hd + 1, wide)),
         "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "news": news_of(H, Hm, past), "gap": _closed(Hd, wide),
-        "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
+        "lag_prob": np.zeros((W, H)),
+        "brief": np.zeros((min(W, TOLD), H)), "moving": np.zeros((H, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 

@@ -16,6 +16,10 @@ from driftfit.hypotheses import plan
 from driftfit.kernel import Array
 from driftfit.settings import Settings, numbers, one_of, plain, whole
 
+REMEMBERED = 24
+"""Floors of the past that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four hundred
+samples, twenty times, 25 of 40 were found with 8 floors, 37 with 16, and 40 with 24.
+"""
 MOST = 4096
 """Leaf updates a sample above which a bank is refused."""
 
@@ -158,12 +162,13 @@ class IMM(Reduction):
 class Beam(Reduction):
     """The heaviest leaves (M-algorithm); ties go to the earlier leaf.
 
-    ``window`` is how many floors of the past are remembered for the probabilities of events. The mass that was dropped
-    is missing from the evidence; it is reported. Cost: leaves times H.
+    ``window`` is how many floors of the past are remembered for the probabilities of events: a change that takes more
+    samples to tell is not found. The mass that was dropped is missing from the evidence; it is reported. Cost: leaves
+    times H.
     """
 
     leaves: int = 9
-    window: int = 8
+    window: int = REMEMBERED
 
     def __post_init__(self) -> None:
         for name in ("leaves", "window"):
@@ -177,6 +182,8 @@ class Beam(Reduction):
 @dataclass(frozen=True)
 class Hybrid(Reduction):
     """Merge leaves that agree in the changes of the window, the last sensor events and their age; then a beam.
+
+    Of events more is remembered than the ``window`` that keeps leaves apart, on average over what was merged.
 
     Old sensor events are nuisance and merged early, changes are the product and kept apart. Ages above ``age_cap``
     count as one. Cost: leaves times H.
@@ -199,7 +206,12 @@ class Hybrid(Reduction):
                 f"Hybrid: a window of {self.window} with {Hd} changes cannot be told apart; use a smaller one."
             )
         return Shape(
-            self.leaves, children, self.window, 1, knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap), bases
+            self.leaves,
+            children,
+            max(self.window, REMEMBERED),
+            1,
+            knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap),
+            bases,
         )
 
 

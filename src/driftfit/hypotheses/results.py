@@ -53,9 +53,12 @@ class Hypotheses:
     ----------
     names : tuple of str
         Names of the joint events (change, sensor), H of them.
-    lag_prob : (T, W, H)
-        lag_prob[t, k] are the probabilities of the events k floors before t, given the data up to t; NaN before the
-        first event.
+    lags : tuple of int
+        Floors back that are told of: all W that the reduction remembers, or where these are more than eight the
+        newest seven and the oldest.
+    lag_prob : (T, len(lags), H)
+        lag_prob[t, k] are the probabilities of the events lags[k] floors before t, given the data up to t; NaN before
+        the first event.
     window : (T,)
         Probability of at least one change in the newest W floors.
     evidence : (T,)
@@ -71,6 +74,7 @@ class Hypotheses:
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
         self._report = run._written("report")
         self.names = self.tracker.event_names
+        self.lags = self.tracker.floors_told
         self.sensors = len(self.tracker.all_sensors)
         if self.impossible:
             warnings.warn(
@@ -93,11 +97,11 @@ class Hypotheses:
 
         Row t is of the event first visible in sample t; NaN at the end, where the later samples are not there yet.
         """
-        W = self.lag_prob.shape[1]
-        if not 0 <= lag < W:
-            raise ValueError(f"prob: lag must be 0 .. {W - 1} for this reduction; got {lag}.")
+        if lag not in self.lags:
+            said = ", ".join(str(k) for k in self.lags)
+            raise ValueError(f"prob: lag must be one of {said} for this reduction; got {lag}.")
         p = np.full((len(self.run), len(self.names)), np.nan)
-        p[: len(p) - lag] = self.lag_prob[lag:, lag]
+        p[: max(len(p) - lag, 0)] = self.lag_prob[lag:, self.lags.index(lag)]
         return p
 
     @property
@@ -113,9 +117,13 @@ class Hypotheses:
     @cached_property
     def latest(self) -> Array:
         """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
-        T, W, _ = self.lag_prob.shape
-        lag = np.minimum(W - 1, T - 1 - np.arange(T))
-        return np.asarray(self.lag_prob[np.arange(T) + lag, lag])
+        p, oldest = self.prob(self.lags[-1]), self.lags[-1]
+        tile, run = self.run._tile, self.run
+        lane = {name: tile[name][0, ..., run._lane] for name in ("memory", "table")}
+        now = self.tracker.array(run.model, lane, "lag_prob")
+        for k in range(min(oldest, len(p))):
+            p[len(p) - 1 - k] = now[k] if now[k].sum() > 0.5 else np.nan
+        return p
 
     @property
     def window(self) -> Array:
@@ -185,20 +193,23 @@ class Hypotheses:
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
         smoothed = self.smooth(threshold)
-        return [event.measured(smoothed) if event.kind == "change" and event.date else event for event in found]
+        return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events`, without how far parameters moved, which takes a smoother."""
         bank = self.tracker
-        told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
-        return all_of(told, threshold)
+        told = Told(
+            self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
+        )  # fmt: skip
+        time = self.run.time
+        return [event.timed(lambda sample: time[sample]) for event in all_of(told, threshold)]
 
     def table(self, threshold: float = 0.5) -> Any:
         """`events` as a polars table: for every parameter how far it moved, with its standard error."""
         import polars as pl
 
-        names, at = self.run.names, self.run.time
-        rows = [{**event.row(names), "time": at[event.date]} for event in self.events(threshold)]
+        names = self.run.names
+        rows = [{**event.row(names), "sample": event.span.date} for event in self.events(threshold)]
         return pl.DataFrame(rows, infer_schema_length=None)
 
     def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:

@@ -92,7 +92,7 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
     which = np.zeros(T, int)
     for event in events:
         if event.kind == "change":
-            which[event.date] = bank.change_names.index(event.name)
+            which[event.span.date] = bank.change_names.index(event.name)
     time = seen["dt"][:, 0] * known[:, 2]
     r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
     C0 = np.diag(WIDE * unit) if bank.p0 is None else np.asarray(_full(bank, n)) * relative
@@ -124,8 +124,9 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
         if event.kind == "sensor":
             sensor = sensors[event.name]
             away = sensor.kind in ("additive", "frozen")
-            last = event.last + 1 + (reach if away else 0)
-            factor[event.first : last] = np.inf if away else np.maximum(factor[event.first : last], sensor.factor)
+            last = event.span.last + 1 + (reach if away else 0)
+            first = event.span.first
+            factor[first:last] = np.inf if away else np.maximum(factor[first:last], sensor.factor)
     return factor
 
 

@@ -189,14 +189,14 @@ def keep(o: State, s: State, l: int) -> None:
 
 @kernel
 def told(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, then factors of the drift of every change."""
+    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
     row = t if known.shape[0] > 1 else 0
     given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
-    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
-    for e in range(H):
-        s.memory[given + e, l] = known[row, 3 + e, l]
+    count, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for k in range(count):
+        s.memory[given + k, l] = known[row, 3 + k, l]
     for i in range(Hd):
-        s.memory[factors + i, l] = known[row, 3 + H + i, l]
+        s.memory[factors + i, l] = known[row, 3 + count + i, l]
 
 
 STEPS = TrackerSteps(nothing, correct, report, begin, keep, told)

@@ -22,17 +22,23 @@ samples in a row were too far from what was expected, FAULTS in all; AGAIN says 
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, SIZE,
-) = range(19)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, SIZE,
+) = range(20)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out."""
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
+BESIDE = 3
+"""Entries of a remembered sample before its probabilities: that of a change in the window, whether it was used, and how
+many nominal intervals had passed.
+"""
+TOLD = 8
+"""Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
 PACKED = (
     "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
     "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "news", "gap", "lag_prob", "decided",
+    "news", "gap", "moving", "lag_prob", "brief", "decided",
 )  # fmt: skip
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.

@@ -42,12 +42,12 @@ from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.factored import factorise, widened
 from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.memory import SINGLE, arrays_of, packed
-from driftfit.hypotheses.prior import events, per_sample
+from driftfit.hypotheses.prior import chains, events, per_sample
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.hypotheses.sensor import Sensor
 from driftfit.hypotheses.start import GROWTH, begin
 from driftfit.hypotheses.steps import STEPS
-from driftfit.hypotheses.table import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, R
+from driftfit.hypotheses.table import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
@@ -104,6 +104,7 @@ class Bank(Tracker):
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
+    density: ClassVar[str] = "report"
     weighs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -270,20 +271,27 @@ class Bank(Tracker):
         }  # fmt: skip
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
-        Hd, Hm = len(self.all_changes), len(self.all_sensors)
-        columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
+        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where nothing is given; then
+        factors of the changes (T, H_d).
+        """
+        Hd, H = len(self.all_changes), self._count
+        columns = np.hstack([np.full((T, H + Hd * Hd), np.nan), np.ones((T, Hd))])
         if prob is not None:
-            given = np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1]))
-            columns[:, : Hd * Hm] = per_sample("Bank", given, self._events[1], Hd)
+            given = as_numbers("prob", prob)
+            if given.ndim == 3:
+                columns[:, H : H + Hd * Hd] = chains("Bank", given, T, Hd)
+            else:
+                given = np.broadcast_to(given, (T, given.shape[-1]))
+                columns[:, :H] = per_sample("Bank", given, self._events[1], Hd)
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
                 raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
-            columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
+            columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+        prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
         columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
         for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
             start = lane["table"][PACKED.index(name), 0] // 8
@@ -314,15 +322,23 @@ class Bank(Tracker):
         return B[:, : max(int(lane["many"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
+        """evidence, window, kept, leaves, lag_prob (of the floors `floors_told`, H) or decided (held, 3) from reports
+        (.., size).
+        """
         if name in SINGLE:
             return report[..., SINGLE.index(name)]
         shape = self._shape
-        lags = shape.floors * self._count
-        start, rows, columns = {"lag_prob": (HEAD, shape.floors, self._count), "decided": (HEAD + lags, shape.held, 3)}[
-            name
-        ]
+        floors = len(self.floors_told)
+        start, rows, columns = {
+            "lag_prob": (HEAD, floors, self._count), "decided": (HEAD + floors * self._count, shape.held, 3),
+        }[name]  # fmt: skip
         return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
+
+    @property
+    def floors_told(self) -> tuple[int, ...]:
+        """The floors that a report tells of, counted back from the present: the newest, and the oldest."""
+        W = self._shape.floors
+        return (*range(min(W, TOLD) - 1), W - 1)
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
