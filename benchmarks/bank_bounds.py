@@ -24,9 +24,6 @@ from typing import Any
 
 import numpy as np
 
-COUNT, SITE, INDEX, SIZE, STOP = range(5)
-"""What is written down: how often, and of the last time where, which index, of how many, and how many sites there may be."""
-
 
 def watch() -> tuple[Any, list[str]]:
     """Put checks into whatever is compiled from now on; returns what they write to, and the lines of the sites."""

@@ -36,7 +36,7 @@ def coverage(size: float, records: int) -> tuple[int, int, int, float]:
     """Found, held, false, and the mean length of the interval."""
     found, held, false, length = 0, 0, 0, 0
     for seed in range(records):
-        events = track(Regression(2), Bank(), *record(np.random.default_rng(seed), size)).hypotheses.found()
+        events = track(Regression(2), Bank(), *record(np.random.default_rng(seed), size)).hypotheses.dated()
         here = near(events, 0)
         false += len(events) - len(here)
         if here:
@@ -55,7 +55,9 @@ def main(records: int = 1000) -> None:
     print("size of the jump   found   interval holds it   false   samples in the interval")
     for size in (1.5, 2.0, 3.0, 5.0, 10.0):
         found, held, false, length = coverage(size, records)
-        print(f"{size:12.1f} {found / records:12.3f} {held / max(found, 1):13.3f} {false / records:15.3f} {length:14.1f}")
+        print(
+            f"{size:12.1f} {found / records:12.3f} {held / max(found, 1):13.3f} {false / records:15.3f} {length:14.1f}"
+        )
     print("outage   found, jump of 2   of 5")
     for outage in (0, 5, 20, 100):
         counts = [outages(size, outage, records) / records for size in (2.0, 5.0)]

@@ -2,8 +2,8 @@
 
 The mass of one jump splits between neighbouring samples, so an event is a cluster of them: while the probability of a
 change in the window is above the threshold, samples with a share in it belong together. Its date is the likeliest of
-them, its interval the fewest neighbours that hold `LEVEL` of the mass. Samples that were not used belong to the next
-one that was: a jump in an outage may have been at any of them.
+them, its interval the fewest neighbours that hold `LEVEL` of the mass of the leaves. Samples that were not used belong
+to the next one that was: a jump in an outage may have been at any of them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FAINT = 0.02
 """Probability below which a sample does not count to a cluster."""
 LEVEL = 0.95
-"""Share of the mass that the interval of a date holds."""
+"""Share of the mass that the interval of a date holds, and its level where the whole record tells of it."""
 
 
 class Span(NamedTuple):
@@ -45,15 +45,16 @@ class Event:
     Attributes
     ----------
     date, first, last
-        When it is first visible, and the ends of the interval that holds the date with probability ``level``, given
-        that the event happened (of a fault: the ends of its duration): times where the record has them, else sample
-        numbers.
+        When it is first visible, and the ends of the interval that holds the date with probability ``level`` (of a
+        fault: the ends of its duration): times where there are some, else sample numbers.
     known
         When it was known at this threshold, likewise.
     span : Span
         The four as sample numbers.
     level : float
-        Level of the interval, 0.95; simulated in `benchmarks/event_dates.py`.
+        Level of the interval: 0.95 for changes in a record, whose dates are those of `driftfit.hypotheses.dates`,
+        simulated in `benchmarks/event_dates.py`. NaN for faults, and in a stream, where the interval is only what the
+        leaves that were kept leave open.
     prob : float
         Probability that it happened.
     name : str
@@ -71,7 +72,7 @@ class Event:
     shift: dict[str, float] = field(default_factory=dict)
     std: dict[str, float] = field(default_factory=dict)
     times: tuple[Any, ...] = ()
-    level: float = LEVEL
+    level: float = float("nan")
 
     @property
     def date(self) -> Any:
@@ -147,9 +148,7 @@ def changes_of(told: Told, threshold: float) -> list[Event]:
         for first, end in clusters(p, reach, threshold):
             mass, share = p[first:end], by_change[first:end, 1:].sum(axis=0)
             low, high = densest(mass)
-            low = first + low
-            while low > reach.start and not told.used[low - 1]:
-                low -= 1
+            low = back_to(first + low, reach.start, told.used)
             shares = dict(zip(names, (share / share.sum()).tolist(), strict=True))
             likely, date = names[int(share.argmax())], first + int(mass.argmax())
             prob = float(min(mass.sum(), 1.0))
@@ -166,6 +165,13 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
         return found
     seen = np.flatnonzero(part > FAINT)
     return [(reach.start + int(seen[0]), reach.start + int(seen[-1]) + 1)] if len(seen) else []
+
+
+def back_to(first: int, start: int, used: Array) -> int:
+    """The first of the samples that were not used before this one: what happened then shows here."""
+    while first > start and not used[first - 1]:
+        first -= 1
+    return first
 
 
 def densest(mass: Array) -> tuple[int, int]:

@@ -183,7 +183,7 @@ class Beam(Reduction):
 class Hybrid(Reduction):
     """Merge leaves that agree in the changes of the window, the last sensor events and their age; then a beam.
 
-    Of events more is remembered than the ``window`` that keeps leaves apart, on average over what was merged.
+    For the probabilities of events ``remembered`` floors are kept, on average over what was merged.
 
     Old sensor events are nuisance and merged early, changes are the product and kept apart. Ages above ``age_cap``
     count as one. Cost: leaves times H.
@@ -193,9 +193,10 @@ class Hybrid(Reduction):
     window: int = 5
     sensor_events: int = 1
     age_cap: int = 40
+    remembered: int = REMEMBERED
 
     def __post_init__(self) -> None:
-        for name, low in (("leaves", 1), ("window", 1), ("sensor_events", 0), ("age_cap", 1)):
+        for name, low in (("leaves", 1), ("window", 1), ("sensor_events", 0), ("age_cap", 1), ("remembered", 1)):
             self._set(name, whole("Hybrid", name, getattr(self, name), low))
 
     def shape(self, Hd: int, Hm: int) -> Shape:
@@ -208,7 +209,7 @@ class Hybrid(Reduction):
         return Shape(
             self.leaves,
             children,
-            max(self.window, REMEMBERED),
+            self.remembered,
             1,
             knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap),
             bases,

@@ -181,7 +181,7 @@ class Hypotheses:
         """The path of the whole record given the events."""
         from driftfit.hypotheses.smooth import EventSmoothed
 
-        return EventSmoothed(self.run, self.found(threshold))
+        return EventSmoothed(self.run, self.dated(threshold))
 
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, in order of time.
@@ -189,20 +189,38 @@ class Hypotheses:
         How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
         change forgets or resets there is nothing to smooth, and it is not said.
         """
-        found = self.found(threshold)
+        found = self.dated(threshold)
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
-        smoothed = self.smooth(threshold)
+        from driftfit.hypotheses.smooth import EventSmoothed
+
+        smoothed = EventSmoothed(self.run, found)
         return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
 
+    def dated(self, threshold: float = 0.5) -> list[Event]:
+        """`found`, with the dates of changes from all samples around them (`driftfit.hypotheses.dates`)."""
+        found = self.found(threshold)
+        if not any(event.kind == "change" for event in found):
+            return found
+        from driftfit.hypotheses.dates import dated
+        from driftfit.hypotheses.smooth import measurements, steps_of
+
+        measured = measurements(self.run, found)
+        jumps = dict(zip(self.tracker.change_names, steps_of(self.run, measured), strict=True))
+        return self._timed(dated(found, measured, jumps))
+
     def found(self, threshold: float = 0.5) -> list[Event]:
-        """`events`, without how far parameters moved, which takes a smoother."""
+        """`events` as they were known when they were found: with the dates that the leaves say, and no shifts."""
         bank = self.tracker
         told = Told(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
         )  # fmt: skip
+        return self._timed(all_of(told, threshold))
+
+    def _timed(self, events: list[Event]) -> list[Event]:
+        """With times, where the record has some."""
         time = self.run.time
-        return [event.timed(lambda sample: time[sample]) for event in all_of(told, threshold)]
+        return [event.timed(lambda sample: time[sample]) for event in events]
 
     def table(self, threshold: float = 0.5) -> Any:
         """`events` as a polars table: for every parameter how far it moved, with its standard error."""

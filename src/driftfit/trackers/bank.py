@@ -342,7 +342,8 @@ class Bank(Tracker):
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
-        start, rows, columns = self.state_for(model)["table"][PACKED.index(name)]
+        table = lane["table"] if "table" in lane else self.state_for(model)["table"]
+        start, rows, columns = table[PACKED.index(name)]
         part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return part.view(np.int64) if name in ("links", "group", "slots") else part
 
