@@ -7,6 +7,7 @@ decided, probabilities are conditional on the decisions.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -215,7 +216,18 @@ class Hypotheses:
         told = Told(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
         )  # fmt: skip
-        return self._timed(all_of(told, threshold))
+        found = [self._early(event, threshold) for event in all_of(told, threshold)]
+        return self._timed(found)
+
+    def _early(self, event: Event, threshold: float) -> Event:
+        """A fault may have been known sooner than when it was remembered for the last time."""
+        if event.kind == "change":
+            return event
+        j, date = self.tracker.sensor_names.index(event.name), event.span.date
+        for k, lag in enumerate(self.lags):
+            if date + lag < len(self.run) and self.lag_prob[date + lag, k, j :: self.sensors].sum() > threshold:
+                return replace(event, span=event.span._replace(known=date + lag))
+        return event
 
     def _timed(self, events: list[Event]) -> list[Event]:
         """With times, where the record has some."""
