@@ -138,7 +138,9 @@ def tune(
     model, y, u, time, dt, weights, drift
         As for `track`.
     tracker : Tracker
-        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays.
+        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays. Of a `Bank` the scales of
+        its changes are found, as factors of the standard deviations that it has, and their prior probabilities, by its
+        log evidence.
     method : "ml", "h-step", "loo" or "gcv"
         The criterion, see the module.
     groups : None, "each", or n labels
