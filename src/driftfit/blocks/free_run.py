@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """``y``, ``w``, ``v`` (T,), the sum over all inputs; ``rising`` and ``stable`` (T,) bool: where F increased and no pole was reflected."""
+    """``y``, ``w`` and ``v`` (T,), v the sum over all inputs; ``rising`` and ``stable`` (T,) bool: where F increased,
+    and where no pole was reflected.
+    """
 
     y: Array
     w: Array

@@ -186,28 +186,69 @@ def joint(M: Array, d0: Array, a: Array, d: Array) -> None:
 
 
 @shared
-def separate_input(row: Array, at_b: int, at_bc: int, method: int, rise: Array, b: Array, c: Array, W: Array) -> float:
-    """b (nb,) and c (n_in,) of an input from one theta; returns the quality."""
-    nb, n_in = len(b), len(c)
-    B = np.empty((nb, n_in))
-    for j in range(nb):
-        B[j, 0] = row[at_b + j]
-        for k in range(1, n_in):
-            B[j, k] = row[at_bc + (k - 1) * nb + j]
-    quality = np.nan
-    if method == 0:
-        average(B, b, c)
-    else:
-        quality = rank_one(B, W, b, c)
-    normed(rise, b, c)
-    return quality
+def separate_input(
+    theta: Array, starts: tuple[int, int], method: int, rise: Array, b: Array, c: Array, worst: Array
+) -> None:
+    """b (T, nb) and c (T, n_in) of an input, whose b and products begin at ``starts``; ``worst`` takes the quality."""
+    at_b, at_bc = starts
+    nb, n_in = b.shape[1], c.shape[1]
+    size = max(nb, n_in)
+    B, W = np.empty((nb, n_in)), np.empty((size, size))
+    for t in range(theta.shape[0]):
+        row = theta[t]
+        for j in range(nb):
+            B[j, 0] = row[at_b + j]
+            for k in range(1, n_in):
+                B[j, k] = row[at_bc + (k - 1) * nb + j]
+        quality = np.nan
+        if method == 0:
+            average(B, b[t], c[t])
+        else:
+            quality = rank_one(B, W, b[t], c[t])
+        normed(rise, b[t], c[t])
+        if not quality <= worst[t]:
+            worst[t] = quality
+
+
+@shared
+def separate_output(theta: Array, starts: tuple[int, int], method: int, a: Array, d: Array, quality: Array) -> None:
+    """a (T, na) and d (T, n_out), the free of which, and whose products, begin at ``starts``; and the quality (T,)."""
+    at_d, at_ad = starts
+    na, n_out = a.shape[1], d.shape[1]
+    size = max(na, n_out)
+    A, W = np.empty((na, n_out)), np.empty((size, size))
+    d0, read = np.ones(n_out), np.empty(n_out)
+    for t in range(theta.shape[0]):
+        row = theta[t]
+        for i in range(na):
+            A[i, 0] = row[i]
+            for k in range(1, n_out):
+                A[i, k] = row[at_ad + (k - 1) * na + i]
+        for k in range(1, n_out):
+            d0[k] = row[at_d + k - 1]
+        quality[t] = 0.0
+        d[t, :] = d0
+        if method == 0:
+            a[t, :] = A[:, 0]
+            quality[t] = np.nan
+        elif na > 0:
+            quality[t] = rank_one(A, W, a[t], read)
+            headed(a[t], read)
+            if method == 1:
+                d[t, :] = read
+            else:
+                joint(A, d0, a[t], d[t])
 
 
 @shared
 def separate(
-    theta: Array, orders: tuple[int, int, int], sizes: Array, rise: Array, groups: tuple[Array, Array, Array, Array],
+    theta: Array,
+    orders: tuple[int, int, int],
+    sizes: Array,
+    rise: Array,
+    groups: tuple[Array, Array, Array, Array],
     quality: Array,
-) -> None:  # fmt: skip
+) -> None:
     """Fill a (T, na), b (T, sum nb), c (T, sum n_in), d (T, n_out), quality (T, 2) from theta (T, n).
 
     ``orders`` are na, n_out and the place of the method in METHODS, ``sizes`` (2, inputs) nb and n_in of the inputs;
@@ -216,38 +257,11 @@ def separate(
     na, n_out, method = orders
     a, b, c, d = groups
     at_d = na + b.shape[1]
-    first_bc = at_d + n_out - 1
-    at_ad = first_bc
-    size = max(na, n_out)
+    at_b, at_c, at_bc = 0, 0, at_d + n_out - 1
+    quality[:, 0] = 0.0
     for i in range(sizes.shape[1]):
-        at_ad += sizes[0, i] * (sizes[1, i] - 1)
-        size = max(size, max(sizes[0, i], sizes[1, i]))
-    A, W = np.empty((na, n_out)), np.empty((size, size))
-    d0, read = np.ones(n_out), np.empty(n_out)
-    for t in range(theta.shape[0]):
-        row = theta[t]
-        at_b, at_c, at_bc, worst = 0, 0, first_bc, 0.0
-        for i in range(sizes.shape[1]):
-            nb, n_in = sizes[0, i], sizes[1, i]
-            own_b, own_c = b[t, at_b : at_b + nb], c[t, at_c : at_c + n_in]
-            found = separate_input(row, na + at_b, at_bc, method, rise[at_c : at_c + n_in], own_b, own_c, W)
-            worst = found if not found <= worst else worst
-            at_b, at_c, at_bc = at_b + nb, at_c + n_in, at_bc + nb * (n_in - 1)
-        for i in range(na):
-            A[i, 0] = row[i]
-            for k in range(1, n_out):
-                A[i, k] = row[at_ad + (k - 1) * na + i]
-        for k in range(1, n_out):
-            d0[k] = row[at_d + k - 1]
-        quality[t, 0], quality[t, 1] = worst, 0.0
-        d[t, :] = d0
-        if method == 0:
-            a[t, :] = A[:, 0]
-            quality[t, 1] = np.nan
-        elif na > 0:
-            quality[t, 1] = rank_one(A, W, a[t], read)
-            headed(a[t], read)
-            if method == 1:
-                d[t, :] = read
-            else:
-                joint(A, d0, a[t], d[t])
+        nb, n_in = sizes[0, i], sizes[1, i]
+        own_b, own_c = b[:, at_b : at_b + nb], c[:, at_c : at_c + n_in]
+        separate_input(theta, (na + at_b, at_bc), method, rise[at_c : at_c + n_in], own_b, own_c, quality[:, 0])
+        at_b, at_c, at_bc = at_b + nb, at_c + n_in, at_bc + nb * (n_in - 1)
+    separate_output(theta, (at_d, at_bc), method, a, d, quality[:, 1])
