@@ -26,14 +26,14 @@ FENCED = re.compile(r"```(\w*)\n(.*?)```", re.S)
 INLINE = re.compile(r"`((?:python|driftfit)\s[^`]*)`")
 BEGINS = re.compile(r"^\s*(?:driftfit|python|pip) (?!\S*[:|])\S.*")
 ELSEWHERE = {
-    "driftfit demo": ("test_demo.py", '"demo"'),
+    "driftfit demo": ("test_demo.py", "demo.show("),
     "driftfit reproduce fls": ("test_reproduce_fls.py", '["reproduce", "fls", "--quick"'),
     "driftfit reproduce hammerstein-wiener": (
         "test_reproduce_hammerstein_wiener.py", '["reproduce", "hammerstein-wiener", "--quick"',
     ),
     "driftfit reproduce hypotheses": ("test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"'),
-    "driftfit bench accuracy": ("test_bench.py", '"accuracy", "--quick"'),
-    "driftfit bench speed": ("test_bench.py", '"speed-here", "--quick"'),
+    "driftfit bench accuracy": ("test_bench.py", '["bench", "accuracy", "--quick"'),
+    "driftfit bench speed": ("test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
 """Commands, by how they begin, with the test that runs them quickly and what stands there."""
 
