@@ -32,8 +32,12 @@ def test_the_first_examples_have_the_reference_errors():
     assert np.median([row["ekf", 0.01] for row in arrived]) > 40
     assert np.mean([np.isinf(row["ekf", 1000.0]) for row in arrived]) >= 0.5
     paths = {"average": runs.separated(run, "average"), "svd": runs.separated(run, "svd")}
-    assert len(parameters(s, paths, slice(0, 4), "a, b").axes) == 4
-    assert errors({"svd": runs.off(paths["svd"], s)}, "error").axes
+    for i, axis in enumerate(parameters(s, paths, slice(0, 4), "a, b").axes):
+        truth, *lines = (line.get_ydata() for line in axis.lines)
+        assert np.array_equal(truth, s.xi[:, i])
+        assert any(np.array_equal(line, paths["svd"][:, i]) for line in lines)
+    drawn = errors({"svd": runs.off(paths["svd"], s)}, "error").axes[0].lines[0].get_ydata()
+    assert np.array_equal(drawn, runs.off(paths["svd"], s)[-len(drawn) :])
 
 
 def made_up(scale=1.0):
