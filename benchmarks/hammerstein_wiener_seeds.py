@@ -4,7 +4,7 @@ The worst of a few records says little about failures that are rare. For each re
 of the error of the eight minimal parameters after the first 200; printed are quantiles over the records, the largest,
 and how many are above 0.1, which is five times what is usual.
 
-Run: python benchmarks/hammerstein_wiener_seeds.py [records, 1000 by default] [--quick]
+Run: python -m benchmarks.hammerstein_wiener_seeds [records, 1000 by default] [--quick]
 """
 
 import sys
@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import track as progress
 from rich.table import Table
 
-from driftfit.reproduce.hammerstein_wiener import runs
 from driftfit.systems.hammerstein_wiener import example
 from driftfit.track import track
+from lab.reproduce.hammerstein_wiener import runs
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 ASTRAY = 0.1

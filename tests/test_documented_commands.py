@@ -26,14 +26,14 @@ FENCED = re.compile(r"```(\w*)\n(.*?)```", re.S)
 INLINE = re.compile(r"`((?:python|driftfit)\s[^`]*)`")
 BEGINS = re.compile(r"^\s*(?:driftfit|python|pip) (?!\S*[:|])\S.*")
 ELSEWHERE = {
-    "driftfit demo": ("test_demo.py", "demo.show("),
-    "driftfit reproduce fls": ("test_reproduce_fls.py", '["reproduce", "fls", "--quick"'),
-    "driftfit reproduce hammerstein-wiener": (
-        "test_reproduce_hammerstein_wiener.py", '["reproduce", "hammerstein-wiener", "--quick"',
+    "driftfit demo": ("tests/test_demo.py", "demo.show("),
+    "python -m lab reproduce fls": ("lab/tests/test_reproduce_fls.py", '["reproduce", "fls", "--quick"'),
+    "python -m lab reproduce hammerstein-wiener": (
+        "lab/tests/test_reproduce_hammerstein_wiener.py", '["reproduce", "hammerstein-wiener", "--quick"',
     ),
-    "driftfit reproduce hypotheses": ("test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"'),
-    "driftfit bench accuracy": ("test_bench.py", '["bench", "accuracy", "--quick"'),
-    "driftfit bench speed": ("test_bench.py", '["bench", "speed", "--quick"'),
+    "python -m lab reproduce hypotheses": ("lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"'),
+    "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
+    "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
 """Commands, by how they begin, with the test that runs them quickly and what stands there."""
 
@@ -70,7 +70,7 @@ def _kind(command: str) -> str:
         return "elsewhere"
     if command.startswith("driftfit") or command.startswith("python -m driftfit"):
         return "driftfit"
-    return "benchmark" if "benchmarks/" in command else "record"
+    return "benchmark" if "benchmarks" in command else "record"
 
 
 def test_commands_are_found():
@@ -86,12 +86,13 @@ def test_commands_are_found():
 @pytest.mark.parametrize("command", of_kind("elsewhere"))
 def test_another_test_runs_it(command):
     _, (name, said) = next(item for item in ELSEWHERE.items() if command.startswith(item[0]))
-    assert said in (ROOT / "tests" / name).read_text()
+    assert said in (ROOT / name).read_text()
 
 
 @pytest.mark.parametrize("command", of_kind("benchmark"))
 def test_benchmarks_run_quickly(command, monkeypatch):
-    _, script, *given = shlex.split(command)
+    script, *given = shlex.split(command.replace("-m benchmarks.", "benchmarks/"))[1:]
+    script = script if script.endswith(".py") else f"{script}.py"
     said = (ROOT / script).read_text()
     assert "--quick" in said or "quick: Annotated" in said
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

@@ -37,7 +37,9 @@ def test_missing_samples_and_refusals():
     y, phi, psi = record(1, 300)
     y[10], phi[20, 0], psi[30, 1] = np.nan, np.inf, 1e200
     kept = np.delete(np.arange(300), [10, 20, 30])
-    np.testing.assert_allclose(rational_model(y, phi, psi).a, rational_model(y[kept], phi[kept], psi[kept]).a, rtol=1e-12)
+    np.testing.assert_allclose(
+        rational_model(y, phi, psi).a, rational_model(y[kept], phi[kept], psi[kept]).a, rtol=1e-12
+    )
     with pytest.raises(ValueError, match="phi is y itself"):
         rational_model(y[:9], np.column_stack([y, phi[:, 1]])[:9], psi[:9])
     with pytest.raises(ValueError, match="4 usable samples cannot tell 4"):
