@@ -1,8 +1,8 @@
 """How often estimates of a Hammerstein-Wiener system go astray: quantiles over a thousand records of example 1.
 
-The worst of a few records says little about failures that are rare. For each record of 5000 samples the root mean square
-of the error of the eight minimal parameters after the first 200; printed are quantiles over the records, the largest,
-and how many are above 0.1, which is five times what is usual.
+The worst of a few records says little about failures that are rare. Printed are quantiles over the records of the root
+mean square error of the eight minimal parameters, over 5000 samples but the first 200; the largest, and how many are
+above 0.1, which is five times what is usual.
 
 Run: python -m benchmarks.hammerstein_wiener_seeds [records, 1000 by default] [--quick]
 """

@@ -31,7 +31,10 @@ ELSEWHERE = {
     "python -m lab reproduce hammerstein-wiener": (
         "lab/tests/test_reproduce_hammerstein_wiener.py", '["reproduce", "hammerstein-wiener", "--quick"',
     ),
-    "python -m lab reproduce hypotheses": ("lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"'),
+    "python -m lab reproduce hypotheses": (
+        "lab/tests/test_reproduce_hypotheses.py", '["reproduce", "hypotheses", "--quick"',
+    ),
+    "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip

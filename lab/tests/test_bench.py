@@ -218,7 +218,7 @@ def test_pages_of_speed_say_where_we_lose():
 
 
 def test_the_page_of_speed_is_written(tmp_path, monkeypatch):
-    """``driftfit bench speed --quick``, with two of its contests, one slope, and no fresh processes."""
+    """``bench speed --quick``, with two of its contests, one slope, and no fresh processes."""
     monkeypatch.setattr(
         speed, "contests", lambda quick: [hold(make(20), 1) for make in (speed.live_kalman, speed.live_rls)]
     )
