@@ -290,11 +290,14 @@ class Track(Judged):
             raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
         return cast("tuple[Array, list[Array]]", convert(self.theta))
 
-    def blocks(self, method: str = "svd-joint", input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+    def blocks(
+        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    ) -> Blocks:
         """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
 
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see `driftfit.blocks.separate`;
-        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`.
+        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`; None is "unit", or
+        "c1" for a tracker that follows the minimal parameters.
         """
         from driftfit.blocks.of_run import blocks_of
 

@@ -20,7 +20,7 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.outputs import missing
 from driftfit.result import Track, root_mean_square
-from driftfit.smoothers.smoothed import Smoothed
+from driftfit.smoothers.shared import SmoothedShared
 from driftfit.summary import printed, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End
@@ -113,11 +113,11 @@ class Shared:
         low, high = self.rows.band(level)
         return self._last(low), self._last(high)
 
-    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
-        """The smoothed path of the rows; take every ny-th of them, between rows of one instant theta does not move."""
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
+        """The smoothed path: theta (T, n) as here, residuals of every output (T, ny)."""
         if order_by is not None:
             raise ValueError("smooth: order_by= would tear the rows of an instant apart; it is for single outputs.")
-        return self.rows.smooth(keep, undetermined=undetermined)
+        return SmoothedShared(self.rows.smooth(keep, undetermined=undetermined), self)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """The h nominal samples after the record, u (h, ny, m): theta, std (h, n), y_hat, y_std (h, ny)."""
