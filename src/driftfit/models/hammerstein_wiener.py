@@ -218,7 +218,7 @@ class HammersteinWiener(Model):
 
     @property
     def apply(self) -> Step | None:
-        return applying(self.into.kind, self.places) if self.nk > 0 else None
+        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
 
     @property
     def reach(self) -> int:
