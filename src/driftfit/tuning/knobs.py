@@ -226,7 +226,7 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
     if not moving and not given:
         raise ValueError("tune: no change of this Bank moves anything, and none has a probability to be found.")
     low, high = _ends(bounds, -3.0, 3.0)
-    most = [float(np.log10(MOST_PROBABLE / len(given) / changes[i].prob)) for i in given]
+    most = [float(np.log10(MOST_PROBABLE / len(given) / (changes[i].prob or 1.0))) for i in given]
     lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, np.array(most) - 2.0)]
     highs = np.r_[np.full(len(moving), high), most]
 
