@@ -189,7 +189,6 @@ def run_fleet(
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
     before: Fleet | None = None,
-    dt: Any = None,
 ) -> Fleet:
     """Run every series of ``records`` with its tracker and return the results.
 
@@ -197,7 +196,7 @@ def run_fleet(
     fleet and returns what is finished, with a warning.
     """
     places: list[Place | None] = [None] * len(trackers)
-    starts, records = _warm(model, trackers, records, before, dt)
+    starts, records = _warm(model, trackers, records, before)
     jobs = [job for group in _groups(model, trackers) for job in _jobs(model, trackers, records, group, keep)]
     for job in jobs:
         for lane, k in enumerate(job.series):
@@ -220,7 +219,7 @@ def run_fleet(
 
 
 def _warm(
-    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None, dt: Any
+    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None
 ) -> tuple[dict[int, dict[str, Array]], Records]:
     """(fields that each series takes over, by its number; the records with the intervals since the runs before)."""
     if before is None:
@@ -232,7 +231,7 @@ def _warm(
             run = before[key]
             starts[k] = carried(run, model, trackers[k])
             if records.time is not None:
-                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], dt)
+                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], records.labels.dt)
     return starts, replace(records, known=known)
 
 

@@ -20,9 +20,10 @@ from numba import types
 
 from driftfit import storage
 from driftfit.drivers import INPUTS, drivers, make_tile, tile_type
+from driftfit.frames import inputs_for
 from driftfit.kernel import Array
 from driftfit.settings import whole
-from driftfit.signals import as_inputs, as_numbers
+from driftfit.signals import as_numbers
 
 if TYPE_CHECKING:
     from driftfit.outputs import Outputs
@@ -66,7 +67,7 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
     """
     whole("forecast", "h", h, 1)
     model = run.model
-    inputs = np.full((h, model.m), np.nan) if u is None else as_inputs(u, h)
+    inputs = np.full((h, model.m), np.nan) if u is None else inputs_for(run.model, u, h)
     if inputs.shape[1] != model.m:
         raise ValueError(f"forecast: the model has {model.m} inputs, but u has {inputs.shape[1]} columns.")
     tile = final_state(run)

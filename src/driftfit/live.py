@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numba import types
 
+from driftfit.clock import Clock, Pace, instant
 from driftfit.drivers import INPUTS, drivers, tile_type
+from driftfit.frames import by_name
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.restrict import Gate
 from driftfit.settings import near, numbers, vector, whole
-from driftfit.signals import as_numbers, check_ready, factor, interval_of, noise_of
+from driftfit.signals import as_numbers, check_ready, factor, noise_of
 from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.storage import fields, load_state, save_state
 from driftfit.trackers.base import Tracker
@@ -38,12 +41,14 @@ class Live:
     ----------
     model, tracker : Model, Tracker
         As for `track`. A model with several inputs must say so: ``ARX(2, [1, 1])``, ``inputs=["pressure", "flow"]``.
-    dt : number or timedelta
-        Nominal interval between samples in the unit of ``time``; with datetimes it must be given.
+    dt : number, duration, step of the calendar or "label"
+        Nominal interval between samples, as for `track`; with datetimes it must be given.
     lag : int
         Keep the last ``lag`` samples for `smooth`; 0 keeps none.
     warm_start : Track, Live or None
         Begin where that run ended.
+    limits : mapping from signals to (low, high)
+        Valid ranges as for `track`: a number outside is missing, and counted in ``outside``.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
@@ -57,11 +62,15 @@ class Live:
         return LiveOutputs(model, *args, **kwargs)
 
     def __init__(
-        self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0, warm_start: Run | None = None
-    ) -> None:
+        self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
+        limits: Mapping[Any, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.model = model.bind(model.m)
         self.tracker = check_ready(tracker)
-        self.dt = dt
+        self._clock = Clock.of(dt)
+        self.dt = self._clock.plain
+        self._pace = Pace(self._clock, self.model.reach)
+        self._gate = Gate(limits, self.model.outputs, self.model.input_names, self.model.m) if limits else None
         self._last: Any = None if warm_start is None else warm_start.end().last
         self._ignored = 0
         self._separator: Any = None
@@ -96,12 +105,14 @@ class Live:
         """Take one sample in and return (y_hat, e, s, ok).
 
         ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
-        otherwise. With ``time``, the interval since the last sample scales the drift; a time that is not after the last
-        is counted in ``ignored`` and leaves the state alone. ``weight`` divides the noise variance of this sample (0:
-        do not use it), ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk
-        trackers) or change (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events
-        at this sample.
+        otherwise, or a mapping from the names of the inputs. With ``time``, the interval since the last sample scales
+        the drift; a time that is not after the last is counted in ``ignored`` and leaves the state alone. ``weight``
+        divides the noise variance of this sample (0: do not use it), ``drift`` multiplies the drift before it: one
+        number, or one for each parameter (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``,
+        prior probabilities of its changes or joint events at this sample.
         """
+        if self._gate is not None:
+            y, u = self._passed(y, u)
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
         if time is not None or weight != 1.0 or drift != 1.0 or self._window is not None:
@@ -127,14 +138,17 @@ class Live:
                 self.tracker.tell(self.lane(), self.model, None, None)
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
-        interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
-        if not interval > 0.0:
+        if time is not None:
+            time = instant(time)
+        interval = 1.0 if time is None else self._clock.since(self._last, time)
+        if not interval >= 0.0:
             self._ignored += 1
             return (np.nan, np.nan, np.nan, False)
         known = (float(interval), float(noise_of(weight)), float(factor("drift", drift)))
         u = self._inputs(u)
         if time is not None:
             self._last = time
+            self._pace.see(interval)
         known = _HELD if self.held else known
         self._rest(known)
         step: Step = self._update(self._tile, np.nan if y is None else y, u)
@@ -144,6 +158,12 @@ class Live:
             self._window.push(self._tile, known)
         return step
 
+    def _passed(self, y: Any, u: Any) -> tuple[float, Array]:
+        """One sample with NaN for what is outside its limits."""
+        assert self._gate is not None
+        output, inputs = self._gate.sample(as_numbers("y", y).reshape(1), self._inputs(u))
+        return float(output[0]), inputs
+
     def _rest(self, known: tuple[float, float, float]) -> None:
         """Set what holds for every sample that says nothing else."""
         for name, value in zip(_KNOWN, known, strict=True):
@@ -152,7 +172,8 @@ class Live:
     def predict(self, u: Any = None) -> tuple[float, float]:
         """(y_hat, s): what the next output is expected to be if its input is ``u``; the state stays as it is."""
         self._scratch[...] = self._tile
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, self._inputs(u))
+        inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
+        y_hat, _, s, _ = self._update(self._scratch, np.nan, inputs)
         return y_hat, s
 
     def smooth(self) -> FixedLag:
@@ -233,6 +254,7 @@ class Live:
 
     def _inputs(self, u: Any) -> Array:
         """u as floats (m,)."""
+        u = by_name(self.model, u)
         if u is None:
             u = () if self._m == 0 else np.full(self._m, np.nan)
         given: Array = np.asarray(u, dtype=np.float64)
@@ -292,6 +314,11 @@ class Live:
         """Samples that came with a time not after the last."""
         return self._ignored
 
+    @property
+    def outside(self) -> dict[str, int]:
+        """How many numbers of each signal were outside its limits."""
+        return {} if self._gate is None else self._gate.counts
+
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file, without pickle; complete or not at all."""
         save_state(
@@ -301,6 +328,7 @@ class Live:
             self._tile,
             {
                 "dt": self.dt,
+                "limits": None if self._gate is None else self._gate.plain(),
                 "last": self._last,
                 "ignored": self._ignored,
                 "lag": self.lag,
@@ -312,7 +340,10 @@ class Live:
     def load(cls, path: str | PathLike[str]) -> Self:
         """Continue from a file as if never stopped."""
         model, tracker, tile, extra = load_state(path)
-        live = cls(model, tracker, dt=extra["dt"], lag=extra["lag"])
+        limits, outside = extra["limits"] or ([], [])
+        live = cls(model, tracker, dt=extra["dt"], lag=extra["lag"], limits=dict(limits))
+        if live._gate is not None:
+            live._gate.restore(outside)
         if live._window is not None:
             live._window.restore(extra["window"])
         live._last, live._ignored = extra["last"], extra["ignored"]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from typing import Any, Self
 
 import numpy as np
 
 from driftfit import storage
+from driftfit.clock import Clock, Pace, instant
 from driftfit.drivers import drivers, output_type
+from driftfit.frames import by_name, order_of
 from driftfit.joint import end_of, joint_tile, taken_over, trackers_of
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.restrict import Gate
 from driftfit.settings import whole
 from driftfit.shared_outputs import row_model
-from driftfit.signals import as_numbers, factor, interval_of, noise_of
+from driftfit.signals import as_numbers, factor, noise_of
 from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, Run
@@ -32,16 +36,22 @@ class LiveOutputs:
     output; ``warm_start`` is a record or a stream of the same outputs.
     """
 
-    def __init__(self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None) -> None:
+    def __init__(
+        self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
+        limits: Mapping[Any, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.model = model if model.shared else model.bind(model.m)
         self.trackers = trackers_of(self.model, tracker)
-        self.dt = dt
+        self._clock = Clock.of(dt)
+        self.dt = self._clock.plain
+        self._pace = Pace(self._clock, model.reach)
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
         self._last: Any = None if warm_start is None else warm_start.end().last
         self._ignored = 0
         self._rows = row_model(self.model, self.trackers[0]) if self.model.shared else self.model
+        self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self._tile = joint_tile(self._rows, self.trackers, taken_over(warm_start, self._rows, self.trackers))
         self._out = np.empty(1, output_type(self._tile, self.trackers[0].outputs))
         self._run = drivers(self._rows.steps, self.trackers[0].steps_for(self._rows)).run
@@ -49,17 +59,47 @@ class LiveOutputs:
         self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
 
     def update(self, y: Any, u: Any = None, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
-        """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta."""
+        """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
+
+        y may map the names of the outputs, and u those of the inputs of a model that has them, to numbers.
+        """
         ny = len(self.model.outputs)
-        interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
-        if not interval > 0.0:
+        time = None if time is None else instant(time)
+        interval = 1.0 if time is None else self._clock.since(self._last, time)
+        if not interval >= 0.0:
             self._ignored += 1
             nothing = np.full(ny, np.nan)
             return nothing, nothing, nothing, np.zeros(ny, bool)
         known = self._known(interval, weight, drift)
-        step = self._step(self._tile, as_numbers("y", y), u, known, self._windows)
-        self._last = self._last if time is None else time
+        output, inputs = self._outputs(y), self._inputs(u)
+        if self._gate is not None:
+            output, inputs = self._gate.sample(output, inputs)
+        step = self._step(self._tile, output, inputs, known, self._windows)
+        if time is not None:
+            self._last = time
+            self._pace.see(interval)
         return step
+
+    def _outputs(self, y: Any) -> Array:
+        """y as floats (ny,)."""
+        outputs = self.model.outputs
+        if hasattr(y, "keys"):
+            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
+            y = [y[name] for name in outputs]
+        given = as_numbers("y", y)
+        if given.shape != (len(outputs),):
+            raise ValueError(f"Live.update: y must be ({len(outputs)},); got shape {given.shape}.")
+        return given
+
+    def _inputs(self, u: Any) -> Array:
+        """u as floats (m,), or (ny, m) where the outputs share one theta."""
+        shape = (len(self.model.outputs), self._rows.m) if self.model.shared else (self._rows.m,)
+        if u is None:
+            return np.full(shape, np.nan)
+        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
+        if given.size != np.prod(shape):
+            raise ValueError(f"Live.update: u must have shape {shape}; got shape {given.shape}.")
+        return given.reshape(shape)
 
     def _known(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
         """What the driver is told of one sample, (k, ny)."""
@@ -76,32 +116,27 @@ class LiveOutputs:
     def predict(self, u: Any = None) -> tuple[Array, Array]:
         """(y_hat, s), each (ny,): what the next outputs are expected to be; the state stays as it is."""
         missing = np.full(len(self.model.outputs), np.nan)
-        y_hat, _, s, _ = self._step(self._tile.copy(), missing, u, self._known(), [])
+        inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
+        y_hat, _, s, _ = self._step(self._tile.copy(), missing, inputs, self._known(), [])
         return y_hat, s
 
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample pass whose outputs go to the lags and are not used."""
-        self._step(self._tile, y, u, self._known(weight=0.0), [])
+        self._step(self._tile, y, self._inputs(u), self._known(weight=0.0), [])
 
-    def _step(self, tile: Array, y: Array, u: Any, known: Array, windows: list[Window]) -> Steps:
+    def _step(self, tile: Array, y: Array, u: Array, known: Array, windows: list[Window]) -> Steps:
         """One call of the driver, or one for each row of the instant."""
         ny, m = len(self.model.outputs), self._rows.m
-        if y.shape != (ny,):
-            raise ValueError(f"Live.update: y must be ({ny},); got shape {y.shape}.")
-        shape = (ny, m) if self.model.shared else (m,)
-        inputs = np.full(shape, np.nan) if u is None else as_numbers("u", u).reshape(-1)
-        if inputs.size != (ny * m if self.model.shared else m):
-            raise ValueError(f"Live.update: u must have shape {shape}; got shape {np.shape(u)}.")
         said = []
         if self.model.shared:
-            for j, row in enumerate(inputs.reshape(ny, m)):
+            for j, row in enumerate(u):
                 same = known[None, :, j : j + 1].copy()
                 same[0, 0] *= j == 0
                 self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
                 said.append(self._said())
                 self._push(tile, same[0], windows)
         else:
-            self._run(tile, y[None], np.repeat(inputs.reshape(1, m, 1), ny, axis=2), known[None], self._out)
+            self._run(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
             said.append(self._said())
             self._push(tile, known, windows)
         self._rest(tile)
@@ -165,6 +200,11 @@ class LiveOutputs:
         """Samples that came with a time not after the last."""
         return self._ignored
 
+    @property
+    def outside(self) -> dict[str, int]:
+        """How many numbers of each signal were outside its limits."""
+        return {} if self._gate is None else self._gate.counts
+
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
         return end_of(self._rows, self.trackers, self._tile, self._last)
@@ -172,6 +212,7 @@ class LiveOutputs:
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file, without pickle; complete or not at all."""
         extra = {"dt": self.dt, "last": self._last, "ignored": self._ignored, "lag": self.lag}
+        extra["limits"] = None if self._gate is None else self._gate.plain()
         extra["windows"] = [window.plain() for window in self._windows]
         described = {"model": storage.describe(self.model), "trackers": [storage.describe(t) for t in self.trackers]}
         states = {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
@@ -184,7 +225,10 @@ class LiveOutputs:
         model, extra = storage.rebuild(header["model"], Model), header["extra"]
         trackers = [storage.rebuild(one, Tracker) for one in header["trackers"]]
         tracker = trackers[0] if model.shared else dict(zip(model.outputs, trackers, strict=True))
-        live = cls(model, tracker, extra["dt"], extra["lag"])
+        limits, outside = extra["limits"] or ([], [])
+        live = cls(model, tracker, extra["dt"], extra["lag"], limits=dict(limits))
+        if live._gate is not None:
+            live._gate.restore(outside)
         live._last, live._ignored = extra["last"], extra["ignored"]
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.clock import Clock, instant
 from driftfit.drivers import make_tile
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.signals import interval_of
 from driftfit.trackers.base import Tracker
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
@@ -70,7 +70,7 @@ def first_interval(run: Run, time: Any, dt: Any) -> float:
     last = run.end().last
     if last is None or time is None:
         return 1.0
-    interval = interval_of(last, time, dt)
-    if not interval > 0.0:
+    interval = Clock.of(dt).since(instant(last), instant(time))
+    if not interval >= 0.0:
         raise ValueError(f"warm_start: the record begins at {time}, not after the end of the run before, {last}.")
     return interval

@@ -119,6 +119,10 @@ class HammersteinWiener(Model):
         return 1
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        return () if self.name is None else (self.name,)
+
+    @property
     def into(self) -> Basis:
         """Functions of the input block."""
         return self.input if isinstance(self.input, Basis) else IDENTITY
