@@ -177,6 +177,12 @@ class LiveOutputs:
         return theta[0] if self.model.shared else theta
 
     @property
+    def regressors(self) -> Array:
+        """Those of the last sample, (n,)."""
+        phi: Array = self._tile["phi"][0, :, 0].copy()
+        return phi
+
+    @property
     def cov(self) -> Array:
         """Covariance of theta, (ny, n, n), or (n, n) where the outputs share one theta."""
         lanes = range(self._tile["theta"].shape[-1])
