@@ -82,6 +82,28 @@ def test_an_interval_of_the_wrong_kind_is_named():
         track(MODEL, TRACKER, y, u, time=days)
 
 
+def test_days_and_months_are_those_of_the_zone(tmp_path):
+    """Midnight in Tokyo is on the day before in UTC, where Monday would be a Sunday."""
+    y, u = signals()
+    plain = track(MODEL, TRACKER, y, u)
+    for zone in ("Asia/Tokyo", "America/New_York", "Europe/Berlin", "+09:00"):
+        for freq, dt in (("B", "business day"), ("MS", "month"), ("QE", "quarter")):
+            time = pd.date_range("2020-01-01", periods=T, freq=freq, tz=zone)
+            same(track(MODEL, TRACKER, y, u, time=time, dt=dt), plain)
+            run = track(MODEL, TRACKER, y, u, time=time, dt=dt)
+            table = pd.DataFrame({"y": y, "u": u, "t": time})
+            same(track(MODEL, TRACKER, "y", "u", data=table, time="t", dt=dt), plain)
+            live = Live(MODEL, TRACKER, dt=dt)
+            for t in range(T):
+                if t == T // 2:
+                    live.save(tmp_path / "live.npz")
+                    live = Live.load(tmp_path / "live.npz")
+                live.update(y[t], u[t], time=time[t])
+            assert np.array_equal(live.theta, plain.theta[-1])
+            ahead = pd.DatetimeIndex(Clock.of(dt, run.labels.zone).ahead(run.time[-1], 5)).tz_localize("UTC")
+            assert list(ahead.tz_convert(zone)) == list(pd.date_range(time[-1], periods=6, freq=freq))[1:]
+
+
 CALENDARS = {
     "business day": ["B"],
     "month": ["MS", "ME", "BME", "BMS"],
@@ -141,8 +163,8 @@ def test_a_stream_counts_as_its_record(dt):
     y, u = signals()
     rng = np.random.default_rng(1)
     time = np.datetime64("2024-01-01", "us") + np.cumsum(rng.integers(1, 90, T)) * np.timedelta64(1, "h")
-    record = track(MODEL, TRACKER, y, u, time=time, dt=dt)
     for kind in kinds_of(time):
+        record = track(MODEL, TRACKER, y, u, time=kind, dt=dt)
         live = Live(MODEL, TRACKER, dt=dt)
         for t in range(T):
             step = live.update(y[t], u[t], time=kind[t])

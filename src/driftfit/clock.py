@@ -9,8 +9,9 @@
 
 A month is counted from its first day, with the part of it that has passed: 31 January to 28 February is 0.997 months. A
 number of steps within a tenth of a whole one counts as whole, so that the last day, or the last trading day, of every
-month are one step apart. A weekend has no business time: from Saturday to Monday 0 steps pass. Everything depends on a
-sample and the one before it alone, so a stream counts as its record does.
+month are one step apart; days and months are those of the zone of the times. A weekend has no business time: from
+Saturday to Monday 0 steps pass. Everything depends on a sample and the one before it alone, so a stream counts as its
+record does.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from typing import Any, NoReturn
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -28,6 +30,7 @@ from driftfit.models.arx import GAP
 from driftfit.settings import warn
 
 LABEL = "label"
+CALENDARS = ("month", "business")
 MONTHS = {
     **dict.fromkeys(("month", "months", "MS", "ME", "BMS", "BME", "CBMS", "CBME"), 1),
     **dict.fromkeys(("quarter", "quarters", "Q", "QS", "QE", "BQS", "BQE"), 3),
@@ -64,10 +67,17 @@ class Clock:
     count: float = 1.0
     duration: np.timedelta64 | None = None
     holidays: tuple[str, ...] = ()
+    zone: str | None = None
+    """Where days and months begin, for times in UTC."""
 
     @classmethod
-    def of(cls, dt: Any) -> Clock:
-        """What ``dt`` stands for; ValueError where it is nothing of the kind."""
+    def of(cls, dt: Any, zone: str | None = None) -> Clock:
+        """What ``dt`` stands for, for times that are shown in a zone; ValueError where it is nothing of the kind."""
+        clock = cls._of(dt)
+        return replace(clock, zone=zone) if clock.kind in CALENDARS and zone is not None else clock
+
+    @classmethod
+    def _of(cls, dt: Any) -> Clock:
         if isinstance(dt, Clock):
             return dt
         if dt is None:
@@ -107,7 +117,7 @@ class Clock:
         if self.duration is not None:
             return np.asarray((time - last) / self.duration)
         place = self._months if self.kind == "month" else self._business_days
-        steps = (place(time) - place(last)) / self.count
+        steps = (place(self._local(time)) - place(self._local(last))) / self.count
         nearest = np.rint(steps)
         return np.where((nearest >= 1.0) & (np.abs(steps - nearest) < NEAR), nearest, steps)
 
@@ -125,6 +135,31 @@ class Clock:
             )
         if self.kind not in ("number", "unset", LABEL) and not dates:
             raise ValueError(f"dt={self.plain!r} is for dates, but time is numbers: give dt in the unit of time.")
+
+    def at(self, time: Any) -> Clock:
+        """This clock, its days and months those of the zone of a time that has one."""
+        known = self.zone is not None or self.kind not in CALENDARS or getattr(time, "tzinfo", None) is None
+        return self if known else replace(self, zone=zone_name(time.tzinfo))
+
+    def _local(self, time: Array) -> Array:
+        """Times in UTC as the wall clock of the zone shows them."""
+        if self.zone is None:
+            return time
+        import polars as pl
+
+        series = pl.Series(np.atleast_1d(time).astype("datetime64[us]")).dt.replace_time_zone("UTC")
+        shown = series.dt.convert_time_zone(self.zone).dt.replace_time_zone(None).to_numpy()
+        return np.asarray(shown.reshape(np.shape(time)))
+
+    def _in_utc(self, time: Array) -> Array:
+        """The inverse; NaT where the wall clock skips a time."""
+        if self.zone is None:
+            return time
+        import polars as pl
+
+        series = pl.Series(time.astype("datetime64[us]"))
+        zoned = series.dt.replace_time_zone(self.zone, ambiguous="earliest", non_existent="null")
+        return np.asarray(zoned.dt.convert_time_zone("UTC").dt.replace_time_zone(None).to_numpy())
 
     def _months(self, time: Array) -> Array:
         """Months since 1970, with the part of the month that has passed."""
@@ -167,15 +202,17 @@ class Clock:
             return np.asarray(last + k * self.count)
         if self.duration is not None:
             return np.asarray(last + k * self.duration)
-        day = last.astype("datetime64[D]")
-        part, jump = last - day, k * int(self.count)
+        local = self._local(last)
+        day = local.astype("datetime64[D]")
+        part, jump = local - day, k * int(self.count)
         if self.kind == "business":
-            return np.asarray(np.busday_offset(day, jump, roll="backward", busdaycal=self._calendar) + part)
-        month = last.astype("datetime64[M]")
+            days = np.busday_offset(day, jump, roll="backward", busdaycal=self._calendar)
+            return self._in_utc(np.asarray(days + part))
+        month = local.astype("datetime64[M]")
         first, after = (m.astype("datetime64[D]") for m in (month + jump, month + jump + 1))
         ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays that
         there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
-        return np.asarray(there + part)
+        return self._in_utc(np.asarray(there + part))
 
 
 def instant(time: Any) -> Any:
@@ -197,10 +234,22 @@ def instants(time: Any) -> tuple[Array, str | None]:
     if axis.dtype.kind == "M":
         return _by_days(axis), None
     if axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], datetime) and axis.flat[0].tzinfo is not None:
-        zone = str(axis.flat[0].tzinfo)
+        zone = zone_name(axis.flat[0].tzinfo)
         flat = [one.astimezone(UTC).replace(tzinfo=None) for one in axis.flat]
         return np.array(flat, dtype="datetime64[us]").reshape(axis.shape), zone
     return np.asarray(time, dtype="datetime64[us]"), None
+
+
+def zone_name(zone: Any) -> str:
+    """The name of a time zone, of a tzinfo or as text; a fixed offset of whole hours has one too, others are UTC."""
+    name = next((str(getattr(zone, key)) for key in ("key", "zone") if getattr(zone, key, None)), str(zone))
+    try:
+        ZoneInfo(name)
+        return name
+    except (ValueError, OSError, KeyError):  # nothing of that name
+        pass
+    offset = re.fullmatch(r"(?:UTC)?([+-]\d\d):00", name)
+    return f"Etc/GMT{-int(offset[1]):+d}" if offset and int(offset[1]) else "UTC"
 
 
 def _by_days(axis: Array) -> Array:
@@ -283,14 +332,14 @@ def _written(length: np.timedelta64) -> str:
     return f"{length // np.timedelta64(1, size)}{size}"  # type: ignore[call-overload]
 
 
-def median_interval(time: Array) -> tuple[str, str]:
+def median_interval(time: Array, zone: str | None = None) -> tuple[str, str]:
     """(the median interval of a record in words, the dt that fits it best)."""
     middle = np.sort(np.diff(time))[(len(time) - 1) // 2]
     if time.dtype.kind != "M":
         return f"{middle:g}", f"dt={middle:g}"
     best, name = max(0.9, float(np.mean(np.abs(np.diff(time) / middle - 1.0) < 1e-3))), _written(middle)
     for step in ("business day", "month", "quarter", "year"):
-        fit = float(np.mean(Clock.of(step).steps(time)[1:] == 1.0))
+        fit = float(np.mean(Clock.of(step, zone).steps(time)[1:] == 1.0))
         best, name = (fit, step) if fit > best else (best, name)
     return _written(middle), f"dt={name!r}"
 
@@ -302,7 +351,7 @@ def broken(gaps: Array, first: Array, reach: int) -> Array:
     return np.asarray(total[places + 1] > total[np.maximum(places + 1 - reach, begin)])
 
 
-def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: int) -> None:
+def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: int, zone: str | None = None) -> None:
     """Say it where most samples cannot be used because of dt, or where weekends cost a record of working days.
 
     ``time`` and ``gaps`` (N,) hold one series after the other, each from its ``first`` sample on.
@@ -313,7 +362,7 @@ def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: in
     lost = int(broken(gaps, first, reach).sum())
     longest = int(np.argmax(np.diff(np.append(first, N))))
     axis = time[first[longest] : np.append(first, N)[longest + 1]]
-    middle, better = median_interval(axis)
+    middle, better = median_interval(axis, zone)
     weekdays = "business" in better and clock.kind == "duration"
     if lost > 0.5 * N or weekdays:
         warn(

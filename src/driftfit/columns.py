@@ -14,6 +14,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
+from driftfit.clock import zone_name
 from driftfit.kernel import Array
 from driftfit.settings import near
 from driftfit.signals import as_numbers
@@ -96,6 +97,9 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
         if text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
         series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
+    native: Any = series.to_native()
+    if hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None:  # narwhals lacks zones that pandas has
+        return np.asarray(native.dt.tz_convert(None).to_numpy()), zone_name(native.dtype.tz)
     if series.dtype == nw.Date:
         series = series.cast(nw.Datetime("us"))
     if not isinstance(series.dtype, nw.Datetime):
@@ -103,7 +107,7 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
     zone = series.dtype.time_zone
     if zone is not None:
         series = series.dt.convert_time_zone("UTC").dt.replace_time_zone(None)
-    return np.asarray(series.to_numpy()), zone
+    return np.asarray(series.to_numpy()), None if zone is None else zone_name(zone)
 
 
 def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:

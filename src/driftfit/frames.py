@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.clock import instants
+from driftfit.clock import instants, zone_name
 from driftfit.kernel import Array
 from driftfit.signals import as_inputs
 
@@ -114,7 +114,7 @@ def _dates(index: Any) -> Times:
     zone = getattr(stamps, "tz", None)
     return Times(
         np.asarray(stamps.tz_convert(None) if zone is not None else stamps),
-        None if zone is None else str(zone),
+        None if zone is None else zone_name(zone),
         index.name if isinstance(index.name, str) else None,
     )
 

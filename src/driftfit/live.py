@@ -139,7 +139,7 @@ class Live:
 
     def _update_known(self, y: float | None, u: Any, time: Any, weight: float, drift: float) -> Step:
         if time is not None:
-            time = instant(time)
+            self._clock, time = self._clock.at(time), instant(time)
         interval = 1.0 if time is None else self._clock.since(self._last, time)
         if not interval >= 0.0:
             self._ignored += 1
@@ -328,6 +328,7 @@ class Live:
             self._tile,
             {
                 "dt": self.dt,
+                "zone": self._clock.zone,
                 "limits": None if self._gate is None else self._gate.plain(),
                 "last": self._last,
                 "ignored": self._ignored,
@@ -341,7 +342,7 @@ class Live:
         """Continue from a file as if never stopped."""
         model, tracker, tile, extra = load_state(path)
         limits, outside = extra["limits"] or ([], [])
-        live = cls(model, tracker, dt=extra["dt"], lag=extra["lag"], limits=dict(limits))
+        live = cls(model, tracker, dt=Clock.of(extra["dt"], extra["zone"]), lag=extra["lag"], limits=dict(limits))
         if live._gate is not None:
             live._gate.restore(outside)
         if live._window is not None:

@@ -64,7 +64,8 @@ class LiveOutputs:
         y may map the names of the outputs, and u those of the inputs of a model that has them, to numbers.
         """
         ny = len(self.model.outputs)
-        time = None if time is None else instant(time)
+        if time is not None:
+            self._clock, time = self._clock.at(time), instant(time)
         interval = 1.0 if time is None else self._clock.since(self._last, time)
         if not interval >= 0.0:
             self._ignored += 1
@@ -217,7 +218,7 @@ class LiveOutputs:
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file, without pickle; complete or not at all."""
-        extra = {"dt": self.dt, "last": self._last, "ignored": self._ignored, "lag": self.lag}
+        extra = {"dt": self.dt, "zone": self._clock.zone, "last": self._last, "ignored": self._ignored, "lag": self.lag}
         extra["limits"] = None if self._gate is None else self._gate.plain()
         extra["windows"] = [window.plain() for window in self._windows]
         described = {"model": storage.describe(self.model), "trackers": [storage.describe(t) for t in self.trackers]}
@@ -232,7 +233,7 @@ class LiveOutputs:
         trackers = [storage.rebuild(one, Tracker) for one in header["trackers"]]
         tracker = trackers[0] if model.shared else dict(zip(model.outputs, trackers, strict=True))
         limits, outside = extra["limits"] or ([], [])
-        live = cls(model, tracker, extra["dt"], extra["lag"], limits=dict(limits))
+        live = cls(model, tracker, Clock.of(extra["dt"], extra["zone"]), extra["lag"], limits=dict(limits))
         if live._gate is not None:
             live._gate.restore(outside)
         live._last, live._ignored = extra["last"], extra["ignored"]

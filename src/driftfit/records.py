@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -56,6 +58,16 @@ class Labels:
 
 
 PLAIN = Labels()
+
+
+def time_text(time: Any, zone: str | None) -> str:
+    """A time as text, dates in a time zone."""
+    if not isinstance(time, np.datetime64):
+        return f"{time:g}"
+    text = time.astype("datetime64[us]").item()
+    if zone is None:
+        return f"{text:%Y-%m-%d %H:%M:%S}"
+    return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
 
 
 @dataclass(frozen=True)
@@ -122,7 +134,8 @@ class Records:
         found = replace(self, u=u, labels=replace(self.labels, u=names))
         found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
-            warn_of_gaps(Clock.of(self.labels.dt), self.time, self.known[:, 0], self.first, reach or model.reach)
+            clock, zone = Clock.of(self.labels.dt), self.labels.zone
+            warn_of_gaps(clock, self.time, self.known[:, 0], self.first, reach or model.reach, zone)
         return found
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
@@ -151,7 +164,7 @@ def one_series(y: Any, u: Any, reading: Reading) -> Records:
     T = len(output)
     times = times_of(reading.time, list(signals.values()))
     dt = LABEL if times.labels and reading.dt is None else reading.dt
-    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, dt, T)
+    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     drift = beside["drift"].values
     common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
     known = known_factors(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
@@ -203,7 +216,8 @@ def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: 
     axis: Array | None = None
     gaps: Any = 1.0
     if time is not None:
-        given, _ = instants(time)
+        given, zone = instants(time)
+        dt = Clock.of(dt, zone)
         if given.ndim == 1:
             axis, gaps = intervals(given, dt, T)
             axis = np.broadcast_to(axis, shape)

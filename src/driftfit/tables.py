@@ -49,7 +49,7 @@ def read_records(
         raise ValueError(f"there is nothing to track: the {columns.rows} rows have no unit or no time.")
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
-    clock = Clock.of(reading.dt)
+    clock = Clock.of(reading.dt, columns.zone)
     known = known_factors(
         1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),

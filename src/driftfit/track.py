@@ -243,7 +243,7 @@ def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Ru
     if before is not None:
         start = carried(before, model, tracker)
         known = known.copy()
-        known[0, 0] *= first_interval(before, None if time is None else time[0], records.labels.dt)
+        known[0, 0] *= first_interval(before, None if time is None else time[0], records.labels)
     tile = fresh_tile(model, tracker, start)
     out = drive(model, tracker, tile, y, u, known, keep)
     return Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)

@@ -114,7 +114,7 @@ def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run
     y, u, time = signals.y, signals.u, signals.time
     gaps = signals.gaps.copy()
     if before is not None:
-        gaps[0] *= first_interval(before, None if time is None else time[0], signals.labels.dt)
+        gaps[0] *= first_interval(before, None if time is None else time[0], signals.labels)
     if model.shared:
         return run_shared(model, tracker, signals._replace(gaps=gaps), keep, before)
     bound = model.bind(signals.labels.u or u.shape[1])
@@ -156,7 +156,8 @@ def _warn(model: Model, found: Mapping[Hashable, Signals]) -> None:
     if timed:
         time, gaps = (np.concatenate(parts) for parts in zip(*((one.time, one.gaps) for one in timed), strict=True))
         length = np.array([len(one.gaps) for one in timed])
-        warn_of_gaps(Clock.of(timed[0].labels.dt), time, gaps, np.cumsum(length) - length, model.reach)
+        labels = timed[0].labels
+        warn_of_gaps(Clock.of(labels.dt), time, gaps, np.cumsum(length) - length, model.reach, labels.zone)
 
 
 def keep_of(keep: str, tracker: Tracker) -> str:
@@ -209,7 +210,7 @@ def of_arrays(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Si
     T = len(output)
     times = times_of(reading.time, list(given.values()))
     dt = LABEL if times.labels and reading.dt is None else reading.dt
-    axis, gaps = (None, np.ones(T)) if times.axis is None else intervals(times.axis, dt, T)
+    axis, gaps = (None, np.ones(T)) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     each = as_numbers("drift", reading.drift) if np.ndim(reading.drift) == 2 else None
     factors = np.broadcast_to(factor("drift", reading.drift, T), T) if each is None else each
     regressors = shared_inputs(u, T, ny) if model.shared else as_inputs(given["u"].values, T)
