@@ -41,8 +41,8 @@ def test_a_number_outside_its_range_is_missing(keys):
     limits = {keys[0]: (-5.0, 5.0), keys[1]: (None, 39.9)}
     run = track(MODEL, TRACKER, *given, limits=limits)
     same(run, track(MODEL, TRACKER, *holes(y, u, [7, 30], [12, 13])))
-    assert run.labels.missing == {"values of y outside its limits": 2, "values of u1 outside its limits": 1}
-    assert "2 values of y outside its limits, 1 values of u1 outside its limits" in str(run.summary())
+    assert run.labels.missing == {"of y outside its limits": 2, "of u1 outside its limits": 1}
+    assert "2 of y outside its limits, 1 of u1 outside its limits" in str(run.summary())
     for kept, was in zip(given, before, strict=True):
         assert np.array_equal(kept, was, equal_nan=True)  # the user's arrays stay as they are
 
@@ -99,8 +99,8 @@ def test_a_fleet_from_a_table():
     day = range(24, 48)
     same(fleet["p"], track(MODEL, TRACKER, *holes(y, u, [10, *day], day)))
     same(fleet["q"], track(MODEL, TRACKER, *holes(y, u, [11, *day], day)))
-    assert fleet["q"].labels.missing == {"values of flow outside its limits": 1, "samples excluded": 24}
-    assert "2 values of flow outside its limits, 48 samples excluded" in str(fleet.summary())
+    assert fleet["q"].labels.missing == {"of flow outside its limits": 1, "excluded": 24}
+    assert "2 of flow outside its limits, 48 excluded" in str(fleet.summary())
     each = track(MODEL, TRACKER, "flow", "valve", by="pump", exclude={"q": [("2024-03-02", None)]}, **signs)
     same(each["p"], track(MODEL, TRACKER, *holes(y, u, [10])))
     same(each["q"], track(MODEL, TRACKER, *holes(y, u, [11, *range(24, T)], range(24, T))))
@@ -118,7 +118,7 @@ def test_rows_and_grids():
     for fleet in (rows, grid):
         for key in (0, 1):
             same(fleet[key], alone)
-            assert fleet[key].labels.missing["samples excluded"] == 2
+            assert fleet[key].labels.missing["excluded"] == 2
 
 
 ENDS = {
@@ -143,7 +143,7 @@ def test_a_stretch_is_left_out(kind):
     more = {} if axis is None else {"time": axis, "dt": "1h" if isinstance(time, str) else 2}
     run = track(MODEL, TRACKER, y, u, exclude=[stretch], **more)
     same(run, track(MODEL, TRACKER, *holes(y, u, rows, rows), **more))
-    assert run.labels.missing == {"samples excluded": len(rows)}
+    assert run.labels.missing == {"excluded": len(rows)}
     # nothing of the stretch reaches a lag, so the sample after it is skipped as well
     after = [t for t in (rows[-1] + 1,) if t < T]
     assert not run.ok[[*rows, *after]].any()
@@ -187,8 +187,8 @@ def test_several_outputs_shared_or_not():
     limits = {"two": (-10, 10)}
     run = track(model, TRACKER, wild, u, limits=limits, exclude=[(20, 25)])
     same(run, track(model, TRACKER, clean, gone))
-    assert run["two"].labels.missing == {"values of two outside its limits": 1, "samples excluded": 6}
-    assert run["one"].labels.missing == {"samples excluded": 6}
+    assert run["two"].labels.missing == {"of two outside its limits": 1, "excluded": 6}
+    assert run["one"].labels.missing == {"excluded": 6}
     live = Live(model, TRACKER, limits=limits)
     for t in range(20):
         live.update(wild[t], u[t])
@@ -198,7 +198,7 @@ def test_several_outputs_shared_or_not():
     rows, hole = np.stack([u, u[:, ::-1]], axis=1), np.stack([gone, gone[:, ::-1]], axis=1)
     shared = track(both, TRACKER, wild, rows, limits=limits, exclude=[(20, 25)])
     same(shared, track(both, TRACKER, clean, hole))
-    assert shared.rows.labels.missing["samples excluded"] == 6
+    assert shared.rows.labels.missing["excluded"] == 6
 
 
 def test_tune_and_select():

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from driftfit.result import Track
 
-DRAWS = 4000
+DRAWS = 2000
 
 
 @dataclass(frozen=True)

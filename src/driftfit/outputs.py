@@ -155,7 +155,7 @@ class Outputs(JudgedMany):
         for name in names_of(out):
             out[name][..., 0] = self._out[name][..., lane]
         start = {name: value for name, value in self._starts[lane].items() if name in own} if self._starts else None
-        others = tuple(f"values of {name} " for name in self.outputs if name != self.outputs[lane])
+        others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
         missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
         labels = replace(self.labels, y=self.outputs[lane], u=self.names[lane], missing=missing)
         return Track(alone, tracker, self.y[:, lane], phi, self._time, known, out, tile, 0, labels, start)

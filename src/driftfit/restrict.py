@@ -165,8 +165,8 @@ def marked(
     keys: Sequence[Any], owner: Array, outside: Mapping[str, Array], excluded: Array
 ) -> dict[Any, dict[str, int]]:
     """Counts by key and by reason; ``owner`` (N,) is the number of each sample's series."""
-    reasons = {f"values of {name} outside its limits": flags for name, flags in outside.items()}
-    reasons |= {"samples excluded": excluded}
+    reasons = {f"of {name} outside its limits": flags for name, flags in outside.items()}
+    reasons |= {"excluded": excluded}
     counts: dict[Any, dict[str, int]] = {}
     for reason, flags in reasons.items():
         found = np.bincount(owner[flags], minlength=len(keys))

@@ -140,10 +140,8 @@ def restricted(model: Model, found: Mapping[Hashable, Signals], reading: Reading
         excluded = within_each(reading.exclude, keys, np.full(len(number), k), one.time, number, one.labels.zone)
         inputs = np.moveaxis(out_u, -1, 0).reshape(m, len(number), -1).sum(axis=2)
         counts = [*(out_y & ~excluded[:, None]).sum(axis=0), *(inputs * ~excluded).sum(axis=1)]
-        said = {
-            f"values of {name} outside its limits": int(c) for name, c in zip(limits.names, counts, strict=True) if c
-        }
-        said |= {"samples excluded": int(excluded.sum())} if excluded.any() else {}
+        said = {f"of {name} outside its limits": int(c) for name, c in zip(limits.names, counts, strict=True) if c}
+        said |= {"excluded": int(excluded.sum())} if excluded.any() else {}
         y = np.where(out_y | excluded[:, None], np.nan, one.y)
         u = np.where(out_u | excluded.reshape(-1, *(1,) * (one.u.ndim - 1)), np.nan, one.u)
         out[key] = one._replace(y=y, u=u, labels=replace(one.labels, missing=said))
