@@ -130,6 +130,7 @@ ENDS = {
     "days": ("h", (date(2024, 3, 2), date(2024, 3, 2)), range(24, 48)),
     "days of numpy": ("h", (np.datetime64("2024-03-02"), np.datetime64("2024-03-02")), range(24, 48)),
     "months": ("h", ("2024-03", "2024-03"), range(T)),
+    "text with a zone": ("h", ("2024-03-02T00:00:00Z", "2024-03-02 04:00+01:00"), range(24, 28)),
     "datetimes": ("h", (datetime(2024, 3, 2), datetime(2024, 3, 2, 3)), range(24, 28)),
     "stamps": ("h", (pd.Timestamp("2024-03-02"), pd.Timestamp("2024-03-02 03:00")), range(24, 28)),
 }

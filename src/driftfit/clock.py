@@ -283,13 +283,18 @@ def _of_text(text: str) -> Clock:
         return Clock("month", _whole(text, count) * MONTHS[known])
     if known not in DURATIONS or unit in ("M", "m"):
         _refuse(text)
-    scale, size = (1, known) if known in ("ns", "us", "ms") else (10**9, "ns")
+    scale, size = (1, str(known)) if known in ("ns", "us", "ms") else (10**9, "ns")
     ticks = count * DURATIONS[known] * scale
     if ticks != round(ticks):
         raise ValueError(f"dt={text!r} is no whole number of nanoseconds.")
     if scale > 1 and round(ticks) % 1000 == 0:  # dates of the far past or future do not fit nanoseconds
         ticks, size = ticks / 1000, "us"
-    return Clock("duration", duration=np.timedelta64(round(ticks), size))  # type: ignore[call-overload]
+    return Clock("duration", duration=_delta(round(ticks), size))
+
+
+def _delta(count: int, unit: str) -> np.timedelta64:
+    """A duration of so many units that NumPy knows."""
+    return np.timedelta64(count, unit)  # type: ignore[arg-type, call-overload, no-any-return, unused-ignore]
 
 
 def _whole(text: str, count: float) -> float:
@@ -328,8 +333,8 @@ def _written(length: np.timedelta64) -> str:
     for name, one in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
         if length % np.timedelta64(one, "s") == np.timedelta64(0, "s"):
             return f"{length // np.timedelta64(one, 's')}{name}"
-    size = next(size for size in ("ms", "us", "ns") if length % np.timedelta64(1, size) == np.timedelta64(0, "ns"))  # type: ignore[call-overload]
-    return f"{length // np.timedelta64(1, size)}{size}"  # type: ignore[call-overload]
+    size = next(size for size in ("ms", "us", "ns") if length % _delta(1, size) == _delta(0, size))
+    return f"{length // _delta(1, size)}{size}"
 
 
 def median_interval(time: Array, zone: str | None = None) -> tuple[str, str]:

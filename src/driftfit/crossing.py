@@ -267,7 +267,6 @@ def crossings(
 ) -> polars.DataFrame:  # fmt: skip
     """A table of the crossings of many runs, those that come first on top; limits and u are one for all, or by key."""
     import polars
-    import polars.selectors
 
     rows = []
     for key, run in runs.items():
@@ -284,7 +283,8 @@ def crossings(
                 row[f"{name}_time"] = found.time(samples)
         rows.append(row)
     table = polars.DataFrame(rows, infer_schema_length=None)
-    zones = {run.labels.zone for run in runs.values()} - {None}
-    dates = polars.selectors.datetime()
-    table = table.with_columns(dates.dt.replace_time_zone("UTC").dt.convert_time_zone(zone) for zone in zones)
+    zone = next((run.labels.zone for run in runs.values()), None)
+    if zone is not None:
+        times = polars.col([name for name in table.columns[len(by) :] if table[name].dtype == polars.Datetime])
+        table = table.with_columns(times.dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
     return table.sort(["median", "probability"], descending=[False, True])

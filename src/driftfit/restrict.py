@@ -15,6 +15,7 @@ are true and only nothing is to be learned from it, give ``weights`` of 0: then 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from datetime import date, datetime
 from typing import Any
@@ -141,16 +142,23 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
     try:
         if axis.dtype.kind != "M":
             return float(given)
-        stamp = np.datetime64(given) if isinstance(given, str) else given
-        if isinstance(stamp, date) and not isinstance(stamp, datetime):
-            stamp = np.datetime64(stamp)
+        stamp = _stamp(given)
         coarse = isinstance(stamp, np.datetime64) and np.datetime_data(stamp.dtype)[0] in ("Y", "M", "W", "D")
-        moment = (stamp + (coarse and upper)).astype("datetime64[us]") if coarse else instant(stamp)
-        moment = _in_utc(moment, given, zone)
+        moment = _in_utc((stamp + upper).astype("datetime64[us]") if coarse else instant(stamp), stamp, zone)
         return moment - np.timedelta64(1, "us") if coarse and upper else moment
     except (TypeError, ValueError):
         kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"
         raise ValueError(f"exclude: with this record an end of a stretch is {kind}, or None; got {given!r}.") from None
+
+
+def _stamp(given: Any) -> Any:
+    """Text and days as datetime64 in the resolution in which they were given; text with a zone as a datetime."""
+    if isinstance(given, date) and not isinstance(given, datetime):
+        return np.datetime64(given)
+    if not isinstance(given, str):
+        return given
+    zoned = re.search(r"\d\d:\d\d.*([+-]\d\d:?\d\d|Z)$", given.strip())
+    return datetime.fromisoformat(given) if zoned else np.datetime64(given)
 
 
 def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
@@ -170,6 +178,6 @@ def marked(
     counts: dict[Any, dict[str, int]] = {}
     for reason, flags in reasons.items():
         found = np.bincount(owner[flags], minlength=len(keys))
-        for k in np.flatnonzero(found):
+        for k in np.flatnonzero(found).tolist():
             counts.setdefault(keys[k], {})[reason] = int(found[k])
     return counts

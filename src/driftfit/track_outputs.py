@@ -301,7 +301,8 @@ def of_table(
         )
         rows = slice(int(records.first[k]), int(records.first[k]) + T)
         factors = known[:, 2].copy() if records.drifts is None else records.drifts[rows]
-        signals, names = np.ascontiguousarray(rest[:, ny - 1 : end]), ()
+        names: tuple[str, ...] = ()
+        signals = np.ascontiguousarray(rest[:, ny - 1 : end])
         if model.shared:
             signals = signals.reshape(T, ny, -1)
         else:
