@@ -177,7 +177,11 @@ def test_crossings_of_a_fleet_come_first_on_top():
     one = fleet["r"].crossing("a", below=0.5, horizon=2000)
     assert table.row(0)[:3] == ("r", one.probability, one.median)
     assert (table["low"] <= table["median"]).all()
-    assert "median_time" in table.columns
+    assert table.columns[:4] == ["pump", "probability", "median", "median_time"]
+    first = fleet["r"].time[-1] + int(one.median) * np.timedelta64(1, "h")
+    assert table["median_time"].dtype == pl.Datetime("us", "Asia/Tokyo")
+    assert table["median_time"].dt.convert_time_zone("UTC").dt.replace_time_zone(None).to_numpy()[0] == first
+    assert fleet.crossing("a", below=-50.0, horizon=20)["median_time"].is_null().all()
     each = fleet.crossing("a", below={"p": 3.5, "q": 1.0, "r": -5.0}, horizon=100)
     assert each["pump"][0] == "p"
     assert each["median"][0] == 0.0

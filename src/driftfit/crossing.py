@@ -268,23 +268,25 @@ def crossings(
     """A table of the crossings of many runs, those that come first on top; limits and u are one for all, or by key."""
     import polars
 
-    rows = []
+    rows: list[dict[str, Any]] = []
+    times: dict[str, list[Any]] = {}
     for key, run in runs.items():
-        limits = (one[key] if isinstance(one, Mapping) else one for one in (below, above))
-        low, high = limits
-        future = u[key] if isinstance(u, Mapping) and key in u else u
+        low, high = (one[key] if isinstance(one, Mapping) else one for one in (below, above))
+        future = u.get(key) if isinstance(u, Mapping) else u
         found = crossing(run, what, below=low, above=high, horizon=horizon, u=future, level=level)
-        parts = key if isinstance(key, tuple) else (key,)
-        row = dict(zip(by, parts, strict=True)) | {"probability": found.probability}
-        for name in ("median", "low", "high"):
-            samples = getattr(found, name)
-            row[name] = samples
-            if found.times is not None:
-                row[f"{name}_time"] = found.time(samples)
+        row = dict(zip(by, key if isinstance(key, tuple) else (key,), strict=True)) | {"probability": found.probability}
+        row |= {name: getattr(found, name) for name in ("median", "low", "high")}
         rows.append(row)
+        if found.times is not None:
+            nothing = np.array("NaT", found.times.dtype) if found.times.dtype.kind == "M" else np.nan
+            for name in ("median", "low", "high"):
+                time = found.time(row[name])
+                times.setdefault(f"{name}_time", []).append(nothing if time is None else time)
     table = polars.DataFrame(rows, infer_schema_length=None)
     zone = next((run.labels.zone for run in runs.values()), None)
-    if zone is not None:
-        times = polars.col([name for name in table.columns[len(by) :] if table[name].dtype == polars.Datetime])
-        table = table.with_columns(times.dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
+    for name, values in times.items():
+        column = polars.Series(name, np.array(values))
+        if zone is not None:
+            column = column.dt.replace_time_zone("UTC").dt.convert_time_zone(zone)
+        table = table.insert_column(table.columns.index(name.removesuffix("_time")) + 1, column)
     return table.sort(["median", "probability"], descending=[False, True])
