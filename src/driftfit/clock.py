@@ -195,13 +195,17 @@ class Clock:
 
     def ahead(self, last: Any, h: int) -> Array | None:
         """The times (h,) of the nominal samples after ``last``; None where times are only labels."""
-        k = np.arange(1, h + 1)
+        return self.moved(last, np.arange(1, h + 1))
+
+    def moved(self, last: Any, k: Array) -> Array | None:
+        """The times k nominal intervals after ``last``, negative ones before it; None where times are only labels."""
         if self.kind == LABEL or last is None:
             return None
         if self.kind in ("number", "unset"):
             return np.asarray(last + k * self.count)
         if self.duration is not None:
             return np.asarray(last + k * self.duration)
+        k = np.rint(k).astype(np.int64)
         local = self._local(last)
         day = local.astype("datetime64[D]")
         part, jump = local - day, k * int(self.count)

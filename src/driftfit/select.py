@@ -23,9 +23,8 @@ weights in closed form. Cost: one run a structure.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from io import StringIO
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -40,8 +39,9 @@ from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.records import Reading, one_series
+from driftfit.roles import check_roles
 from driftfit.signals import check_ready, factor
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
@@ -68,7 +68,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Printed):
     """What `select` returns; printing it shows the table.
 
     Attributes
@@ -154,11 +154,6 @@ class Selection:
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
-
     def plot(self, most: int = 20) -> Figure:
         """How far structures are below the best, with standard errors, and where in time they lost it."""
         from driftfit.judges.plots import plot_selection
@@ -172,6 +167,8 @@ def grid(kind: type[Model], **choices: Any) -> list[Model]:
     A list is a choice; anything else, a tuple too, is one value for all. Combinations that the model refuses are left
     out; ValueError where none is left.
     """
+    if not (isinstance(kind, type) and issubclass(kind, Model)):
+        raise TypeError(f"grid: it makes the models, so give their class, as in grid(ARX, na=[1, 2]); got {kind!r}.")
     options = [value if isinstance(value, list | range) else [value] for value in choices.values()]
     models: list[Model] = []
     refused = ""
@@ -222,23 +219,26 @@ def select(
         No candidate, a tracker without a variance, more than 30 regressors, names that are not there, or what `track`
         refuses.
     """
-    tracker = check_ready(AdaptiveKalman() if tracker is None else tracker)
+    tracker = AdaptiveKalman() if tracker is None else tracker
+    candidates = list(models) if isinstance(models, Iterable) else [models]
+    for model in candidates:
+        check_roles("select", model, tracker)
+    check_ready(tracker)
     if not tracker.covariance:
         raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
-    given = [models] if isinstance(models, Model) else list(models)
-    if not given:
+    if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
     records = one_series(y, u, reading)
     factor("drift", drift, len(records.y))
-    named = max(given, key=lambda model: len(model.input_names))
-    records = records.for_model(named, reading, max(model.reach for model in given))
-    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in given]
+    named = max(candidates, key=lambda model: len(model.input_names))
+    records = records.for_model(named, reading, max(model.reach for model in candidates))
+    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     if any(len(model.outputs) > 1 for model in bound):
         raise ValueError("select: structures are compared for one output at a time.")
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
-    names = [repr(model) for model in given]
+    names = [repr(model) for model in candidates]
     pool, structures = pool_of(bound, names, records.y, records.u, records.known)
     if isinstance(models, Model):
         structures, predictions = subsets(pool, tracker, structures[0], keep, most)

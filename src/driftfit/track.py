@@ -16,6 +16,7 @@ from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import Reading, Records, one_series, rows
 from driftfit.result import Track
+from driftfit.roles import check_roles
 from driftfit.settings import one_of
 from driftfit.signals import check_ready
 from driftfit.trackers.base import Tracker
@@ -161,6 +162,7 @@ def track(
     DataWarning
         Where most samples cannot be used because of ``dt``.
     """
+    check_roles("track", model, tracker, several=True)
     reading = Reading(time, dt, weights, drift, units, limits, exclude)
     if len(model.outputs) > 1:
         if prob is not None:
