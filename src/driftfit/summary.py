@@ -123,7 +123,7 @@ def summarise(run: Track) -> Summary:
     )  # fmt: skip
     return Summary(
         repr(run.model), _short(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
+        _signals(run), _span(run), counts(run.labels.dropped), (*_missing(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -134,6 +134,11 @@ def _signals(run: Track) -> str:
         return ""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
+
+
+def _missing(run: Track) -> tuple[tuple[str, str], ...]:
+    """What was taken as missing though a number stood there."""
+    return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
 
 
 def _span(run: Track) -> str:
