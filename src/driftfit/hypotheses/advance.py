@@ -403,7 +403,7 @@ def lone_density(now: Array) -> float:
     far, s = now[IN_Y] - now[Y_HAT], now[S2]
     if not (now[IN_OK] > 0.0 and 0.0 < s < math.inf):
         return 0.0
-    return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)
+    return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 
 @core
