@@ -156,8 +156,8 @@ def iteration(seeds: Sequence[int]) -> Claim:
         corrected.append(np.abs(augmented(run, schedule="constant").theta - path).max())
         for tol, errors in names.items():
             errors.append(rms((augmented(run, lam=0.9, tol=tol).theta - d.theta)[after:]))
-    errors = {tol: float(np.median(e)) for tol, e in names.items()}
-    return judge_iteration(errors, float(np.median(exact)), float(max(corrected)))
+    medians = {tol: float(np.median(e)) for tol, e in names.items()}
+    return judge_iteration(medians, float(np.median(exact)), float(max(corrected)))
 
 
 def count() -> Claim:
