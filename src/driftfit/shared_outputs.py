@@ -8,12 +8,10 @@ knows the first one already.
 from __future__ import annotations
 
 from dataclasses import replace
-from io import StringIO
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from rich.console import Console
 
 from driftfit import storage
 from driftfit.joint import end_of
@@ -23,7 +21,7 @@ from driftfit.models.regression import Regression
 from driftfit.outputs import missing
 from driftfit.result import Track, root_mean_square
 from driftfit.smoothers.shared import SmoothedShared
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import printed, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End
 
@@ -154,9 +152,7 @@ class Shared:
         errors = table_of("One-step prediction error, root mean square", *self.outputs)
         kept = self.innovation[max(50, 5 * len(self.names)) :]
         errors.add_row(*(f"{root_mean_square(e[np.isfinite(e)]):.5g}" for e in kept.T))
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(table, errors)
-        return text.getvalue()
+        return printed(table, errors)
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters with bands, predictions and innovations of the rows."""

@@ -38,13 +38,13 @@ from typing import Any, Self
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
 from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
 from driftfit.models.block_rows import FLOOR
-from driftfit.models.hammerstein_wiener_steps import build
+from driftfit.models.hammerstein_wiener_steps import applying, build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -215,6 +215,10 @@ class HammersteinWiener(Model):
     @property
     def steps(self) -> ModelSteps:
         return _steps(self)
+
+    @property
+    def apply(self) -> Step | None:
+        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
 
     @property
     def reach(self) -> int:

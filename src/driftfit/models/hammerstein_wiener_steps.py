@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, core, floats, kernel, outside, part
+from driftfit.kernel import Array, State, Step, core, floats, kernel, outside, part
 from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverting, laying, locating, refining
 from driftfit.models.block_memory import (
@@ -88,18 +88,19 @@ def thresholds(m: Array, p: Places, theta: Array) -> None:
 
 
 @lru_cache
-def _entering(into: tuple[Kind, ...], i: int = 0) -> Any:
-    """A part (m, p) that takes the inputs of this sample, from input i on, into their lags."""
+def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
+    """A part (m, p) that takes the inputs of this sample, from input i on, into their lags, or replaces the newest."""
     input_at, own = input_values(into[i], i), OWN + EACH * i
 
     def one(m: Array, p: Places) -> None:
-        shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
+        if moves:
+            shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
         input_at(m, p, m[p[US] + i, 0], p[own + OWN_F], p[SPARE])
 
     enter = part(one)
     if i + 1 == len(into):
         return enter
-    others = _entering(into, i + 1)
+    others = _entering(into, i + 1, moves)
 
     def all_from(m: Array, p: Places) -> None:
         enter(m, p)
@@ -240,3 +241,22 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             machine.load()
 
     return ModelSteps(regress, push, ready)
+
+
+@lru_cache
+def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
+    """The step that takes inputs after their sample: their functions, and the row of the next sample laid out again."""
+    place, orders = _entering(into, moves=False), np.array(p)
+    now, following, n, us, inputs = p[NOW], p[NEXT], p[N], p[US], p[INPUTS]
+
+    def apply(s: State, l: int) -> None:
+        for i in range(inputs):
+            s.blocks[us + i, l] = s.u[i, l]
+        m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
+        place(m, orders)
+        fill(m, orders, following, 1, m[SEEN, 0] > 0.0)
+        for i in range(n):
+            s.blocks[now + i, l] = s.blocks[following + i, l]
+
+    step: Step = kernel(apply)
+    return step
