@@ -1,6 +1,6 @@
 """Speed of Hammerstein-Wiener tracking: stage one beside a regression of its size, separation, a stream with blocks.
 
-    python benchmarks/hammerstein_wiener.py
+    python -m benchmarks.hammerstein_wiener
 
 Targets: stage one at the rate of a regression with as many regressors, 1.1 times at most; separation of
 a whole record at most 5 times the filter step; an update with blocks at n = 14 below 10 us.
@@ -18,8 +18,8 @@ from driftfit.blocks.separate import METHODS, separate
 from driftfit.kernel import Array
 from driftfit.models.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.reproduce.hammerstein_wiener.cost import least
 from driftfit.systems.hammerstein_wiener import CUBIC, example
+from lab.reproduce.hammerstein_wiener.cost import least
 
 T = 5000
 MODELS = {

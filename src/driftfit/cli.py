@@ -1,4 +1,4 @@
-"""Command line: ``driftfit track``, ``trackers``, ``demo``, ``reproduce``, ``bench``.
+"""Command line: ``driftfit track``, ``trackers``, ``demo``.
 
 What a user got wrong ends in one line on stderr and exit code 2; a traceback is always a fault of the program.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,15 +18,11 @@ from rich.text import Text
 
 from driftfit import __version__, trackers
 from driftfit.arguments import default, given_fields, listed, parse_interval, parse_model, parse_tracker, parse_units
-from driftfit.bench import commands as bench
 from driftfit.export import check_ending, write
-from driftfit.reproduce import found as reproductions
-from driftfit.settings import near
 from driftfit.summary import WIDTH
 from driftfit.track import track as run_track
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__.splitlines()[0], rich_markup_mode=None)
-app.add_typer(bench.app, name="bench", help="Compare accuracy and speed with other packages.")
 out = Console(width=WIDTH, highlight=False, soft_wrap=False)
 progress = Console(stderr=True)
 
@@ -169,20 +164,3 @@ def demo(
 
     with helpful():
         show(out, progress, plot)
-
-
-@app.command(
-    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
-    help=f"Reproduce a paper: {', '.join(reproductions())}. Options: driftfit reproduce NAME --help.",
-)
-def reproduce(context: typer.Context, name: Annotated[str, typer.Argument(help="Which one.")] = "--help") -> None:
-    """Run one of the reproductions with the options that it has itself."""
-    if name == "--help":
-        out.print(f"driftfit reproduce {{{','.join(reproductions())}}} [--help]")
-        return
-    with helpful():
-        if name not in reproductions():
-            raise ValueError(f"there is no reproduction {name!r}; {near(name, reproductions())}")
-        program = typer.Typer(add_completion=False, rich_markup_mode=None)
-        program.command()(import_module(f"driftfit.reproduce.{name.replace('-', '_')}").main)
-        program(args=context.args, prog_name=f"driftfit reproduce {name}", standalone_mode=False)

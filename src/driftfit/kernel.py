@@ -181,6 +181,11 @@ class Outside(types.ExternalFunction):
 
     identity: str
 
+    @property
+    def py_func(self) -> Any:
+        """The Python function that it was made of."""
+        return _OUTSIDE[self.symbol].py_func
+
     def __reduce__(self) -> Any:
         """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
         return _machine, (self.symbol,)

@@ -26,7 +26,7 @@ from numba.core.registry import CPUDispatcher, cpu_target
 KEPT = 400
 """Functions whose code is kept for drivers to come; a driver takes in some twenty, a bank some hundred and fifty."""
 
-# llvmlite frees no pass manager: both classes inherit the `_dispose` that does nothing (seen in 0.44 to 0.50). They were
+# llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were
 # three fifths of all memory that a compilation left behind.
 for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
     if _manager._dispose is passes.ffi.ObjectRef._dispose:

@@ -1,6 +1,6 @@
 """Says that the compiler is at work, where a user waits for it: one line on stderr after two seconds, once a process.
 
-Only where somebody looks: on a terminal, or in a notebook. What is written to a file or read by a program stays as it is.
+Only where somebody looks: on a terminal, or in a notebook. What goes to a file or a program stays as it is.
 """
 
 from __future__ import annotations
