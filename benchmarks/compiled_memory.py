@@ -1,4 +1,4 @@
-"""Memory that a process holds for each configuration that it compiled: megabytes, as the number of configurations grows.
+"""Memory that a process holds for each configuration that it compiled: MB, as the number of configurations grows.
 
 ARX(na, nb) of different orders, each a record type of its own, followed by a Kalman filter; first compiled, then found
 on disk, in processes of their own with a cache of their own. "all kept": nothing is forgotten, and llvmlite's pass
@@ -51,7 +51,7 @@ def resident() -> float:
 
 
 def main(quick: bool) -> None:
-    count = 6 if quick else 60
+    count = 6 if quick else 24
     table = Table(box=SIMPLE_HEAD, show_edge=False)
     for head in ("MB for each of", *(str(n) for n in (count // 3, 2 * count // 3, count)), "configurations"):
         table.add_column(head, justify="right")

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
-from driftfit.report import LONG, page, svg
+from driftfit.report import page
+from driftfit.report_parts import LONG, svg
 
 K = Kalman(q=1e-3, r=0.01)
 OPEN = {"meta", "br", "img", "link", "hr"}

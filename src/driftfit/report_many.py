@@ -14,7 +14,8 @@ import numpy as np
 
 from driftfit.judges.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judges.page import READING
-from driftfit.report import PARAMETERS, document, parameter_figure, picture, section, table
+from driftfit.report import PARAMETERS, parameter_figure
+from driftfit.report_parts import document, picture, section, table
 from driftfit.summary import key_text
 from driftfit.verdict import p_text
 

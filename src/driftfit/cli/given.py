@@ -14,6 +14,7 @@ import typer
 from driftfit.cli.arguments import listed, parse_interval, parse_model, parse_tracker, parse_units
 from driftfit.cli.program import helpful, progress
 from driftfit.cli.reading import Part, Rows, rows_of
+from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
@@ -100,7 +101,9 @@ class Given:
         """The models, each bound to the inputs."""
         default = [f"arx:2,{2 if self.inputs else 0},intercept"]
         found = [parse_model(text, self.outputs) for text in self.model or default]
-        return [model if model.shared else model.bind(self.inputs) for model in found]
+        several = len(found) > 1  # then one of them may leave the inputs out
+        alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
+        return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
 
     def chosen_tracker(self) -> Tracker:
         """The tracker with its settings."""

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from driftfit.cli.given import Given, reads
 from driftfit.cli.program import app, say
 from driftfit.export import check_ending, write
+from driftfit.result import Track
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (one run).")]
 Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
@@ -18,7 +22,15 @@ Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send 
 
 @app.command()
 @reads
-def track(given: Given, write_to: Out = None, plot: Plot = None, report: Report = None) -> None:
+def track(
+    given: Given,
+    write_to: Out = None,
+    plot: Plot = None,
+    system: Annotated[
+        Path | None, typer.Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
+    ] = None,
+    report: Report = None,
+) -> None:
     """Follow the parameters of a model through a record, or through a fleet of them."""
     if write_to is not None and check_ending(write_to) == ".npz" and given.by:
         raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
@@ -34,5 +46,14 @@ def track(given: Given, write_to: Out = None, plot: Plot = None, report: Report 
         write(run, write_to)
     if plot is not None:
         run.plot().savefig(plot, dpi=150)
+    if system is not None:
+        plot_system(run).savefig(system, dpi=150)
     if report is not None:
         run.report(report)
+
+
+def plot_system(run: Any) -> Figure:
+    """The picture of the system, of runs that have one."""
+    if not isinstance(run, Track):
+        raise ValueError("--system: the picture is of one series with one output; leave out --by and further --y.")
+    return run.plot_system()

@@ -7,6 +7,8 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
     from driftfit.judges.many import ManyDiagnoses, ManyVerdicts
@@ -143,8 +145,30 @@ class Judged:
 
         return detect(cast("Track", self), kind, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`."""
+    def plot_system(self, input: int | str = 0, at: Any = None, **settings: Any) -> Figure:
+        """Step and frequency response over time with bands, poles in the plane, gain; see `driftfit.system_plots`."""
+        from driftfit.system_plots import plot_system
+
+        return plot_system(cast("Track", self), input, at, **settings)
+
+    def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
+        """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
+        from driftfit.system_plots import plot_validation
+
+        return plot_validation(cast("Track", self), y, u, at, level)
+
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: Alarms | None = None,
+        labels: Array | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`.
+
+        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
+        """
         from driftfit.report import report
 
-        report(cast("Track", self), path, title)
+        report(cast("Track", self), path, title, alarms, labels)
