@@ -105,7 +105,7 @@ def summarise(run: Track) -> Summary:
         for i, name in enumerate(run.names)
     )  # fmt: skip
     return Summary(
-        repr(run.model), _short(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
+        repr(run.model), shortened(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
     )  # fmt: skip
 
@@ -137,7 +137,7 @@ def counts(dropped: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items())
 
 
-def _short(text: str) -> str:
+def shortened(text: str) -> str:
     """Numbers of more than six digits in six."""
     return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 

@@ -12,7 +12,7 @@ from driftfit.cli.arguments import given_fields
 from driftfit.cli.given import Given, reads
 from driftfit.cli.program import app, progress, say
 from driftfit.cli.track import Plot
-from driftfit.summary import facts, table_of
+from driftfit.summary import facts, shortened, table_of
 
 
 @app.command()
@@ -35,7 +35,11 @@ def tune(
         tuned = find(
             models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
         )
-    told = [("Model", repr(models[0])), ("Tracker", repr(tuned.tracker)), ("Log-likelihood", f"{tuned.loglik:.6g}")]
+    told = [
+        ("Model", repr(models[0])),
+        ("Tracker", shortened(repr(tuned.tracker))),
+        ("Log-likelihood", f"{tuned.loglik:.6g}"),
+    ]
     say(facts(*told))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
     for name, value in tuned.chosen.items():
