@@ -140,3 +140,21 @@ def test_command_line_writes_a_page(tmp_path):
     fleet = CliRunner().invoke(app, [*base, "--by", "unit", "--report", str(tmp_path / "f.html")])
     assert fleet.exit_code == 0, fleet.output
     read((tmp_path / "f.html").read_text())
+
+
+def test_page_shows_faults_and_alarms(run):
+    labels = np.zeros(400, bool)
+    labels[250:300], labels[390:395] = True, True
+    alarms = run.detect("innovation", reference=200, every=500)
+    text = page(run, None, alarms, labels)
+    read(text)
+    plain = " ".join(" ".join(read(text).text).split())
+    score = alarms.score(labels)
+    assert f"{score.found} of 2 labelled stretches found, {score.false} false alarms" in plain
+    assert plain.index("Faults and alarms") < plain.index("Parameters over time")
+    for t in (250, 299, 390, 394, *alarms.onsets):
+        assert run.time_text(int(t)) in plain
+    assert read(text).tags.count("svg") == 4
+    assert "Faults and alarms" not in page(run)
+    with pytest.raises(ValueError, match="labels have shape"):
+        page(run, None, None, labels[1:])

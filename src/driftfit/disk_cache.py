@@ -131,7 +131,7 @@ def _say_nothing_is_kept() -> None:
     )
 
 
-class Kept(_Cache):  # type: ignore[misc]
+class Kept(_Cache):
     """The cache that a dispatcher of Numba asks, for functions that are kept by themselves."""
 
     def __init__(self, function: str, identity: str) -> None:

@@ -104,8 +104,9 @@ def summarise(run: Track) -> Summary:
         )
         for i, name in enumerate(run.names)
     )  # fmt: skip
+    tracker = shortened(repr(run.tracker))
     return Summary(
-        repr(run.model), shortened(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
+        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
     )  # fmt: skip
 
