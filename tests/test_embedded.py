@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+import runpy
 import shutil
 import subprocess
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ from driftfit.kernel import kernel
 from driftfit.trackers.base import Tracker
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off"]
-CORTEX = Path(__file__).parent / "cortex"
+ROOT = Path(__file__).parent.parent
+CORTEX = ROOT / "tests" / "cortex"
 M4F = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc to compile the source")
@@ -229,6 +231,15 @@ class Odd(Tracker):
     @property
     def steps(self):
         return TrackerSteps(predict, correct, predict)
+
+
+@needs_gcc
+def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["controller.py"])
+    runpy.run_path(str(ROOT / "examples" / "controller.py"), run_name="__main__")
+    page = (ROOT / "docs" / "embedded.md").read_text()
+    said = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
+    assert capsys.readouterr().out.split() == said.split()
 
 
 def test_readme_and_header_say_what_there_is(tmp_path):

@@ -97,16 +97,20 @@ SUPPORT = {
     "whole_maximum": "static int64_t whole_maximum(int64_t a, int64_t b) { return b > a ? b : a; }",
     "whole_abs": "static int64_t whole_abs(int64_t a) { return a < 0 ? -a : a; }",
     "real_square": "static real real_square(real a) { return a * a; }",
-    "from_bits": """static double from_bits(int64_t bits) {
+    "from_bits": """#ifndef TRACKER_SINGLE
+static double from_bits(int64_t bits) {
     union { int64_t whole; double number; } both;
     both.whole = bits;
     return both.number;
-}""",
-    "bits_of": """static int64_t bits_of(double number) {
+}
+#endif""",
+    "bits_of": """#ifndef TRACKER_SINGLE
+static int64_t bits_of(double number) {
     union { int64_t whole; double number; } both;
     both.number = number;
     return both.whole;
-}""",
+}
+#endif""",
     "four": "typedef struct { real at[4]; } four;",
     "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
     "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
@@ -138,7 +142,7 @@ README = """\
 * An update takes at most {ops}.
   Loops are counted at their longest, and of two branches the dearer. After the start a sample takes at most
   {ordinary}.
-* From the library: `sqrt` and `fabs` where they are used.
+* From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
 * `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
 
 ```c
