@@ -206,3 +206,28 @@ def test_picture_of_the_system(table):
     run("track", *SIGNALS, "--system", "system.png", "--out", "run.npz")
     assert Track.load("run.npz").names == ("a1", "b1[valve]")
     assert "one series" in fails("track", *SIGNALS, "--by", "leak", "--system", "s.png")
+
+
+def test_alarms_of_a_fleet(table):
+    two = [table.with_columns(pump=pl.lit("a")), table.with_columns(pump=pl.lit("b"), flow=pl.col("flow").shift(0))]
+    pl.concat(two).write_csv("two.csv")
+    options = ["--by", "pump", "--reference", "150", "--every", "1000", "--out", "alarms.csv", "--report", "page.html"]
+    assert "2 series" in run("detect", "two.csv", *DATED[1:], *options)
+    written = pl.read_csv("alarms.csv")
+    assert set(written["key"]) == {"a", "b"}
+    page = Path("page.html").read_text()
+    assert "Faults and alarms" in page
+    assert str(written["from"][0]) in page
+
+
+def test_page_of_a_fleet_marks_labels(table):
+    y, u, wrong = simulate()
+    fleet = track(ARX(1, 1), K, np.stack([y, y]), np.stack([u, u])[..., None], by="row")
+    fleet.report("page.html", labels={0: wrong})
+    page = Path("page.html").read_text()
+    assert "Stretches labelled as wrong" in page
+    assert ">200<" in page
+    with pytest.raises(ValueError, match="which has no result"):
+        fleet.report("page.html", labels={7: wrong})
+    with pytest.raises(ValueError, match="300 samples"):
+        fleet.report("page.html", labels={0: wrong[1:]})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -11,27 +12,71 @@ from driftfit.judges.onsets import onsets
 from driftfit.judges.plots import plot_alarms
 from driftfit.kernel import Array
 from driftfit.report_parts import picture, table
+from driftfit.summary import key_text
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
     from driftfit.detect import Alarms
+    from driftfit.judges.many_alarms import ManyAlarms
     from driftfit.result import Track
 
 LISTED = 100
 """Rows of a table."""
+
+PICTURED = 4
+"""Pictures of alarms on a page about many."""
 
 PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm is on. Grey: labelled as wrong."
 
 
 def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
     """The section: labels, alarms, and the picture of the alarms."""
-    wrong = None if labels is None else np.asarray(labels).astype(bool)
-    if wrong is not None and wrong.shape != (len(run),):
-        raise ValueError(f"report: labels have shape {wrong.shape}, but the record has {len(run)} samples.")
+    wrong = None if labels is None else _checked(run, labels)
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
         parts += [_said(alarms, wrong), _alarms(alarms), picture(plot_alarms(alarms, wrong), run, PICTURE)]
     return "".join(parts)
+
+
+def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, labels: Mapping[Hashable, Array]) -> str:
+    """The section about many: a row for each with labels or alarms, and pictures of the most extreme."""
+    watched = {} if alarms is None else {row.key: row for row in alarms.rows}
+    strange = [key for key in labels if key not in runs]
+    if strange:
+        raise ValueError(f"report: labels name {strange[0]!r}, which has no result.")
+    rows = []
+    for key in dict.fromkeys([*watched, *labels]):
+        wrong = _checked(runs[key], labels[key]) if key in labels else np.zeros(len(runs[key]), bool)
+        begun, row = onsets(wrong), watched.get(key)
+        marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
+        cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
+        if row is not None and (len(begun) or len(row.alarms.onsets)):
+            score = row.alarms.score(wrong)
+            found = (str(score.found), str(score.false)) if key in labels else ("", "")
+            cells += (str(len(row.alarms.onsets)), escape(row.first), escape(p_text(row.q)), *found)
+        if len(cells) > 3 or len(begun):
+            rows.append((*cells, *[""] * (8 - len(cells))))
+    heads = ("", "labelled", "the first", "alarms", "the first", "q", "found", "false")
+    shown = [row for row in watched.values() if len(row.alarms.onsets)][:PICTURED]
+    pictures = (
+        f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
+        f"{picture(plot_alarms(row.alarms, _given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        for row in shown
+    )
+    return table(f"Stretches labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
+        pictures
+    )
+
+
+def _given(runs: Mapping[Hashable, Track], labels: Mapping[Hashable, Array], key: Hashable) -> Array | None:
+    return _checked(runs[key], labels[key]) if key in labels else None
+
+
+def _checked(run: Track, labels: Array) -> Array:
+    wrong = np.asarray(labels).astype(bool)
+    if wrong.shape != (len(run),):
+        raise ValueError(f"report: labels have shape {wrong.shape}, but the record has {len(run)} samples.")
+    return wrong
 
 
 def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:

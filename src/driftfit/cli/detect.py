@@ -14,6 +14,8 @@ from driftfit.cli.given import Given, reads
 from driftfit.cli.program import app, say
 from driftfit.cli.reading import moment, stretch
 from driftfit.cli.track import Plot, Report
+from driftfit.detect import Alarms
+from driftfit.report import check_path
 from driftfit.result import Track
 
 
@@ -42,6 +44,10 @@ def detect(
     """Find alarms, with one false alarm in so many samples; with labels, score them."""
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
+    if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {write_to}: alarms are written to .csv or .parquet.")
+    if report is not None:
+        check_path(report)
     rows = given.read(labels) if labels is not None else None
     run = given.run(rows)
     settings = {"every": every, "window": window, "hold": hold, "calibrate": calibrate}
@@ -57,10 +63,11 @@ def detect(
     if write_to is not None:
         _write(said, write_to)
     if plot is not None:
-        (said.plot(wrong) if isinstance(run, Track) else run.plot()).savefig(plot, dpi=150)
+        if not isinstance(run, Track):
+            raise ValueError("--plot: alarms are drawn for one series; --report has those of a fleet.")
+        said.plot(wrong).savefig(plot, dpi=150)
     if report is not None:
-        more: Any = {"alarms": said, "labels": wrong} if isinstance(run, Track) else {}
-        run.report(report, **more)
+        run.report(report, alarms=said, **({} if wrong is None else {"labels": wrong}))
 
 
 def parse_reference(given: list[str] | None, run: Any) -> Any:
@@ -88,10 +95,12 @@ def _band(entry: str) -> tuple[str, tuple[float, float]]:
 
 
 def _write(said: Any, path: Path) -> None:
-    if path.suffix.lower() not in (".csv", ".parquet"):
-        raise ValueError(f"--out {path}: alarms are written to .csv or .parquet.")
-    if not hasattr(said, "onsets"):
-        raise ValueError(f"--out {path}: alarms of one series are written; a fleet is printed.")
+    table = _table(said) if isinstance(said, Alarms) else said.table
+    table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
+
+
+def _table(said: Alarms) -> pl.DataFrame:
+    """One row an alarm."""
     places = [int(t) for t in said.onsets]
     names = [said.names.index(said.cause(t)) for t in places]
     spans = [said.span(t) for t in places]
@@ -101,5 +110,4 @@ def _write(said: Any, path: Path) -> None:
         "statistic": [float(said.statistic[t, j]) for t, j in zip(places, names, strict=True)],
         "limit": [float(said.limits[j]) for j in names],
     }  # fmt: skip
-    table = pl.DataFrame(columns, schema_overrides=dict.fromkeys(("from", "to", "cause"), pl.String))
-    table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
+    return pl.DataFrame(columns, schema_overrides=dict.fromkeys(("from", "to", "cause"), pl.String))

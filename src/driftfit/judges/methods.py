@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
@@ -56,12 +56,23 @@ class JudgedMany:
 
         return alarms(self._runs(), kind, every=every, level=level, reference=reference, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures."""
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: ManyAlarms | None = None,
+        labels: Mapping[Hashable, Array] | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        """
         from driftfit.report import check_path
         from driftfit.report_many import page_of_many
 
-        check_path(path).write_text(page_of_many(self._runs(), title, getattr(self, "failed", {})), encoding="utf-8")
+        text = page_of_many(self._runs(), title, getattr(self, "failed", {}), alarms, labels)
+        check_path(path).write_text(text, encoding="utf-8")
 
 
 class Judged:
