@@ -30,7 +30,6 @@ def worker(way: str, count: int) -> None:
 
     if way == "all kept":
         linked.KEPT = kernel.MOST_ENTRIES = 10**9
-        linked.forget.__defaults__ = (10**9,)
         for manager in (passes.ModulePassManager, passes.FunctionPassManager):
             manager._dispose = passes.ffi.ObjectRef._dispose
     y, u = np.random.default_rng(0).normal(size=(2, 60))
@@ -51,7 +50,7 @@ def resident() -> float:
 
 
 def main(quick: bool) -> None:
-    count = 6 if quick else 15
+    count = 6 if quick else 12
     table = Table(box=SIMPLE_HEAD, show_edge=False)
     for head in ("MB for each of", *(str(n) for n in (count // 3, 2 * count // 3, count)), "configurations"):
         table.add_column(head, justify="right")

@@ -7,7 +7,9 @@ and the versions of everything that makes code, so that two processes can only e
 appears at once or not at all, and one that was damaged is compiled anew.
 
 The folder is ``NUMBA_CACHE_DIR`` where that is set, else ``__pycache__`` of the package, else the user's cache folder.
-Where none can be written, code is compiled in memory, in every process anew, and a warning says so once.
+Code is found in any of them, as in an image that was filled by ``driftfit warm`` and can only be read, and written to
+the first that can be written. Where none can, it is compiled in memory, in every process anew, and a warning says so
+once.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ from numba.core.serialize import dumps
 
 PACKAGE = Path(__file__).parent
 ENDING = ".compiled"
-MAKERS = ("kernel.py", "linked.py", "machine_code.py", "disk_cache.py", "eights.py")
+MAKERS = ("kernel.py", "linked.py", "machine_code.py", "eights.py")
 """Files that decide what becomes of a function, beside its own code."""
 
 
@@ -43,13 +45,14 @@ def folders() -> tuple[Path, ...]:
     given = numba.config.CACHE_DIR
     if given:
         return (Path(given) / "driftfit",)
-    home = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
-    return PACKAGE / "__pycache__" / "compiled", Path(home or Path("~/.cache").expanduser()) / "driftfit"
+    own = PACKAGE / "__pycache__" / "compiled"
+    home = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return (own,) if home.startswith("~") else (own, Path(home) / "driftfit")  # ~: nobody knows whose home
 
 
 @cache
 def folder() -> Path | None:
-    """Where compiled code is kept: the first folder that can be written, or None."""
+    """Where compiled code goes: the first folder that can be written, or None."""
     for place in folders():
         try:
             place.mkdir(parents=True, exist_ok=True)
@@ -77,19 +80,18 @@ def name_of(function: str, identity: str, signature: Any) -> str:
 
 
 def read(name: str) -> Any:
-    """What was kept under a name; None where there is nothing, or nothing whole."""
-    place = folder()
-    if place is None:
-        return None
-    try:
-        data = (place / name).read_bytes()
-        if hashlib.sha256(data[32:]).digest() != data[:32]:
-            return None
-        found = pickle.loads(data[32:])
-    except (OSError, EOFError, pickle.UnpicklingError, ImportError, AttributeError):
-        return None
-    _touch(place / name)
-    return found
+    """What was kept under a name, in any of the folders; None where there is nothing, or nothing whole."""
+    for place in folders():
+        try:
+            data = (place / name).read_bytes()
+            if hashlib.sha256(data[32:]).digest() != data[:32]:
+                continue
+            found = pickle.loads(data[32:])
+        except (OSError, EOFError, pickle.UnpicklingError, ImportError, AttributeError):
+            continue
+        _touch(place / name)
+        return found
+    return None
 
 
 def _touch(path: Path) -> None:
@@ -175,7 +177,7 @@ def contents() -> Contents:
     """What is kept on disk."""
     files = [(path, path.stat()) for path in _files()]
     usable = sum(_mine(path) for path, _ in files)
-    return Contents(folder(), len(files), sum(stat.st_size for _, stat in files), usable)
+    return Contents(_place(), len(files), sum(stat.st_size for _, stat in files), usable)
 
 
 def prune(days: float) -> int:
@@ -187,8 +189,13 @@ def prune(days: float) -> int:
     return len(gone)
 
 
+def _place() -> Path | None:
+    """The folder that is written, or that can be read at least."""
+    return folder() or next((place for place in folders() if place.is_dir()), None)
+
+
 def _files() -> list[Path]:
-    place = folder()
+    place = _place()
     return [] if place is None else sorted(path for path in place.iterdir() if path.name.endswith((ENDING, ".tmp")))
 
 

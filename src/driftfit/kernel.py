@@ -369,7 +369,8 @@ class _Entries:
     def used(self, entry: Any, owner: Driver) -> None:
         """Note that an entry point is in use, and let go of those that were not for longest."""
         with self._lock:
-            self._owners[entry] = self._owners.pop(entry, None) or ref(owner)
+            self._owners.setdefault(entry, ref(owner))
+            self._owners.move_to_end(entry)
             while len(self._owners) > MOST_ENTRIES:
                 old, place = self._owners.popitem(last=False)
                 holder = place()

@@ -151,9 +151,9 @@ def _used(dispatcher: Any, signature: Any) -> None:
     _recent.move_to_end(key)
 
 
-def forget(most: int = KEPT) -> None:
-    """Let go of all but the functions used last. Not while something is being compiled that may still take them in."""
-    while len(_recent) > most:
+def forget(most: int | None = None) -> None:
+    """Let go of all but the functions used last (`KEPT`), and not while something is compiled that may take them in."""
+    while len(_recent) > (KEPT if most is None else most):
         (place, arguments), _ = _recent.popitem(last=False)
         dispatcher = place()
         if dispatcher is not None and arguments in dispatcher.overloads:

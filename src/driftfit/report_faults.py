@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -118,5 +118,5 @@ def _alarms(alarms: Alarms) -> str:
     return table(f"Alarms.{_more(rows)}", heads, rows[:LISTED], (1, 2))
 
 
-def _more(rows: list[tuple[str, ...]]) -> str:
+def _more(rows: Sequence[tuple[str, ...]]) -> str:
     return f" The first {LISTED} of {len(rows)}." if len(rows) > LISTED else ""

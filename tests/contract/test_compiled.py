@@ -116,6 +116,22 @@ def own_cache(tmp_path, monkeypatch):
     disk_cache.folder.cache_clear()
 
 
+def test_a_cache_that_can_only_be_read_is_read(tmp_path, monkeypatch):
+    filled = tmp_path / "image"
+    try:
+        monkeypatch.setattr(disk_cache, "folders", lambda: (filled,))
+        disk_cache.folder.cache_clear()
+        assert Driver(second)(np.ones((2, 2))) == 1.0
+        assert len(list(filled.iterdir())) == 1
+        monkeypatch.setattr(disk_cache, "folder", lambda: None)
+        monkeypatch.setattr(kernel, "compiled", None)  # the compiler is not asked
+        assert Driver(second)(np.ones((2, 2))) == 1.0
+        assert disk_cache.contents()[:2] == (filled, 1)
+    finally:
+        monkeypatch.undo()
+        disk_cache.folder.cache_clear()
+
+
 def second(y):
     return y[0, 1]
 

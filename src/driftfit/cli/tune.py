@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -53,18 +53,18 @@ def tune(
         tuned.plot().savefig(plot, dpi=150)
 
 
-def _flags(given: Given, tracker: object) -> str:
+def _flags(given: Given, tracker: Any) -> str:
     """The tracker as options of the command line."""
-    values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}  # type: ignore[arg-type]
+    values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}
     parts = [f"-p {name}={_typed(value)}" for name, (value, default) in values.items() if not _same(value, default)]
     return " ".join([f"--tracker {given.tracker}", *parts])
 
 
-def _same(value: object, default: object) -> bool:
-    return np.shape(value) == np.shape(default) and bool(np.all(value == default))  # type: ignore[arg-type]
+def _same(value: Any, default: Any) -> bool:
+    return np.shape(value) == np.shape(default) and bool(np.all(value == default))
 
 
-def _typed(value: object) -> str:
+def _typed(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return str(value).lower()
-    return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)  # type: ignore[arg-type]
+    return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)

@@ -10,7 +10,7 @@ import typer
 
 from driftfit.cli.arguments import parse_model, parse_tracker
 from driftfit.cli.program import app, helpful, progress, say
-from driftfit.disk_cache import contents
+from driftfit.disk_cache import contents, folder
 from driftfit.fleet import FEWEST
 from driftfit.summary import facts
 
@@ -59,5 +59,5 @@ def warm(
                 ("Seconds", f"{time.perf_counter() - start:.0f}"),
             )
         )
-        if after.place is None:
+        if folder() is None:
             raise ValueError("no folder can be written, so nothing was kept; set NUMBA_CACHE_DIR.")
