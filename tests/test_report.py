@@ -98,7 +98,11 @@ def test_long_records_stay_small():
 def test_other_models_and_trackers(tmp_path):
     y, u = arx_record(300, 2)
     for model, tracker in ((Regression(1), K), (ARX(2, 2), AugmentedFLS(mu=10.0))):
-        read(page(track(model, tracker, y, u)))
+        run = track(model, tracker, y, u)
+        said = " ".join(read(page(run)).text)
+        assert all(name in said for name in run.names)
+        assert ("largest pole" in said) == isinstance(model, ARX)
+        assert f"{run.verdict().rms:.5g}" in said
     read(page(track(ARX(2, 2), K, y[:30], u[:30])))
 
 
@@ -136,10 +140,16 @@ def test_command_line_writes_a_page(tmp_path):
     ]
     done = CliRunner().invoke(app, [*base, "--report", str(tmp_path / "r.html")])
     assert done.exit_code == 0, done.output
-    read((tmp_path / "r.html").read_text())
+    expected = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"))
+    said = " ".join(" ".join(read((tmp_path / "r.html").read_text()).text).split())
+    for sentence in (*expected.verdict().sentences, *expected.diagnose().sentences):
+        assert " ".join(sentence.split()) in said
     fleet = CliRunner().invoke(app, [*base, "--by", "unit", "--report", str(tmp_path / "f.html")])
     assert fleet.exit_code == 0, fleet.output
-    read((tmp_path / "f.html").read_text())
+    both = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"), by="unit")
+    said = " ".join(" ".join(read((tmp_path / "f.html").read_text()).text).split())
+    for sentence in both.verdict().sentences:
+        assert " ".join(sentence.split()) in said
 
 
 def test_page_shows_faults_and_alarms(run):

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from io import StringIO
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +23,7 @@ from rich.text import Text
 from driftfit.compare import persistence
 from driftfit.kernel import Array
 from driftfit.result import root_mean_square
-from driftfit.summary import WIDTH, counts, facts, key_text, table_of
+from driftfit.summary import Printed, counts, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.fleet import Fleet
@@ -54,7 +53,7 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class FleetSummary:
+class FleetSummary(Printed):
     """What `Fleet.summary` returns: ``units``, those that moved most first; printing it shows the first twenty."""
 
     model: str
@@ -91,11 +90,6 @@ class FleetSummary:
         yield table
         if len(self.units) > SHOWN:
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
 
 def summarise(fleet: Fleet) -> FleetSummary:

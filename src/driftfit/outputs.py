@@ -147,7 +147,8 @@ class Outputs(JudgedMany):
         known = self._known[..., lane].copy()
         known[:, 0] = seen["dt"][:, lane]
         tile = fresh_tile(alone, tracker)
-        own = [name for name in storage.fields(tile) if name != "u"]
+        shapes = {name: tile[name].shape[:-1] for name in storage.fields(tile) if name != "u"}
+        own = [name for name, shape in shapes.items() if shape == self._tile[name].shape[:-1]]
         for name in own:
             tile[name][0, ..., 0] = self._tile[name][0, ..., lane]
         out = np.empty(len(self), output_type(tile, tracker.outputs, "cov" if "P" in names_of(self._out) else "std"))

@@ -19,7 +19,8 @@ class Settings:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]  # a dataclass leaves alone what its class has
+        if "__repr__" not in vars(cls):  # a dataclass leaves alone what its class has
+            cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
         """What makes it again: settings without a default, and those that differ from it."""

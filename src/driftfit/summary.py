@@ -12,6 +12,7 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -23,6 +24,28 @@ if TYPE_CHECKING:
 WIDTH = 96
 
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
+
+
+def printed(*parts: Any) -> str:
+    """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
+
+    Left to itself rich hands what is printed to the display of a notebook, and takes colours and widths from the
+    environment.
+    """
+    text = StringIO()
+    console = Console(
+        file=text, width=WIDTH, height=100, color_system=None, force_jupyter=False, force_terminal=False,
+        legacy_windows=False,
+    )  # fmt: skip
+    console.print(*parts)
+    return text.getvalue()
+
+
+class Printed(JupyterMixin):
+    """A result that rich draws: ``str`` gives it as plain text, and a notebook shows it as the value of a cell."""
+
+    def __str__(self) -> str:
+        return printed(self)
 
 
 @dataclass(frozen=True)
@@ -40,7 +63,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Summary:
+class Summary(Printed):
     """What `Track.summary` returns; printing it shows two tables."""
 
     model: str
@@ -85,11 +108,6 @@ class Summary:
         if self.comparison.samples:
             return f"on the {self.comparison.samples} samples after the first {self.burn} that all four could predict"
         return f"the record has no sample after the first {self.burn} that all four could predict: nothing to compare"
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
 
 def summarise(run: Track) -> Summary:

@@ -16,6 +16,7 @@ from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import Records, one_series, rows
 from driftfit.result import Track
+from driftfit.roles import check_roles
 from driftfit.settings import one_of
 from driftfit.signals import check_ready
 from driftfit.trackers.base import Tracker
@@ -137,6 +138,7 @@ def track(
         Shapes that do not fit, times of arrays that do not increase, settings that are incomplete; columns that are not
         there, cells that are not numbers, files that cannot be read. Missing and non-finite data never raise.
     """
+    check_roles("track", model, tracker, several=True)
     if len(model.outputs) > 1:
         if prob is not None:
             raise ValueError("track: prob= is for one series and one tracker.")

@@ -26,13 +26,14 @@ import numpy as np
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.records import one_series
+from driftfit.roles import check_roles
 from driftfit.settings import one_of, whole
 from driftfit.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tuning.intervals import intervals_of
 from driftfit.tuning.knobs import find_knobs
 from driftfit.tuning.lanes import Record, score
-from driftfit.tuning.objective import along, objective
+from driftfit.tuning.objective import Criterion, along
 from driftfit.tuning.search import Counted, Search, minimise
 
 if TYPE_CHECKING:
@@ -137,7 +138,9 @@ def tune(
     model, y, u, time, dt, weights, drift
         As for `track`.
     tracker : Tracker
-        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays.
+        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays. Of a `Bank` the scales of
+        its changes are found, as factors of the standard deviations that it has, and their prior probabilities, by its
+        log evidence.
     method : "ml", "h-step", "loo" or "gcv"
         The criterion, see the module.
     groups : None, "each", or n labels
@@ -169,6 +172,7 @@ def tune(
     ValueError
         Nothing to find, a method that the tracker does not have, no usable sample, or what `track` refuses.
     """
+    check_roles("tune", model, tracker)
     one_of("tune", "method", method, METHODS)
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
@@ -194,7 +198,7 @@ def _tuned(
     if order_by is not None:
         record = along(record, tracker, order_by)
     knobs = find_knobs(record, tracker, groups, bounds)
-    f = Counted(objective(record, knobs, method, h))
+    f = Counted(Criterion(record, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
     final = score(record, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])

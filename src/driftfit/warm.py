@@ -23,12 +23,16 @@ _LEFT = ("interval", "noise", "drift", "each", "F")
 
 
 class End(NamedTuple):
-    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample."""
+    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample.
+
+    ``awaits`` says whether a stream still expects the input of that sample (`driftfit.late`).
+    """
 
     model: Model
     tracker: Tracker
     state: Mapping[str, Array]
     last: Any
+    awaits: int = 0
 
 
 class Run(Protocol):

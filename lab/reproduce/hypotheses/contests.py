@@ -127,7 +127,7 @@ def beam(M: int, *others: Sensor, **more: Any) -> Entry:
 
 
 def hybrid(M: int, *others: Sensor) -> Entry:
-    return Entry(bank(Hybrid(M), *others), window(0.5))
+    return Entry(bank(Hybrid(M, remembered=5), *others), window(0.5))
 
 
 def imm(*others: Sensor, literal: bool = False, **more: Any) -> Entry:
@@ -283,6 +283,6 @@ def alarming() -> dict[str, Entry]:
     short = bank(Beam(9, window=3))
     return {
         "Beam(9), MAP at lag 3": beam(9), "Beam(9), window 3 > .5": Entry(short, window(0.5)),
-        **{f"Beam(9), window 8 > .{p}": Entry(bank(Beam(9)), window(p / 10.0)) for p in (5, 9)},
+        **{f"Beam(9), window 8 > .{p}": Entry(bank(Beam(9, window=8)), window(p / 10.0)) for p in (5, 9)},
         "IMM, MAP": imm(),
     }  # fmt: skip

@@ -82,11 +82,21 @@ def pick(
 @core
 def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
     """Row ``to`` of T2: the average over the members."""
-    for at in range(T.shape[1]):
-        T2[to, at] = 0.0
-    for k in range(len(members)):
-        for at in range(T.shape[1]):
-            T2[to, at] += share[k] * T[members[k], at]
+    for at in range(0, T.shape[1], WIDTH):
+        total = fill(0.0)
+        for k in range(len(members)):
+            total = plus(total, times(fill(share[k]), load(T, members[k], at)))
+        store(T2, to, at, total)
+
+
+@core
+def summary(lags: Array, brief: Array) -> None:
+    """The newest floors, and the oldest."""
+    last = len(brief) - 1
+    for k in range(len(brief)):
+        row = k if k < last else len(lags) - 1
+        for e in range(lags.shape[1]):
+            brief[k, e] = lags[row, e]
 
 
 @part

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
+    from driftfit.judges.alarm_rule import AlarmRule
     from driftfit.judges.many import ManyDiagnoses, ManyVerdicts
     from driftfit.judges.many_alarms import ManyAlarms
     from driftfit.kernel import Array
@@ -150,8 +151,11 @@ class Judged:
 
         return long_run(cast("Track", self), at, level)
 
-    def detect(self, kind: str = "band", **settings: Any) -> Alarms:
-        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`."""
+    def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
+        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`.
+
+        ``kind`` may also be the rule of another run, ``said.rule``.
+        """
         from driftfit.detect import detect
 
         return detect(cast("Track", self), kind, **settings)
