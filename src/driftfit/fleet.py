@@ -21,13 +21,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.drivers import drivers, make_tile, output_type, repeat_tile
 from driftfit.judges.methods import JudgedMany
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver
 from driftfit.models.base import Model
 from driftfit.records import Records
 from driftfit.result import Track
@@ -380,7 +379,7 @@ def _words(tile: Array, L: int) -> Array:
     return flat[: len(flat) // L * L].reshape(-1, L)
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def _gather(
     y: Array, u: Array, known: Array, first: Array, length: Array, a: int, b: int,
     to_y: Array, to_u: Array, to_known: Array,

@@ -145,6 +145,21 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     return Prediction(out, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
 
 
+def fit(y: Any, y_hat: Any) -> float:
+    """Fit in per cent, 100 (1 - |y - y_hat| / |y - mean y|) over the samples where both are known.
+
+    100 is perfect, 0 no better than the mean, and below that worse; the measure of Ljung (1999) and of MATLAB's
+    ``compare``. NaN where nothing is known or y stands still.
+    """
+    measured, predicted = np.asarray(y, float), np.asarray(y_hat, float)
+    if measured.shape != predicted.shape:
+        raise ValueError(f"fit: y has shape {measured.shape}, but y_hat has {predicted.shape}.")
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    spread = float(np.linalg.norm(measured[known] - measured[known].mean())) if known.any() else 0.0
+    error = float(np.linalg.norm(measured[known] - predicted[known]))
+    return 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
+
+
 def noise_at(run: Track, at: int) -> float:
     """Noise variance at a sample: the one-step variance less what the parameters add to it; NaN without one."""
     sample = range(len(run))[at]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from driftfit.crossing import Crossing
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
@@ -56,12 +58,23 @@ class JudgedMany:
 
         return alarms(self._runs(), kind, every=every, level=level, reference=reference, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures."""
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: ManyAlarms | None = None,
+        labels: Mapping[Hashable, Array] | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        """
         from driftfit.report import check_path
         from driftfit.report_many import page_of_many
 
-        check_path(path).write_text(page_of_many(self._runs(), title, getattr(self, "failed", {})), encoding="utf-8")
+        text = page_of_many(self._runs(), title, getattr(self, "failed", {}), alarms, labels)
+        check_path(path).write_text(text, encoding="utf-8")
 
 
 class Judged:
@@ -163,8 +176,30 @@ class Judged:
 
         return detect(cast("Track", self), kind, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`."""
+    def plot_system(self, input: int | str = 0, at: Any = None, **settings: Any) -> Figure:
+        """Step and frequency response over time with bands, poles in the plane, gain; see `driftfit.system_plots`."""
+        from driftfit.system_plots import plot_system
+
+        return plot_system(cast("Track", self), input, at, **settings)
+
+    def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
+        """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
+        from driftfit.system_plots import plot_validation
+
+        return plot_validation(cast("Track", self), y, u, at, level)
+
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: Alarms | None = None,
+        labels: Array | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`.
+
+        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
+        """
         from driftfit.report import report
 
-        report(cast("Track", self), path, title)
+        report(cast("Track", self), path, title, alarms, labels)
