@@ -24,6 +24,8 @@ OUTLIER = 0.02
 """Probability of an outlier."""
 MEMORY = 100.0
 """Samples over which r is remembered."""
+IN_A_ROW, RISE = 4.0, 0.3
+"""From the third outlier in a row on (`driftfit.trackers.proportion`), log r rises by this with each."""
 FINEST = 1e-12
 """r is never below this share of the mean square of y: the data's own rounding."""
 
@@ -36,7 +38,14 @@ def any_level() -> dict[str, Any]:
         "log_level": np.log(LEVELS),
         "nu": np.array([*np.full(J - 1, 1.0 / (J - 1)), 0.0]),
         "nu_prior": np.zeros(J),
+        "outlier": 0.0,
     }
+
+
+@kernel
+def finest(s: State, l: int) -> float:
+    """What r is never below."""
+    return max(FINEST * s.power[l], s.coarse[l])  # type: ignore[no-any-return]
 
 
 @kernel
@@ -65,4 +74,6 @@ def learn_noise(s: State, l: int) -> None:
     s.count[l] += 1.0
     step = 1.0 / min(s.count[l] + 1.0, MEMORY)
     move = step * surprise + max(step, 2.0 / MEMORY) * level
-    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), FINEST * s.power[l])
+    if s.patience[l] > IN_A_ROW:
+        move += RISE * s.outlier[l]
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), finest(s, l))
