@@ -74,11 +74,11 @@ def settle(s: State, l: int) -> None:
 
 
 @kernel
-def learn(s: State, l: int, outlier: float) -> None:
+def learn(s: State, l: int, odd: float) -> None:
     """What every sample tells of scales, excitation and readings."""
     learn_scales(s, l)
     learn_information(s, l)
-    learn_proportion(s, l, outlier)
+    learn_proportion(s, l, odd)
 
 
 @kernel
@@ -88,13 +88,13 @@ def follow(s: State, l: int) -> None:
     bound_leverage(s, l)
     innovate(s, l)
     leave_out(s, l)
-    s.outlier[l] = 0.0
+    s.odd[l] = 0.0
     entered = s.rank[l] < s.theta.shape[0] and enter_filters(s, l)
     if s.ok[l] > 0.0 and not entered:
         weigh(s, l)
         update_filters(s, l)
         learn_noise(s, l)
-    learn(s, l, s.outlier[l])
+    learn(s, l, s.odd[l])
 
 
 @kernel

@@ -103,7 +103,7 @@ def weigh(s: State, l: int) -> None:
             s.mu[k, l] += s.joint[j, k, l]
     for k in range(K):
         s.mu[k, l] = max(s.mu[k, l], LEAST)  # at 0 a mode that only such modes lead to would have no mixture at all
-    s.outlier[l] = s.nu[J - 1, l]
+    s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
     # an outlier says nothing about the level: the chain keeps what it was
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)

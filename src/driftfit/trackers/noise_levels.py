@@ -38,7 +38,7 @@ def any_level() -> dict[str, Any]:
         "log_level": np.log(LEVELS),
         "nu": np.array([*np.full(J - 1, 1.0 / (J - 1)), 0.0]),
         "nu_prior": np.zeros(J),
-        "outlier": 0.0,
+        "odd": 0.0,
     }
 
 
@@ -75,5 +75,5 @@ def learn_noise(s: State, l: int) -> None:
     step = 1.0 / min(s.count[l] + 1.0, MEMORY)
     move = step * surprise + max(step, 2.0 / MEMORY) * level
     if s.patience[l] > IN_A_ROW:
-        move += RISE * s.outlier[l]
+        move += RISE * s.odd[l]
     s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), finest(s, l))
