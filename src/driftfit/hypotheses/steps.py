@@ -41,8 +41,10 @@ from driftfit.hypotheses.table import (
 )  # fmt: skip
 from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
-from driftfit.trackers.diffuse import enter, measurement, spanned_variance
+from driftfit.trackers.diffuse import enter, measurement, prediction, spanned_variance
 from driftfit.trackers.excitation import learn_scales
+from driftfit.trackers.proportion import bound_leverage, learn_proportion, leave_out
+from driftfit.trackers.resolution import resolve
 
 
 @kernel
@@ -130,19 +132,25 @@ def among(s: State, l: int) -> None:
 @kernel
 def tell(s: State, l: int) -> None:
     """What the machine is told of this sample."""
-    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
+    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l] * s.leverage[l], s.dt[l]
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
-    s.now[R, l], s.now[LEAST, l] = s.r[l], FLOOR * s.power[l] + 1e-300
+    s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    resolve(s, l)
     if s.many[SETTLED, l] > 0:
+        if s.wary[l] > 0:
+            bound_leverage(s, l)
+            s.y_hat[l] = prediction(s, l)
+            leave_out(s, l)
         tell(s, l)
         run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
         learn_scales(s, l)
+        learn_proportion(s, l, 0.0)
     else:
         only_drift(s, l)
         measurement(s, l)
@@ -151,6 +159,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
+    resolve(s, l)
     only_drift(s, l)
     enter(s, l)
     alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
@@ -161,6 +170,7 @@ def begin(s: State, l: int) -> None:
 def alone(s: State, l: int, counts: bool) -> None:
     """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
     learn_scales(s, l)
+    learn_proportion(s, l, 0.0)
     if counts:
         learn_start(s, l)
     tell(s, l)

@@ -55,7 +55,8 @@ def learn_start(s: State, l: int) -> None:
     s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
     s.count[l] += counted
     s.s[l] *= s.scale[l]
-    s.scale[l] = max(s.squares[l] / s.count[l], s.coarse[l])
+    scale = s.squares[l] / s.count[l]
+    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN stays
 
 
 @kernel

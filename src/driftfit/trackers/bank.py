@@ -15,6 +15,7 @@ Jumps show only through the regressors: no excitation, no detection.
 None) q and p0 are in units of it, unless a ``guess`` of it is given.
 
 A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
+Without ``sensors`` readings out of all proportion are left out (`driftfit.trackers.proportion`).
 Until the regressors have full rank (and, with unknown noise, four residuals are there) only the first change acts.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.hypotheses.square_root`): the same numbers for ordinary
@@ -54,6 +55,8 @@ from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
+from driftfit.trackers.proportion import no_proportion, proportion
+from driftfit.trackers.resolution import resolution, unresolved
 
 
 @dataclass(frozen=True)
@@ -250,7 +253,8 @@ class Bank(Tracker):
             **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt"),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
+            "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
+            **no_proportion(), "wary": int(self.sensors is None),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             "q0": arrays["Q"][0, : n * (n + 1) // 2], "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
@@ -324,7 +328,8 @@ class Bank(Tracker):
         said = [("Events", f"{kinds.count('change')} changes{faults}; see run.hypotheses.events()")]
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
-        return tuple(said)
+        lane = run.end().state
+        return (*said, *proportion(lane), *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     @property
     def steps(self) -> TrackerSteps:

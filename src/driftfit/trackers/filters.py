@@ -19,6 +19,7 @@ from driftfit.kernel import State, exp, kernel
 from driftfit.trackers.diffuse import TOLERANCE, outside, widen
 from driftfit.trackers.drift_ladder import TOP, leap
 from driftfit.trackers.noise_levels import OUTLIER
+from driftfit.trackers.resolution import lasting
 
 LEAST = 1e-100
 """Probability that a filter is never below."""
@@ -76,9 +77,10 @@ def weigh(s: State, l: int) -> None:
     """Joint probabilities of drift modes and noise levels after the sample."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest, factor = np.inf, s.noise[l] * s.leverage[l]
+    more = lasting(s, l)
     leap(s, l, factor * max(s.r[l], s.coarse[l]))
     for j in range(J):
-        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
+        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
         widest = np.inf if j == J - 1 else 0.0
         for k in range(K):
             square = s.e_k[k, l] * s.e_k[k, l]

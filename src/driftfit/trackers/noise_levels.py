@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.kernel import State, exp, kernel
+from driftfit.trackers.resolution import lasting
 
 LEVELS = (1.0 / 16.0, 0.25, 1.0, 4.0, 16.0, 100.0)
 """Noise levels in units of r; the last is the outlier's."""
@@ -67,9 +68,10 @@ def learn_noise(s: State, l: int) -> None:
     """r follows what the ordinary levels leave unexplained, and moves towards the level in use."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     surprise, level = 0.0, 0.0
+    more = lasting(s, l)
     for j in range(J - 1):
         for k in range(K):
-            surprise += s.joint[j, k, l] * (s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - 1.0)
+            surprise += s.joint[j, k, l] * (s.e_k[k, l] * s.e_k[k, l] / (1.0 / s.inverse[j, k, l] - more) - 1.0)
         level += s.nu[j, l] * s.log_level[j, l]
     s.count[l] += 1.0
     step = 1.0 / min(s.count[l] + 1.0, MEMORY)

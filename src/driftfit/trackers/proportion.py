@@ -22,9 +22,10 @@ Source: bounded leverage is Mallows's, see Hampel, Ronchetti, Rousseeuw and Stah
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from driftfit.kernel import State, kernel
+from driftfit.kernel import Array, State, kernel
 
 REACH = 10.0
 """Standard deviations of the readings beyond which one is out of proportion."""
@@ -87,3 +88,9 @@ def bound_leverage(s: State, l: int) -> None:
         square = s.phi[i, l] * s.phi[i, l]
         most = max(most, square / (LEVERAGE * s.c[i, l])) if s.c[i, l] > 0.0 else most
     s.leverage[l] = most
+
+
+def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """What a summary says of it: nothing where all readings were let in."""
+    count = int(lane["left_out"])
+    return (("Left out", f"{count} readings out of all proportion to those before"),) if count else ()

@@ -33,12 +33,15 @@ ENOUGH = 3.0
 ROUNDING = 1e-12
 """A step below this share of the reading is rounding, and the reading a repeated one."""
 
+LONGEST = 4.0
+"""More repeated readings in a row count as so many."""
+
 
 def unresolved() -> dict[str, Any]:
     """Fields before the first reading."""
     return {
         "reading": np.nan, "quantum": np.inf, "smallest": 0.0, "steps": 0.0, "repeats": 0.0, "coarse": 0.0,
-        "fresh": 1.0,
+        "fresh": 1.0, "alike": 0.0,
     }  # fmt: skip
 
 
@@ -57,7 +60,17 @@ def resolve(s: State, l: int) -> None:
     s.reading[l] = y if seen > 0.0 else s.reading[l]
     s.quantum[l], s.smallest[l], s.steps[l], s.repeats[l] = quantum, smallest, steps, repeats
     s.coarse[l] = quantum * quantum / 12.0 if coarse else 0.0
+    s.alike[l] = min(s.alike[l] + 1.0, LONGEST) * repeated if seen > 0.0 else s.alike[l]
     s.fresh[l] = 0.0 if (repeated > 0.0) & (not coarse) else 1.0
+
+
+@kernel
+def lasting(s: State, l: int) -> float:
+    """What a reading that repeats adds to the variance of its noise: k in a row share one error of rounding.
+
+    With coarse (k + 1)^2 in the place of coarse a run of them is worth no more than two readings.
+    """
+    return s.coarse[l] * s.alike[l] * (s.alike[l] + 2.0)  # type: ignore[no-any-return]
 
 
 def resolution(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
