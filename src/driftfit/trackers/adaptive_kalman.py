@@ -26,6 +26,7 @@ levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -35,14 +36,16 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array, State, kernel
 from driftfit.settings import numbers
+from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import enter, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.drift_ladder import filters, mix
-from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation
+from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.filters import enter_filters, innovate, mixture, predict, update_filters, weigh
+from driftfit.trackers.hindsight import NOTED, note, varying
 from driftfit.trackers.noise_levels import any_level, finest, learn_noise, noise_prior
-from driftfit.trackers.proportion import bound_leverage, learn_proportion, leave_out, no_proportion
-from driftfit.trackers.resolution import resolve, unresolved
+from driftfit.trackers.proportion import bound_leverage, learn_proportion, leave_out, no_proportion, proportion
+from driftfit.trackers.resolution import resolution, resolve, unresolved
 
 RESIDUALS = 4
 """Residuals seen before the filters start."""
@@ -89,9 +92,10 @@ def follow(s: State, l: int) -> None:
     bound_leverage(s, l)
     innovate(s, l)
     leave_out(s, l)
-    s.odd[l] = 0.0
+    s.odd[l], s.weighed[l] = 0.0, 0
     entered = s.rank[l] < s.theta.shape[0] and enter_filters(s, l)
     if s.ok[l] > 0.0 and not entered:
+        s.weighed[l] = 1
         weigh(s, l)
         update_filters(s, l)
         learn_noise(s, l)
@@ -158,6 +162,7 @@ class AdaptiveKalman(Tracker):
     groups: Any = None
 
     width: ClassVar[int] = 1
+    noted: ClassVar[tuple[str, ...]] = NOTED
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -183,6 +188,7 @@ class AdaptiveKalman(Tracker):
             "squares": 0.0,
             "count": 0.0,
             "settled": 0,
+            "weighed": 0,
             "gain": np.zeros((n, K)),
             "e_k": np.zeros(K),
             "step": np.zeros(K),
@@ -199,7 +205,33 @@ class AdaptiveKalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin)
+        return TrackerSteps(predict, correct, report, begin, note=note)
+
+    def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
+        return varying(noted, e, time, self.state(model.n))
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         return learned(lane)
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        lane, names = run.end().state, np.array(run.names)
+        never = np.isinf(lane["var"])
+        lately = ~never & ~learned(lane)
+        said = []
+        if never.any():
+            said.append(("Not learned", f"{', '.join(names[never])}: never moved apart from the others; std is inf"))
+        if lately.any():
+            said.append(("Not learned now", f"{', '.join(names[lately])}: the last regressors do not tell"))
+        return (*said, *proportion(lane), *resolution(lane))
+
+    def inspect(self, run: Any) -> None:
+        lane = run.end().state
+        never = np.isinf(lane["var"])
+        if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
+            warnings.warn(
+                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, since the regressors "
+                "never moved apart from the others: std is inf. The other parameters are followed all the same; leave "
+                "out a column that stands still, or that repeats another, to be rid of this.",
+                UserWarning,
+                stacklevel=4,
+            )

@@ -65,6 +65,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
         "rare": 1.0,
+        "leapt": 0.0,
     }
 
 
@@ -113,11 +114,11 @@ def leap(s: State, l: int, noise: float) -> None:
         unit += own * s.phi[i, l] * s.phi[i, l]
     wide = max(v, min(square, most * most * s.spread[l]))
     better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
-    s.rare[l] = RARE if better and unit > 0.0 else 1.0
+    s.rare[l], s.leapt[l] = 1.0, 0.0
     if better and unit > 0.0:
+        s.rare[l], s.leapt[l] = RARE, (wide - v) / unit
         for i in range(s.theta.shape[0]):
-            own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-            own *= (wide - v) / unit
+            own = s.leapt[l] * s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
             s.C[i, i, TOP, l] += own
             s.gain[i, TOP, l] += own * s.phi[i, l]
         s.h[TOP, l] += wide - v

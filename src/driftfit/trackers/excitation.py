@@ -29,15 +29,20 @@ LARGE = 25.0
 """A square above this multiple of the mean square counts as this multiple."""
 
 
+def window(n: int) -> int:
+    """Samples over which G looks."""
+    return max(50, 10 * n)
+
+
 def no_excitation(n: int) -> dict[str, Any]:
-    """Fields before the first sample; the window of G is max(50, 10 n) samples."""
+    """Fields before the first sample."""
     return {
         "seen_samples": 0.0,
         "power": 0.0,
         "c": np.zeros(n),
         "active": np.zeros(n),
         "information": np.zeros((n, n)),
-        "fade": 1.0 - 1.0 / max(50, 10 * n),
+        "fade": 1.0 - 1.0 / window(n),
     }
 
 

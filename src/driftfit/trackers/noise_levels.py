@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import State, exp, kernel
+from driftfit.kernel import Array, State, exp, kernel
 from driftfit.trackers.resolution import lasting
 
 LEVELS = (1.0 / 16.0, 0.25, 1.0, 4.0, 16.0, 100.0)
@@ -41,6 +41,16 @@ def any_level() -> dict[str, Any]:
         "nu_prior": np.zeros(J),
         "odd": 0.0,
     }
+
+
+def level_chain() -> Array:
+    """Transitions of the ordinary levels: stay, or one rung up or down."""
+    K = len(LEVELS) - 1
+    T = STAY * np.eye(K)
+    for j in range(K):
+        for to in (max(j - 1, 0), min(j + 1, K - 1)):
+            T[j, to] += 0.5 * (1.0 - STAY)
+    return T
 
 
 @kernel
