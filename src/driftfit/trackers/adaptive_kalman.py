@@ -6,17 +6,17 @@ drift of one parameter adds to the output per sample, whatever the units. The fi
 modes of a Markov chain and interact (`driftfit.trackers.drift_ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.noise_levels`). For each filter the
-levels are merged at once, which is a rank-one update:
-
-    p_kj   proportional to c_k nu_j N(e_k; 0, s_kj),   s_kj = phi' P_k phi + f_j r
-    a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
-    m_k   <- m_k + g_k a_k e_k,        P_k <- P_k - g_k g_k' (a_k - d_k e_k^2),        g_k = P_k phi
+levels are merged at once, which is a rank-one update (`driftfit.trackers.filters`). Readings out of all proportion are
+left out (`driftfit.trackers.proportion`), and r is not below what coarse readings allow
+(`driftfit.trackers.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
+(`driftfit.trackers.drift_ladder`), or more noise.
 
 Reported are the mean and covariance of the mixture; the one-step variance leaves the outlier level out, so its band is
 one for samples that are not outliers.
 
 Start: exact diffuse least squares without drift until there are a few residuals to tell r from, and the filters start
-from there. Scaling inputs or outputs changes nothing but units. Use it when nothing is known; where q and r are known,
+from there, in the directions that the regressors span by then. Scaling inputs or outputs changes nothing but units.
+Use it when nothing is known; where q and r are known,
 `Kalman` is as good and far cheaper. Two groups of parameters with very different rates are followed at one
 common rate unless ``groups`` says otherwise.
 
@@ -35,8 +35,8 @@ import numpy as np
 
 from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array, State, kernel
-from driftfit.settings import numbers
 from driftfit.models.base import Model
+from driftfit.settings import numbers
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import enter, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.drift_ladder import filters, mix

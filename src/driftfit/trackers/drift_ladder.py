@@ -8,6 +8,10 @@ T moves one rung up or down, and from every rung straight to the top, which is h
 the top straight back to the bottom: mixing the wide covariance of the top filter into the filter without drift costs
 more than all else when nothing moves (measured: 1.8 times the error of least squares instead of 1.15).
 
+The top filter may also *leap*: where a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
+deviations of the output (times patience, `driftfit.trackers.proportion`), explains the sample better by more than a
+factor 1 / RARE, its covariance grows by that move.
+
 Source: Blom and Bar-Shalom (1988); the ladder and its transitions are ours. Cost per sample: O(K^2 n^2) for K modes,
 vectorised over the modes that receive.
 """

@@ -5,8 +5,9 @@
     a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with v_j the noise of level j (`driftfit.trackers.noise_levels`), c and nu the probabilities of filters and levels. Until
-the regressors have spanned all directions the filters are those of an exact diffuse start
+with v_j the noise of level j (`driftfit.trackers.noise_levels`), c and nu the probabilities of filters and levels. An
+outlier's level is as wide as the innovation where that is more than it would be: however far off, its influence does
+not grow. Until the regressors have spanned all directions the filters are those of an exact diffuse start
 (`driftfit.trackers.diffuse`): a regressor outside the span is taken in by all of them, and says nothing about which one
 is right. Cost per sample: O(K n^2 + K J) for K filters and J levels.
 """

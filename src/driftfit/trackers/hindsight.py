@@ -7,8 +7,8 @@ with f_t the probabilities after sample t and T their transitions, of drift mode
 and o_t the probability that sample t was an outlier. A smoother of that walk (`driftfit.smoothers.exact`) gives theta
 from all samples, with drift and noise as they turned out to be. Before the filters start nothing drifts.
 
-Source: the backward pass is Kim's (1994), eq. 2.20; to smooth one walk given its result instead of K, one for each mode,
-is ours.
+Source: the backward pass is Kim's (1994), eq. 2.20; to smooth one walk given its result, in the place of one for each
+mode, is ours.
 """
 
 from __future__ import annotations

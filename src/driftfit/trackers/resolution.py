@@ -4,13 +4,14 @@ Readings of an integer meter, a counter or a converter of few bits are right to 
 residuals are zero although nothing was measured exactly. A noise variance learned from those collapses, and bands and
 likelihood with it. So
 
-    quantum    the least step between two readings in a row, if steps of its size (up to twice it) are a tenth of all
-               steps, and a tenth of the readings repeat the one before
+    quantum    the least step between two readings in a row, if steps of its size (up to one and a half) are a tenth
+               of all steps, and a tenth of the readings repeat the one before
     coarse     quantum^2 / 12, the variance of what rounding takes away; 0 where readings are fine
     fresh      whether a residual tells of the noise: not that of a reading that repeats the one before, as long as
                the quantum is unknown
 
-and no tracker takes its noise variance to be below ``coarse``. Readings of a fine sensor never repeat, and nothing
+and no tracker takes its noise variance to be below ``coarse``. `AdaptiveKalman` also takes readings that repeat for
+what they are, one error of rounding seen again (`lasting`). Readings of a fine sensor never repeat, and nothing
 changes for them. Where they do, at a limit, at 0 while a pump is off, or because a value is held, the other steps are
 of all sizes and the least stands alone.
 
@@ -52,8 +53,8 @@ def resolve(s: State, l: int) -> None:
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
     moved = seen if step > ROUNDING * abs(y) else 0.0
     repeated = seen if step <= ROUNDING * abs(y) else 0.0
-    near = moved if step < 2.0 * quantum else 0.0
-    smallest = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.5 * quantum) else 0.0)
+    near = moved if step < 1.5 * quantum else 0.0
+    smallest = near + (s.smallest[l] if (moved == 0.0) | (step >= 0.75 * quantum) else 0.0)
     quantum = step if (moved > 0.0) & (step < quantum) else quantum
     steps, repeats = s.steps[l] + moved, s.repeats[l] + repeated
     coarse = (smallest >= max(ENOUGH, SHARE * steps)) & (repeats >= max(ENOUGH, SHARE * (steps + repeats)))
