@@ -41,9 +41,8 @@ from driftfit.hypotheses.table import (
 )  # fmt: skip
 from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
-from driftfit.trackers.diffuse import enter, measurement, prediction, spanned_variance
+from driftfit.trackers.diffuse import enter, measurement, spanned_variance
 from driftfit.trackers.excitation import learn_scales
-from driftfit.trackers.proportion import bound_leverage, learn_proportion, leave_out
 from driftfit.trackers.resolution import resolve
 
 
@@ -132,7 +131,7 @@ def among(s: State, l: int) -> None:
 @kernel
 def tell(s: State, l: int) -> None:
     """What the machine is told of this sample."""
-    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l] * s.leverage[l], s.dt[l]
+    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
@@ -142,15 +141,11 @@ def tell(s: State, l: int) -> None:
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     if s.many[SETTLED, l] > 0:
-        if s.wary[l] > 0:
-            bound_leverage(s, l)
-            s.y_hat[l] = prediction(s, l)
-            leave_out(s, l)
         tell(s, l)
         run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
+        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]  # a fault code counts as missing, in lags too
         learn_scales(s, l)
-        learn_proportion(s, l, 0.0)
     else:
         only_drift(s, l)
         measurement(s, l)
@@ -170,11 +165,10 @@ def begin(s: State, l: int) -> None:
 def alone(s: State, l: int, counts: bool) -> None:
     """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
     learn_scales(s, l)
-    learn_proportion(s, l, 0.0)
     if counts:
         learn_start(s, l)
     tell(s, l)
-    s.now[Y_HAT, l] = s.y_hat[l]
+    s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
     s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
     ready = s.rank[l] == s.theta.shape[0] and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
     s.many[SETTLED, l] = READY if ready else WAITING
@@ -198,14 +192,14 @@ def keep(o: State, s: State, l: int) -> None:
 
 @kernel
 def told(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, then factors of the drift of every change."""
+    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
     row = t if known.shape[0] > 1 else 0
     given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
-    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
-    for e in range(H):
-        s.memory[given + e, l] = known[row, 3 + e, l]
+    count, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for k in range(count):
+        s.memory[given + k, l] = known[row, 3 + k, l]
     for i in range(Hd):
-        s.memory[factors + i, l] = known[row, 3 + H + i, l]
+        s.memory[factors + i, l] = known[row, 3 + count + i, l]
 
 
 STEPS = TrackerSteps(nothing, correct, report, begin, keep, told)

@@ -16,9 +16,9 @@ one for samples that are not outliers.
 
 Start: exact diffuse least squares without drift until there are a few residuals to tell r from, and the filters start
 from there, in the directions that the regressors span by then. Scaling inputs or outputs changes nothing but units.
-Use it when nothing is known; where q and r are known,
-`Kalman` is as good and far cheaper. Two groups of parameters with very different rates are followed at one
-common rate unless ``groups`` says otherwise.
+
+Use it when nothing is known; where q and r are known, `Kalman` is as good and far cheaper. Two groups of parameters
+with very different rates are followed at one common rate unless ``groups`` says otherwise.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
 levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels.
@@ -163,6 +163,7 @@ class AdaptiveKalman(Tracker):
 
     width: ClassVar[int] = 1
     noted: ClassVar[tuple[str, ...]] = NOTED
+    adapts: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.groups is not None:
