@@ -12,6 +12,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.result import Track
+from driftfit.segment import segment
 from driftfit.select import grid, select
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
@@ -50,6 +51,7 @@ __all__ = [
     "Track",
     "frontier",
     "grid",
+    "segment",
     "select",
     "track",
     "tune",

@@ -134,8 +134,8 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     least, apart = shortest(n), len(found.breaks) > 0
     L, p = _each(S[ends - 1], null, np.diag(V[-1]))
     _, p_path = _each(path[ends - 1], own, var)
-    p_own = [together(p_path[i], *suprema(path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1], ends, least, apart))
-             for i in range(n)]  # fmt: skip
+    alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
+    p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
     joint, p_mean = _joint(S[ends - 1], null, V[-1])
     p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))

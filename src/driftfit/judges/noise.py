@@ -57,8 +57,14 @@ class Noise(NamedTuple):
     """(p,): a."""
     held: Array
     """(N,): y within three levels of the fit of its segment, or of the nearest one beside a break."""
+    near: Array
+    """(N,): v, or that of the neighbouring segment beside a break where it is smaller."""
     leverage: Array
     """(N,): diagonal of the projector on the white rows of each segment."""
+    white: float
+    """Standard deviation of w, in units of the level."""
+    penalty: float
+    """What a break had to gain, in units of w's variance."""
 
 
 @shared
@@ -211,7 +217,17 @@ class _Search(NamedTuple):
             if np.array_equal(before, breaks):
                 break
         cost = 2.0 * N * np.log(self.size(near, ar)) + len(breaks) * self.price(ar) + len(ar) * np.log(N)
-        return float(cost), Noise(breaks, residual, c, ar, held, leverage)
+        return float(cost), Noise(
+            breaks,
+            residual,
+            c,
+            ar,
+            held,
+            near,
+            leverage,
+            self.size(near, ar) * float(np.median(self.c / c)),
+            self.price(ar),
+        )
 
     def price(self, ar: Array) -> float:
         """The penalty, dearer by the standard error of the logarithm of the noise's long-run variance."""

@@ -27,7 +27,7 @@ from driftfit.kernel import Array, Driver
 def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
     """Q, and 1 - rho when a or b moves by one place; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n)."""
     m, n = S.shape[0] - 1, S.shape[1]
-    M, L, z = np.zeros((n + 1, n + 1)), np.zeros((n, n)), np.zeros(n)
+    M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
     for a in range(m):
         for b in range(a + 1, m + 1):
             for i in range(n):
