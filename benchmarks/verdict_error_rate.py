@@ -11,7 +11,7 @@ a noise deviation in one coefficient, half-way, is found.
 Then faults of a mean in 1000 samples of noise 0.5, beside an input: how many of the records they are found in, and the
 largest p of all, by their size.
 
-Run: python benchmarks/verdict_error_rate.py [records a cell, 300 by default]
+Run: python benchmarks/verdict_error_rate.py [records a cell, 300 by default] [--quick]
 """
 
 import sys
@@ -57,7 +57,7 @@ def record(model: str, kind: str, rng: np.random.Generator, T: int, jump: float)
     return np.column_stack([y[1:-1], y[:-2], drive[1:-1], drive[:-2]]), y[2:]
 
 
-def rates(records: int) -> Table:
+def rates(records: int, lengths: tuple[int, ...]) -> Table:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell, %", width=108)
     heads = ("model", "noise", "T", "joint", "mean square", "break", "stretch", "at 0.1 %", "named", "finds 0.5")
     for head in heads:
@@ -65,7 +65,7 @@ def rates(records: int) -> Table:
     all_rates = []
     for model in ("regression", "arx"):
         for kind in NOISES:
-            for T in (100, 300, 1000):
+            for T in lengths:
                 rng = np.random.default_rng([T, *model.encode(), *kind.encode()])
                 still = [constancy(*record(model, kind, rng, T, 0.0)) for _ in range(records)]
                 moved = [constancy(*record(model, kind, rng, T, 0.5)) for _ in range(records // 4)]
@@ -110,11 +110,14 @@ def faults(records: int) -> Table:
     return table
 
 
-def main(records: int = 300) -> None:
+def main(records: int = 300, lengths: tuple[int, ...] = (100, 300, 1000)) -> None:
     console = Console(width=110)
-    console.print(faults(max(records // 10, 5)))
-    console.print(rates(records))
+    console.print(faults(max(records // 10, 1)))
+    console.print(rates(records, lengths))
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:2]))
+    if "--quick" in sys.argv:
+        main(4, (100,))
+    else:
+        main(*map(int, sys.argv[1:2]))

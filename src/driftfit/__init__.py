@@ -14,6 +14,7 @@ from driftfit.models.regression import Regression
 from driftfit.result import Track
 from driftfit.segment import segment
 from driftfit.select import grid, select
+from driftfit.settings import DataWarning
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
@@ -37,6 +38,7 @@ __all__ = [
     "Bank",
     "Beam",
     "Change",
+    "DataWarning",
     "Decide",
     "ExtendedKalman",
     "FirstFloor",

@@ -21,7 +21,6 @@ their likelihood. Cost: O(T n^2) and at most CELLS^2 / 2 factors of order n + 1.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from io import StringIO
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,7 +37,7 @@ from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.settings import whole
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import Printed, table_of
 from driftfit.track import track
 from driftfit.trackers.rls import RLS
 
@@ -74,7 +73,7 @@ class Segment(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Segmentation:
+class Segmentation(Printed):
     """What `segment` returns; printing it shows it.
 
     Attributes
@@ -107,11 +106,7 @@ class Segmentation:
 
     def summary(self) -> str:
         """The segments as a table, as text."""
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
-
-    __str__ = summary
+        return str(self)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         count = len(self.breaks)
