@@ -1,6 +1,7 @@
 """The scoreboard measures what it says: oracle and peers run the filter they name, scores count what they should."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,24 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track, trackers
 from driftfit.systems import scenarios
-from lab.bench import accuracy, accuracy_page, contestants, oracle, peers, real, scores, speed, speed_page
+from lab.bench import (
+    accuracy,
+    accuracy_page,
+    commands,
+    contestants,
+    oracle,
+    peers,
+    real,
+    scores,
+    speed,
+    speed_page,
+    speed_process,
+)
 from lab.bench.contest import Contest, Finish, Job, hold
 from lab.bench.machine import installed
 from lab.bench.records import Outcome, Record, regressors, simulated
 from lab.bench.speed_peers import Signals
-from lab.bench.speed_process import needed
+from lab.bench.speed_process import Start, needed
 from lab.program import app
 
 RATIO = (1e-3, 0.0)
@@ -202,6 +215,25 @@ def test_pages_of_speed_say_where_we_lose():
     lines = [speed.Finish("t", "", [], []), Finish("title", "", hold(speed.live_kalman(20), 1).lines[:1] * 2)]
     lines[1].lines[1] = lines[1].lines[1]._replace(name="peer", ratio=0.5)
     assert speed_page.losses(lines) == ["* title: peer needs 0.50 of our time."]
+
+
+def test_the_page_of_speed_is_written(tmp_path, monkeypatch):
+    """``bench speed --quick``, with two of its contests, one slope, and no fresh processes."""
+    monkeypatch.setattr(
+        speed, "contests", lambda quick: [hold(make(20), 1) for make in (speed.live_kalman, speed.live_rls)]
+    )
+    name, (_, *rest) = next(iter(speed.GROWTH.items()))
+    monkeypatch.setattr(speed, "GROWTH", {name: ((10, 20, 40), *rest)})
+    monkeypatch.setattr(speed_process, "starts", lambda repeats: ([Start("driftfit", 0.1, 0.2, 1.0, 2.0)], ["absent"]))
+    ran = []
+    monkeypatch.setattr(commands.subprocess, "run", lambda line, **_: ran.append(line) or SimpleNamespace(returncode=0))
+    result = CliRunner().invoke(app, ["bench", "speed", "--quick", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    commands.speed_here(**{"quick": "--quick" in ran[0], "write_to": Path(ran[0][-1])})
+    page = (tmp_path / "scoreboard_speed.md").read_text()
+    assert "Quick form" in page
+    assert page.count("driftfit Live") >= 2
+    assert (tmp_path / "figures" / "scoreboard_speed.png").stat().st_size > 5000
 
 
 def test_slope_is_the_exponent():

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC
 from functools import cached_property
 from os import PathLike
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, Self, cast
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from driftfit.drivers import drivers, output_type
 from driftfit.judges.methods import Judged
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.records import PLAIN, Labels
+from driftfit.records import PLAIN, Labels, time_text
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, fresh_tile
 
@@ -76,6 +74,19 @@ class Track(Judged):
         self.labels = labels
         self._start = start
 
+    def __reduce__(self) -> Any:
+        """A copy, and what is sent to another process, leaves the other series of a fleet's tile behind."""
+        out, tile = self._out, self._tile
+        if tile["theta"].shape[-1] > 1:
+            tile = fresh_tile(self.model, self.tracker)
+            for name in storage.fields(tile):
+                tile[name][0, ..., 0] = self._tile[name][0, ..., self._lane]
+            out = np.empty(len(self), output_type(tile, self.tracker.outputs, "cov" if "P" in _names(out) else "std"))
+            for name in _names(out):
+                out[name][..., 0] = self._written(name)
+        signals = (self.y, self.u, self._time, self._known)
+        return type(self), (self.model, self.tracker, *signals, out, tile, 0, self.labels, self._start)
+
     def _written(self, name: str) -> Array:
         """A field of what the driver wrote, for this lane."""
         field: Array = self._out[name][..., self._lane]
@@ -106,13 +117,7 @@ class Track(Judged):
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
-        time = self.time[t]
-        if not isinstance(time, np.datetime64):
-            return f"{time:g}"
-        text = time.astype("datetime64[us]").item()
-        if self.labels.zone is None:
-            return f"{text:%Y-%m-%d %H:%M:%S}"
-        return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(self.labels.zone)):%Y-%m-%d %H:%M:%S %Z}"
+        return time_text(self.time[t], self.labels.zone)
 
     @property
     def theta(self) -> Array:
@@ -277,11 +282,14 @@ class Track(Judged):
             raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
         return cast("tuple[Array, list[Array]]", convert(self.theta))
 
-    def blocks(self, method: str = "svd-joint", input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+    def blocks(
+        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    ) -> Blocks:
         """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
 
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see `driftfit.blocks.separate`;
-        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`.
+        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`; None is "unit", or
+        "c1" for a tracker that follows the minimal parameters.
         """
         from driftfit.blocks.of_run import blocks_of
 

@@ -45,10 +45,11 @@ def measure(
         y, u = rng.uniform(-3.0, 3.0, (2, samples))
         xi = rng.normal(size=(samples, model.structure.n_x))
         theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
-        parts = empty(model, samples)
+        *groups, quality = empty(model, samples)
+        parts = (model.structure.sizes, model.rise, tuple(groups), quality)
         row = {}
         for place, method in enumerate(METHODS[:3]):
-            row[method] = least(partial(separate, theta, order, place, *parts), samples)
+            row[method] = least(partial(separate, theta, (na, n_out, place), *parts), samples)
         if model.n < 30:
             tracker = Kalman(q=1e-3, r=1.0, p0=1e2)
             row["filter"] = least(partial(track, model, tracker, y, u), samples)

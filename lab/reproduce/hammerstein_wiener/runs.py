@@ -15,7 +15,7 @@ import numpy as np
 from driftfit.blocks.constant import fit_constant, regression
 from driftfit.blocks.free_run import free_run
 from driftfit.blocks.hand_off import hand_off
-from driftfit.blocks.paths import split
+from driftfit.blocks.paths import Groups, minimal, split
 from driftfit.blocks.product_drift import track_products
 from driftfit.blocks.ratios import track_ratios
 from driftfit.kernel import Array
@@ -194,8 +194,8 @@ def misfit(snr_db: float | None, equation_noise: float, seed: int, T: int = 5000
     rng = np.random.default_rng(seed)
     s = simulate(CUBIC, *(START[name] for name in "abcd"), T=T, rng=rng, snr_db=snr_db, equation_noise=equation_noise)
     run = track(CUBIC, Kalman(q=0.0, r=1.0, p0=1e8), s.y, s.u)
-    a, b, c, d, _ = split(CUBIC, run.theta[-1:], "svd-joint")
-    return np.asarray(CUBIC.structure.minimal(a, b, c, d)[0] - s.xi[-1])
+    groups = Groups(*(part[0] for part in split(CUBIC, run.theta[-1:], "svd-joint")[:4]))
+    return np.asarray(minimal(CUBIC, groups) - s.xi[-1])
 
 
 FIXES = ("least squares", "instruments", "instruments, unbiased basis")

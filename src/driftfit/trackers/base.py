@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.settings import Settings
 from driftfit.trackers.each import roots
@@ -53,6 +53,8 @@ class Tracker(Settings, ABC):
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
+    adapts: ClassVar[bool] = False
+    """Whether it finds drift and noise as it goes, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""
     """Which of ``outputs`` has the log density of every sample, given those before it, as its first entry; none: that
     is the Gaussian one of the forecast.
@@ -84,6 +86,10 @@ class Tracker(Settings, ABC):
     def steps_for(self, model: Model) -> TrackerSteps:
         """The steps for a bound model."""
         return self.steps
+
+    def apply_for(self, model: Model) -> Step | None:
+        """The step that takes in an input after its sample (`Model.apply`), for a bound model."""
+        return model.apply
 
     def names_for(self, model: Model) -> tuple[str, ...]:
         """Names of the entries of theta."""

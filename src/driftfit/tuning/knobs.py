@@ -53,10 +53,19 @@ class Knobs:
     names: tuple[str, ...]
     owner: Array
     values: Callable[[Array], Array]
+    origin: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> Any:
+        """Functions cannot be sent to another process; what they were made of can."""
+        return find_knobs, self.origin
 
 
 def find_knobs(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     """The knobs of a tracker for a record; ValueError where it has none."""
+    return replace(_find(record, tracker, groups, bounds), origin=(record, tracker, groups, bounds))
+
+
+def _find(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     missing = missing_settings(tracker)
     if isinstance(tracker, Bank) and groups is None:
         return _changes(tracker, bounds)
