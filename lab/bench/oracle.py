@@ -12,9 +12,8 @@ Written as a plain loop apart from the library, so that it shares no fault with 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver
 from driftfit.models.arx import ARX
 from lab.bench.records import Outcome, Record
 
@@ -39,7 +38,7 @@ def known_walk(y: Array, phi: Array, na: int, q: Array, r: Array) -> Outcome:
     return out
 
 
-@njit(error_model="numpy", cache=True)
+@Driver
 def _loop(
     y: Array, phi: Array, na: int, q: Array, r: Array, theta: Array, P: Array, filled: Array, missing: int,
     thetas: Array, stds: Array, predictions: Array, prediction_stds: Array,
