@@ -222,7 +222,8 @@ def test_the_page_of_speed_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(
         speed, "contests", lambda quick: [hold(make(20), 1) for make in (speed.live_kalman, speed.live_rls)]
     )
-    monkeypatch.setattr(speed, "GROWTH", {"samples": ((10, 20, 40), *speed.GROWTH["samples"][1:])})
+    name, (_, *rest) = next(iter(speed.GROWTH.items()))
+    monkeypatch.setattr(speed, "GROWTH", {name: ((10, 20, 40), *rest)})
     monkeypatch.setattr(speed_process, "starts", lambda repeats: ([Start("driftfit", 0.1, 0.2, 1.0, 2.0)], ["absent"]))
     ran = []
     monkeypatch.setattr(commands.subprocess, "run", lambda line, **_: ran.append(line) or SimpleNamespace(returncode=0))

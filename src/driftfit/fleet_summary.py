@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,6 +62,7 @@ class FleetSummary(Printed):
     failed: dict[Hashable, str]
     dropped: dict[str, int]
     scaled: bool
+    missing: dict[str, int] = field(default_factory=dict)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         samples, used = sum(unit.samples for unit in self.units), sum(unit.used for unit in self.units)
@@ -74,6 +75,8 @@ class FleetSummary(Printed):
         ]
         if self.dropped:
             pairs.append(("Rows left out", counts(self.dropped)))
+        if self.missing:
+            pairs.append(("Taken as missing", counts(self.missing)))
         yield facts(*pairs)
         yield from self._ranking()
         for key, reason in list(self.failed.items())[:SHOWN]:
@@ -112,7 +115,10 @@ def summary_of(
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)
     trackers = tuple(dict.fromkeys(repr(run.tracker) for run in runs))
-    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled)
+    missing: Counter[str] = Counter()
+    for run in runs:
+        missing.update(run.labels.missing)
+    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled, dict(missing))
 
 
 @dataclass(frozen=True)

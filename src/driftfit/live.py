@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numba import types
 
+from driftfit.clock import Clock, Pace, instant
 from driftfit.drivers import INPUTS, drivers, tile_type
+from driftfit.frames import by_name
 from driftfit.kernel import Array
 from driftfit.late import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.live_methods import HELD, ORDINARY, Asked, Operated
 from driftfit.models.base import Model
+from driftfit.restrict import Gate
 from driftfit.roles import check_roles
 from driftfit.settings import whole
-from driftfit.signals import as_numbers, check_ready, factor, interval_of, noise_of
+from driftfit.signals import as_numbers, check_ready, factor, noise_of
 from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.storage import Kept, describe, fields, rebuild, restore
 from driftfit.trackers.base import Tracker
@@ -46,12 +49,14 @@ class Live(Operated, Asked, Kept):
     ----------
     model, tracker : Model, Tracker
         As for `track`. A model with several inputs must say so: ``ARX(2, [1, 1])``, ``inputs=["pressure", "flow"]``.
-    dt : number or timedelta
-        Nominal interval between samples in the unit of ``time``; with datetimes it must be given.
+    dt : number, duration, step of the calendar or "label"
+        Nominal interval between samples, as for `track`; with datetimes it must be given.
     lag : int
         Keep the last ``lag`` samples for `smooth`; 0 keeps none.
     warm_start : Track, Live or None
         Begin where that run ended.
+    limits : mapping from signals to (low, high)
+        Valid ranges as for `track`: a number outside is missing, and counted in ``outside``.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
@@ -69,11 +74,15 @@ class Live(Operated, Asked, Kept):
         return LiveOutputs(model, *args, **kwargs)
 
     def __init__(
-        self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0, warm_start: Run | None = None
-    ) -> None:
+        self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
+        limits: Mapping[Any, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.model = model.bind(model.m)
         self.tracker = check_ready(tracker)
-        self.dt = dt
+        self._clock = Clock.of(dt)
+        self.dt = self._clock.plain
+        self._pace = Pace(self._clock, self.model.reach)
+        self._gate = Gate(limits, self.model.outputs, self.model.input_names, self.model.m) if limits else None
         before = None if warm_start is None else warm_start.end()
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
@@ -106,7 +115,8 @@ class Live(Operated, Asked, Kept):
 
     def _be_careful(self) -> None:
         """Whether a sample is more than a call of the compiled step."""
-        self._careful = self._window is not None or bool(self._alarms) or self._awaits != NOTHING
+        more = self._window, self._gate
+        self._careful = more != (None, None) or bool(self._alarms) or self._awaits != NOTHING
 
     def update(
         self,
@@ -120,12 +130,12 @@ class Live(Operated, Asked, Kept):
         """Take one sample in and return (y_hat, e, s, ok).
 
         ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
-        otherwise, None where it is not known. Left out it comes with `apply`, before the next sample; ValueError for a
-        model that has inputs and needs them at once. With ``time``, the interval since the last sample scales the
-        drift; a time that is not after the last is counted in ``ignored`` and leaves the state alone. ``weight``
-        divides the noise variance of this sample (0: do not use it), ``drift`` multiplies the drift before it: one
-        number, or one for each parameter (random-walk trackers) or change (`Bank`). A `Bank` also takes ``prob``,
-        prior probabilities of its changes or joint events at this sample.
+        otherwise, or a mapping from the names of the inputs; None where it is not known. Left out it comes with
+        `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
+        the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
+        and leaves the state alone. ``weight`` divides the noise variance of this sample (0: do not use it), ``drift``
+        multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change (`Bank`).
+        A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
@@ -158,18 +168,23 @@ class Live(Operated, Asked, Kept):
         later = u is LATER and self._m > 0
         if later:
             self._placing()
-        interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
-        if not interval > 0.0:
+        if time is not None:
+            self._clock, time = self._clock.at(time), instant(time)
+        interval = 1.0 if time is None else self._clock.since(self._last, time)
+        if not interval >= 0.0:
             self._ignored += 1
             self._expect(IGNORED if later else NOTHING)
             return (np.nan, np.nan, np.nan, False)
         known = (float(interval), float(noise_of(weight)), float(factor("drift", drift)))
-        u = self._inputs(u)
+        y, u = float(as_numbers("y", y)), self._inputs(u)
+        if self._gate is not None:
+            (y,), u = self._gate.sample(np.array([y]), u)
         if time is not None:
             self._last = time
+            self._pace.see(interval)
         known = HELD if self.held else known
         self._rest(known)
-        step: Step = self._update(self._tile, float(as_numbers("y", y)), u)
+        step: Step = self._update(self._tile, float(y), u)
         if known is not HELD:
             self._rest(ORDINARY)
         if self._window is not None:
@@ -216,6 +231,8 @@ class Live(Operated, Asked, Kept):
         check_expected(self._awaits)
         given = self._inputs(u)
         if self._awaits == INPUT:
+            if self._gate is not None:
+                _, given = self._gate.sample(np.array([np.nan]), given)
             self._placing()(self._tile, given)
         self._expect(NOTHING)
 
@@ -230,9 +247,10 @@ class Live(Operated, Asked, Kept):
         While `apply` is outstanding ``u`` stands for what it would bring, so that candidates can be compared.
         """
         self._scratch_bytes[:] = self._bytes  # a record copied field by field takes ten times as long
+        inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         if self._awaits == INPUT:
-            self._placing()(self._scratch, self._inputs(u))
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, self._inputs(u))
+            self._placing()(self._scratch, inputs)
+        y_hat, _, s, _ = self._update(self._scratch, np.nan, inputs)
         return y_hat, s
 
     def smooth(self) -> FixedLag:
@@ -257,7 +275,7 @@ class Live(Operated, Asked, Kept):
         """u as floats (m,)."""
         if u is None or u is LATER:
             return self._unknown
-        given: Array = np.asarray(u, dtype=np.float64)
+        given: Array = np.asarray(by_name(self.model, u), dtype=np.float64)
         if given.shape != self._shape:
             if given.size != self._m:
                 raise ValueError(f"Live.update: the model has {self._m} inputs, but u has shape {given.shape}.")
@@ -291,10 +309,16 @@ class Live(Operated, Asked, Kept):
         """Samples that came with a time not after the last."""
         return self._ignored
 
+    @property
+    def outside(self) -> dict[str, int]:
+        """How many numbers of each signal were outside its limits."""
+        return {} if self._gate is None else self._gate.counts
+
     def _plain(self) -> dict[str, Any]:
         """The state beside the fields of the record, as plain data."""
         return {
-            "dt": self.dt, "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
+            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
+            "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
             "cold": self._cold, "window": None if self._window is None else self._window.plain(),
             "alarms": [alarm.plain() for alarm in self._alarms],
         }  # fmt: skip
@@ -317,7 +341,10 @@ class Live(Operated, Asked, Kept):
         cls, source: str, model: Model, tracker: Tracker, extra: Mapping[str, Any], arrays: Mapping[str, Array]
     ) -> Self:
         """The stream from its state."""
-        live = cls(model, tracker, dt=extra["dt"], lag=extra["lag"])
+        limits, outside = extra["limits"] or ([], [])
+        live = cls(model, tracker, dt=Clock.of(extra["dt"], extra["zone"]), lag=extra["lag"], limits=dict(limits))
+        if live._gate is not None:
+            live._gate.restore(outside)
         if live._window is not None:
             live._window.restore(extra["window"])
         live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra.get("cold", True)

@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from driftfit import storage
+from driftfit.clock import Clock, Pace, instant
 from driftfit.drivers import drivers, output_type
+from driftfit.frames import by_name, order_of
 from driftfit.joint import end_of, joint_tile, taken_over, trackers_of
 from driftfit.kernel import Array
 from driftfit.late import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.restrict import Gate
 from driftfit.settings import whole
 from driftfit.shared_outputs import row_model
-from driftfit.signals import as_numbers, factor, interval_of, noise_of
+from driftfit.signals import as_numbers, factor, noise_of
 from driftfit.smoothers.fixed_lag import FixedLag, Window
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, Run
@@ -41,10 +44,15 @@ class LiveOutputs(storage.Kept):
 
     _kind: ClassVar[str] = "outputs"
 
-    def __init__(self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None) -> None:
+    def __init__(
+        self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
+        limits: Mapping[Any, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.model = model if model.shared else model.bind(model.m)
         self.trackers = trackers_of(self.model, tracker)
-        self.dt = dt
+        self._clock = Clock.of(dt)
+        self.dt = self._clock.plain
+        self._pace = Pace(self._clock, model.reach)
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
@@ -56,6 +64,7 @@ class LiveOutputs(storage.Kept):
         self._alarms: dict[str, LiveAlarm] = {}
         self._place: Any = None
         self._rows = row_model(self.model, self.trackers[0]) if self.model.shared else self.model
+        self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self._tile = joint_tile(self._rows, self.trackers, taken_over(warm_start, self._rows, self.trackers))
         self._out = np.empty(1, output_type(self._tile, self.trackers[0].outputs))
         self._run = drivers(self._rows.steps, self.trackers[0].steps_for(self._rows)).run
@@ -65,39 +74,68 @@ class LiveOutputs(storage.Kept):
     def update(self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
         """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
 
-        u is None where it is not known; left out it comes with `apply`, as in `Live.update`.
+        u is None where it is not known; left out it comes with `apply`, as in `Live.update`. y may map the names of the
+        outputs, and u those of the inputs of a model that has them, to numbers.
         """
         ny = len(self.model.outputs)
         check_applied(self._awaits)
         later = u is LATER and self._rows.m > 0
         if later:
             self._placing()
-        interval = 1.0 if time is None else interval_of(self._last, time, self.dt)
-        if not interval > 0.0:
+        if time is not None:
+            self._clock, time = self._clock.at(time), instant(time)
+        interval = 1.0 if time is None else self._clock.since(self._last, time)
+        if not interval >= 0.0:
             self._ignored += 1
             self._awaits = IGNORED if later else NOTHING
             nothing = np.full(ny, np.nan)
             return nothing, nothing, nothing, np.zeros(ny, bool)
         known = self._known(interval, weight, drift)
-        step = self._step(self._tile, as_numbers("y", y), None if u is LATER else u, known, self._windows)
-        self._last = self._last if time is None else time
+        output, inputs = self._outputs(y), self._inputs(None if u is LATER else u)
+        if self._gate is not None:
+            output, inputs = self._gate.sample(output, inputs)
+        step = self._step(self._tile, output, inputs, known, self._windows)
+        if time is not None:
+            self._last = time
+            self._pace.see(interval)
         for name, alarm in self._alarms.items():
             lane = self.model.outputs.index(name)
             alarm.take(self._tile, lane, step[1][lane], step[2][lane], time)
         self._awaits = INPUT if later else NOTHING
         return step
 
+    def _outputs(self, y: Any) -> Array:
+        """y as floats (ny,)."""
+        outputs = self.model.outputs
+        if hasattr(y, "keys"):
+            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
+            y = [y[name] for name in outputs]
+        given = as_numbers("y", y)
+        if given.shape != (len(outputs),):
+            raise ValueError(f"Live.update: y must be ({len(outputs)},); got shape {given.shape}.")
+        return given
+
+    def _inputs(self, u: Any) -> Array:
+        """u as floats (m,), or (ny, m) where the outputs share one theta."""
+        shape = (len(self.model.outputs), self._rows.m) if self.model.shared else (self._rows.m,)
+        if u is None:
+            return np.full(shape, np.nan)
+        given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
+        if given.size != np.prod(shape):
+            raise ValueError(f"Live.update: u must have shape {shape}; got shape {given.shape}.")
+        return given.reshape(shape)
+
     def apply(self, u: Any) -> None:
         """Give the inputs (m,) of the last sample once they have been chosen; see `Live.apply`."""
         check_expected(self._awaits)
-        self._apply(self._tile, u)
+        inputs = self._inputs(u)
+        if self._gate is not None and self._awaits == INPUT:
+            _, inputs = self._gate.sample(np.full(len(self.model.outputs), np.nan), inputs)
+        self._apply(self._tile, inputs)
         self._awaits = NOTHING
 
-    def _apply(self, tile: Array, u: Any) -> None:
+    def _apply(self, tile: Array, inputs: Array) -> None:
         """What is outstanding, put in its place in a tile."""
-        inputs = np.full(self._rows.m, np.nan) if u is None else as_numbers("u", u).reshape(-1)
-        if inputs.shape != (self._rows.m,):
-            raise ValueError(f"Live.apply: u must have shape ({self._rows.m},); got shape {np.shape(u)}.")
         if self._awaits == INPUT:
             self._placing()(tile, inputs)
 
@@ -130,9 +168,10 @@ class LiveOutputs(storage.Kept):
         While `apply` is outstanding u stands for what it would bring.
         """
         missing, tile = np.full(len(self.model.outputs), np.nan), self._tile.copy()
+        inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         if self.awaits:
-            self._apply(tile, u)
-        y_hat, _, s, _ = self._step(tile, missing, u, self._known(), [])
+            self._apply(tile, inputs)
+        y_hat, _, s, _ = self._step(tile, missing, inputs, self._known(), [])
         return y_hat, s
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
@@ -172,27 +211,21 @@ class LiveOutputs(storage.Kept):
 
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample pass whose outputs go to the lags and are not used."""
-        self._step(self._tile, y, u, self._known(weight=0.0), [])
+        self._step(self._tile, y, self._inputs(u), self._known(weight=0.0), [])
 
-    def _step(self, tile: Array, y: Array, u: Any, known: Array, windows: list[Window]) -> Steps:
+    def _step(self, tile: Array, y: Array, u: Array, known: Array, windows: list[Window]) -> Steps:
         """One call of the driver, or one for each row of the instant."""
         ny, m = len(self.model.outputs), self._rows.m
-        if y.shape != (ny,):
-            raise ValueError(f"Live.update: y must be ({ny},); got shape {y.shape}.")
-        shape = (ny, m) if self.model.shared else (m,)
-        inputs = np.full(shape, np.nan) if u is None else as_numbers("u", u).reshape(-1)
-        if inputs.size != (ny * m if self.model.shared else m):
-            raise ValueError(f"Live.update: u must have shape {shape}; got shape {np.shape(u)}.")
         said = []
         if self.model.shared:
-            for j, row in enumerate(inputs.reshape(ny, m)):
+            for j, row in enumerate(u):
                 same = known[None, :, j : j + 1].copy()
                 same[0, 0] *= j == 0
                 self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
                 said.append(self._said())
                 self._push(tile, same[0], windows)
         else:
-            self._run(tile, y[None], np.repeat(inputs.reshape(1, m, 1), ny, axis=2), known[None], self._out)
+            self._run(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
             said.append(self._said())
             self._push(tile, known, windows)
         self._rest(tile)
@@ -233,6 +266,12 @@ class LiveOutputs(storage.Kept):
         return theta[0] if self.model.shared else theta
 
     @property
+    def regressors(self) -> Array:
+        """Those of the last sample, (n,)."""
+        phi: Array = self._tile["phi"][0, :, 0].copy()
+        return phi
+
+    @property
     def cov(self) -> Array:
         """Covariance of theta, (ny, n, n), or (n, n) where the outputs share one theta."""
         lanes = range(self._tile["theta"].shape[-1])
@@ -256,13 +295,19 @@ class LiveOutputs(storage.Kept):
         """Samples that came with a time not after the last."""
         return self._ignored
 
+    @property
+    def outside(self) -> dict[str, int]:
+        """How many numbers of each signal were outside its limits."""
+        return {} if self._gate is None else self._gate.counts
+
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
         return end_of(self._rows, self.trackers, self._tile, self._last)._replace(awaits=self._awaits)
 
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         extra = {
-            "dt": self.dt, "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
+            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
+            "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
             "cold": self._cold, "windows": [window.plain() for window in self._windows],
             "alarms": {name: alarm.plain() for name, alarm in self._alarms.items()},
         }  # fmt: skip
@@ -286,7 +331,10 @@ class LiveOutputs(storage.Kept):
     ) -> Self:  # fmt: skip
         """The stream from its state."""
         tracker = trackers[0] if model.shared else dict(zip(model.outputs, trackers, strict=True))
-        live = cls(model, tracker, extra["dt"], extra["lag"])
+        limits, outside = extra["limits"] or ([], [])
+        live = cls(model, tracker, Clock.of(extra["dt"], extra["zone"]), extra["lag"], limits=dict(limits))
+        if live._gate is not None:
+            live._gate.restore(outside)
         live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra.get("cold", True)
         live._awaits = extra.get("awaits", NOTHING)
         for window, state in zip(live._windows, extra["windows"], strict=True):

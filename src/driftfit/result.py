@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC
 from functools import cached_property
 from os import PathLike
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, Self, cast
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from driftfit.drivers import drivers, output_type
 from driftfit.judges.methods import Judged
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.records import PLAIN, Labels
+from driftfit.records import PLAIN, Labels, time_text
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, fresh_tile
 
@@ -119,13 +117,7 @@ class Track(Judged):
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
-        time = self.time[t]
-        if not isinstance(time, np.datetime64):
-            return f"{time:g}"
-        text = time.astype("datetime64[us]").item()
-        if self.labels.zone is None:
-            return f"{text:%Y-%m-%d %H:%M:%S}"
-        return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(self.labels.zone)):%Y-%m-%d %H:%M:%S %Z}"
+        return time_text(self.time[t], self.labels.zone)
 
     @property
     def theta(self) -> Array:

@@ -32,15 +32,15 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.drivers import known_factors
 from driftfit.judges.paired import newey_west
 from driftfit.judges.structures import Pool, Predicted, Structure, pool_of
 from driftfit.judges.subsets import subsets
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.records import Reading, one_series
 from driftfit.roles import check_roles
-from driftfit.signals import as_inputs, as_output, check_ready, factor, intervals, noise_of
+from driftfit.signals import check_ready, factor
 from driftfit.summary import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -194,6 +194,8 @@ def select(
     dt: Any = None,
     weights: Any = 1.0,
     drift: Any = 1.0,
+    limits: Any = None,
+    exclude: Any = None,
 ) -> Selection:
     """Compare structures by predictive likelihood.
 
@@ -201,8 +203,8 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or the model whose regressors are to be chosen, at most 30.
-    y, u, time, dt, weights, drift
-        As for `track`.
+    y, u, time, dt, weights, drift, limits, exclude
+        As for `track`; one number or (T,) for drift.
     tracker : Tracker
         How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
         parameters: one q, not a vector.
@@ -224,19 +226,20 @@ def select(
     check_ready(tracker)
     if not tracker.covariance:
         raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
-    output = as_output(y)
-    T = len(output)
-    inputs = as_inputs(u, T)
-    gaps = 1.0 if time is None else intervals(time, dt, T)[1]
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
-    bound = [_bound(model, inputs.shape[1]) for model in candidates]
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    records = one_series(y, u, reading)
+    factor("drift", drift, len(records.y))
+    named = max(candidates, key=lambda model: len(model.input_names))
+    records = records.for_model(named, reading, max(model.reach for model in candidates))
+    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     if any(len(model.outputs) > 1 for model in bound):
         raise ValueError("select: structures are compared for one output at a time.")
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
-    pool, structures = pool_of(bound, [repr(model) for model in candidates], output, inputs, known)
+    names = [repr(model) for model in candidates]
+    pool, structures = pool_of(bound, names, records.y, records.u, records.known)
     if isinstance(models, Model):
         structures, predictions = subsets(pool, tracker, structures[0], keep, most)
     else:
@@ -244,11 +247,16 @@ def select(
     return _judged(pool, tracker, structures, predictions)
 
 
-def _bound(model: Model, m: int) -> Model:
-    """A candidate for m inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
+    """A candidate for these inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+    m = inputs if isinstance(inputs, int) else len(inputs)
     if isinstance(model, ARX) and model.inputs == 0 and m > 0:
         model = replace(model, inputs=m)
-    return model.bind(m)
+    if not isinstance(inputs, int) and model.input_names not in ((), tuple(inputs)):
+        raise ValueError(
+            f"select: candidates name the same inputs in the same order; {model!r} has others than {', '.join(inputs)}."
+        )
+    return model.bind(inputs)
 
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.drivers import LARGEST
+from driftfit.frames import inputs_for
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX, GAP
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.settings import whole
-from driftfit.signals import as_inputs
 from driftfit.system import covariances, taken
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
         If u does not fit the model, or the model cannot be run forward.
     """
     h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
-    inputs = as_inputs(u, h)
+    inputs = inputs_for(run.model, u, h)
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
     given = np.zeros(0) if y is None else np.asarray(y, float)

@@ -125,7 +125,7 @@ def summarise(run: Track) -> Summary:
     tracker = shortened(repr(run.tracker))
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
+        _signals(run), _span(run), counts(run.labels.dropped), (*_missing(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -136,6 +136,11 @@ def _signals(run: Track) -> str:
         return ""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
+
+
+def _missing(run: Track) -> tuple[tuple[str, str], ...]:
+    """What was taken as missing though a number stood there."""
+    return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
 
 
 def _span(run: Track) -> str:

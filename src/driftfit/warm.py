@@ -12,10 +12,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.clock import Clock, instant
 from driftfit.drivers import make_tile
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.signals import interval_of
+from driftfit.records import Labels
 from driftfit.trackers.base import Tracker
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
@@ -69,12 +70,12 @@ def _same(one: Any, other: Any) -> bool:
     return np.shape(one) == np.shape(other) and bool(np.all(np.equal(one, other) | (np.not_equal(one, one))))
 
 
-def first_interval(run: Run, time: Any, dt: Any) -> float:
+def first_interval(run: Run, time: Any, labels: Labels) -> float:
     """Nominal intervals from the end of a run to the first sample of the next; 1 where either knows no time."""
     last = run.end().last
     if last is None or time is None:
         return 1.0
-    interval = interval_of(last, time, dt)
-    if not interval > 0.0:
+    interval = Clock.of(labels.dt, labels.zone).since(instant(last), instant(time))
+    if not interval >= 0.0:
         raise ValueError(f"warm_start: the record begins at {time}, not after the end of the run before, {last}.")
     return interval

@@ -12,7 +12,6 @@ from driftfit.hypotheses.memory import SINGLE
 from driftfit.hypotheses.mixture import Mixture, mixture_of
 from driftfit.hypotheses.table import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
 from driftfit.kernel import Array
-from driftfit.signals import nominal
 
 if TYPE_CHECKING:
     from driftfit.live import Live
@@ -67,4 +66,5 @@ class LiveHypotheses:
         if last is None:
             return sample
         back = float(lane["now"][ELAPSED] - ring[sample % len(ring), 2])
-        return last - back * nominal(last, self._live.dt)
+        time = self._live._clock.moved(last, np.array([-back]))
+        return sample if time is None else time[0]

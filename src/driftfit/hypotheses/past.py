@@ -17,8 +17,10 @@ from driftfit.kernel import Array, core, kernel, part
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:
-    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors."""
-    news = np.zeros((H + 2, width))
+    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
+    is what an eight may reach into.
+    """
+    news = np.zeros((H + 3, width))
     news[range(H), range(H)] = 1.0
     news[:Hm, H] = 1.0
     news[H:] = 1.0

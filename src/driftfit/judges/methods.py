@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from driftfit.crossing import Crossing
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
     from driftfit.judges.alarm_rule import AlarmRule
@@ -102,6 +103,21 @@ class Judged:
         from driftfit.simulate import simulate
 
         return simulate(cast("Track", self), u, at, y)
+
+    def crossing(
+        self,
+        what: str,
+        *,
+        below: float | None = None,
+        above: float | None = None,
+        horizon: int | None = None,
+        u: Any = None,
+        level: float = 0.9,
+    ) -> Crossing:
+        """When a parameter or the output crosses a limit after the record, with an interval; `driftfit.crossing`."""
+        from driftfit.crossing import crossing
+
+        return crossing(cast("Track", self), what, below=below, above=above, horizon=horizon, u=u, level=level)
 
     def poles(self, at: Any = None) -> Array:
         """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.system`."""

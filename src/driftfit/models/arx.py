@@ -130,6 +130,10 @@ class ARX(Model):
         return self._count
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.inputs if isinstance(self.inputs, tuple) else ()
+
+    @property
     def lags(self) -> tuple[tuple[int, int], ...]:
         """(nb, nk) of every input."""
         nb = self.nb if isinstance(self.nb, tuple) else (self.nb,) * self.m

@@ -35,6 +35,11 @@ class Model(Settings, ABC):
         """Names of the parameters, in the order of theta."""
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs in their order, by which signals with names are matched; empty where they have none."""
+        return ()
+
+    @property
     def dimensions(self) -> tuple[tuple[int, int | None], ...] | None:
         """For every parameter (p, j): its unit is that of y to the power p, over that of input j (None: over nothing).
 

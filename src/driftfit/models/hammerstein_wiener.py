@@ -168,6 +168,10 @@ class HammersteinWiener(Model):
         return value if several(value) else (value,) * self.m
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        return () if self.name is None else (self.name,) if isinstance(self.name, str) else tuple(self.name)
+
+    @property
     def into(self) -> Basis:
         """Functions of the input block; ValueError where there are several inputs."""
         if self.m > 1:
