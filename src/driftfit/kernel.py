@@ -343,11 +343,15 @@ class Driver:
         self._entries = {key: one for key, one in self._entries.items() if one is not found}
 
 
+LAYOUT = 0x0001 | 0x0002 | 0x0100
+"""NumPy's flags of what the compiler's type of an array knows: rows contiguous, columns contiguous, aligned."""
+
+
 def _kind(value: Any) -> Any:
     """What the type of an argument depends on."""
     if not isinstance(value, np.ndarray):
         return type(value)
-    return value.dtype, value.ndim, value.flags.c_contiguous, value.flags.f_contiguous, value.flags.aligned
+    return value.dtype, value.ndim, value.flags.num & LAYOUT
 
 
 def _type(value: Any) -> types.Type:

@@ -23,8 +23,8 @@ from numba import njit
 from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher, cpu_target
 
-KEPT = 400
-"""Functions whose code is kept for drivers to come; a driver takes in some twenty, a bank some hundred and fifty."""
+KEPT = 100
+"""Functions whose code is kept for drivers to come, of some 0.3 MB each; a driver takes in some twenty."""
 
 # llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were
 # three fifths of all memory that a compilation left behind.
