@@ -103,10 +103,11 @@ class TrackerSteps(NamedTuple):
 
     ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.rank < n``, for trackers that
-    start from no knowledge at all. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
+    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that
+    start from no knowledge at all (`driftfit.trackers.diffuse`). ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
     name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a
     sample beside interval, noise and drift from the columns of ``known`` after the third, where there are some.
+    ``machines`` are what they call by symbol.
     """
 
     predict: Step
@@ -115,6 +116,7 @@ class TrackerSteps(NamedTuple):
     begin: Step | None = None
     store: Any = nothing_more
     told: Any = nothing_told
+    machines: tuple[Any, ...] = ()
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -201,7 +203,7 @@ class Drivers(NamedTuple):
 
 
 def _advance(tracker: TrackerSteps) -> Any:
-    """predict, correct, report for all lanes of a tile; lanes that still know nothing take ``begin`` instead."""
+    """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
     predict, correct, report, begin, *_ = tracker
 
     @kernel
@@ -217,9 +219,8 @@ def _advance(tracker: TrackerSteps) -> Any:
 
     @routine
     def start(s: State) -> None:
-        n, L = s.theta.shape
-        for l in range(L):
-            if s.rank[l] < n:
+        for l in range(s.theta.shape[1]):
+            if s.root[l] > 0:
                 begin(s, l)
             else:
                 predict(s, l)
@@ -228,11 +229,10 @@ def _advance(tracker: TrackerSteps) -> Any:
 
     @kernel
     def advance_or_start(s: State) -> None:
-        n, L = s.theta.shape
-        lowest = n
-        for l in range(L):
-            lowest = min(lowest, s.rank[l])
-        if lowest < n:
+        some = 0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.root[l])
+        if some > 0:
             start(s)
         else:
             advance(s)
@@ -251,6 +251,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """
     regress, push, ready = model
     ready(1)
+    for machine in tracker.machines:
+        machine.load()
     told = tracker.told
     store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
     advance = _advance(tracker)

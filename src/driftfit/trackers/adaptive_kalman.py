@@ -36,7 +36,7 @@ from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array, State, exp, kernel
 from driftfit.settings import numbers
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import enter, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.diffuse import MACHINES, enter, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.drift_ladder import filters, mix
 from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation
 from driftfit.trackers.noise_levels import FINEST, OUTLIER, any_level, learn_noise, noise_prior
@@ -290,7 +290,7 @@ class AdaptiveKalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin)
+        return TrackerSteps(predict, correct, report, begin, machines=MACHINES)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         return learned(lane)
