@@ -30,8 +30,12 @@ from driftfit.kernel import Array, Driver, State, Step, kernel, routine
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
-LARGEST = 1e100
-"""Signals at least this large cannot be used: their squares, and products of those with a covariance, overflow."""
+LARGEST = 1e38
+"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+
+SMALLEST = 1e-38
+"""Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
+regressor, a covariance that earlier regressors left, and an innovation overflows."""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -64,11 +68,11 @@ def clean(s: State, l: int) -> None:
     for i in range(s.phi.shape[0]):
         x = s.phi[i, l]
         finite = abs(x) < LARGEST
-        s.phi[i, l] = x if finite else 0.0
+        s.phi[i, l] = x if finite & (abs(x) > SMALLEST) else 0.0
         valid = valid if finite else 0.0
     y, noise = s.y[l], s.noise[l]
     finite = abs(y) < LARGEST
-    s.y[l] = y if finite else 0.0
+    s.y[l] = y if finite & (abs(y) > SMALLEST) else 0.0
     s.valid[l] = valid
     s.seen[l] = 1.0 if finite else 0.0
     s.ok[l] = valid if finite & (noise < np.inf) else 0.0
@@ -103,11 +107,11 @@ class TrackerSteps(NamedTuple):
 
     ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that
-    start from no knowledge at all (`driftfit.trackers.diffuse`). ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
-    name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a
-    sample beside interval, noise and drift from the columns of ``known`` after the third, where there are some.
-    ``machines`` are what they call by symbol.
+    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
+    that start from no knowledge at all (`driftfit.trackers.diffuse`), and ``machines`` are what it calls by symbol.
+    ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to
+    the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval, noise and
+    drift from the columns of ``known`` after the third, where there are some.
     """
 
     predict: Step

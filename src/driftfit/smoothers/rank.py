@@ -50,8 +50,10 @@ def compiled_ranks() -> Any:
         for t in range(phi.shape[0]):
             if weight[t] > 0.0 and known < n:
                 for i in range(n):
-                    scaled[i] = work[row, i] = phi[t, i] / scale[i]
-                entering, _ = outside(scaled, S, R, work)
+                    scaled[i] = phi[t, i] / scale[i]
+                entering, _, _ = outside(scaled, S, work)
+                for i in range(n):
+                    work[row, i] = scaled[i]
                 turn_in(S, values, work[row], 0.0, entering)
                 refresh(S, R, work)
                 known += 1 if entering >= 0 else 0

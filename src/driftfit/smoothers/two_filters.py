@@ -101,7 +101,7 @@ def start(walk: Walk, scale: Array, unseen: Array) -> Start:
 
 
 def unspanned(unseen: Array, scale: Array) -> Array:
-    """Orthonormal basis, in rows, of the theta that regressors do not see; divided by ``scale`` they do not ``unseen``."""
+    """Orthonormal basis, in rows, of the theta that regressors do not see, from such vectors for scaled regressors."""
     basis: Array = np.linalg.qr(unseen / scale[:, None])[0].T
     return basis
 

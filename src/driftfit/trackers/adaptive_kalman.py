@@ -36,7 +36,7 @@ from driftfit.drivers import TrackerSteps
 from driftfit.kernel import Array, State, exp, kernel
 from driftfit.settings import numbers
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import MACHINES, enter, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.diffuse import ALMOST_ANY, LEFT, MACHINES, enter, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.drift_ladder import filters, mix
 from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation
 from driftfit.trackers.noise_levels import FINEST, OUTLIER, any_level, learn_noise, noise_prior
@@ -148,9 +148,12 @@ def update_filters(s: State, l: int) -> None:
     for i in range(n):
         for k in range(K):
             s.m[i, k, l] += s.gain[i, k, l] * s.step[k, l]
-        for j in range(i + 1):
+        for j in range(i):
             for k in range(K):
                 s.C[i, j, k, l] -= s.h[k, l] * s.gain[i, k, l] * s.gain[j, k, l]
+        for k in range(K):
+            left = s.C[i, i, k, l] - s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
+            s.C[i, i, k, l] = max(left, LEFT * s.C[i, i, k, l])
 
 
 @kernel
@@ -282,7 +285,7 @@ class AdaptiveKalman(Tracker):
             "h": np.zeros(K),
             "inverse": np.zeros((J, K)),
             "joint": np.zeros((J, K)),
-            **knowing_nothing(n),
+            **knowing_nothing(n, ALMOST_ANY),
             **no_excitation(n),
             **modes,
             **levels,

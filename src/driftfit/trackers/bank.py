@@ -53,7 +53,7 @@ from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import knowing, knowing_nothing
+from driftfit.trackers.diffuse import ALMOST_ANY, knowing, knowing_nothing
 from driftfit.trackers.information import triangular_root
 
 
@@ -254,7 +254,7 @@ class Bank(Tracker):
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+            **(knowing_nothing(n, ALMOST_ANY) if self.p0 is None else knowing(n)),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip

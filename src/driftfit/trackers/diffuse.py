@@ -12,10 +12,9 @@ is free no more, and the share in the diffuse log-likelihood is -1/2 log F, F = 
 det(N' N), N the matrix of these vectors: the limit of s / kappa for P0 = kappa I.
 
 Rotations treat each column in its own unit: multiplying one by a power of 2 changes nothing but the exponents. So does
-the rank, as u_j counts as 0 only where rounding explains it, to `ROUNDING` of the terms that it is the sum of and of
-the errors of R, |S^-1 row i| |S column j|. Of what is not spanned, theta keeps what it was: with isotropic q it is the
-answer nearest to theta0. With other q the exact limit may move theta in directions that nothing was seen of; here it
-stays.
+the rank, as u_j counts as 0 only where rounding explains it. Of what is not spanned, theta keeps what it was: with
+isotropic q it is the answer nearest to theta0. With other q the exact limit may move theta in directions that nothing
+was seen of; here it stays.
 
 The filter goes on with theta and P where variance inflation P_ii |S column i|^2 <= `WORST` for all parameters: the
 covariance form loses as many digits. Otherwise it stays with S, also at full rank.
@@ -38,8 +37,15 @@ from driftfit.trackers.information import spread
 ROUNDING = 1e-13
 """Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, and to spare."""
 
-WORST = 1e8
-"""Largest variance inflation that is left to a covariance: of sixteen digits eight remain."""
+WORST = 1e6
+"""Largest variance inflation that is left to a covariance: of sixteen digits ten remain."""
+
+LEFT = 1e-14
+"""Least share of a variance that one sample leaves: below it what is left is rounding, which may be negative. It takes
+a regressor ten million times as large as those before it."""
+
+ALMOST_ANY = 1e13
+"""The same for trackers whose work cannot wait: they are least squares without drift before the change of form."""
 
 SIZE, STD, LOOSE, ROW, WORK = range(5)
 """Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
@@ -49,12 +55,12 @@ Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, NOW = range(9)
 variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation."""
 
 
-def knowing_nothing(n: int) -> dict[str, Any]:
+def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))
     return {
         "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
-        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1,
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
     }  # fmt: skip
 
 
@@ -118,8 +124,9 @@ def measurement(s: State, l: int) -> None:
     for i in range(n):
         k = gain * s.g[i, l]
         s.theta[i, l] += k * e
-        for j in range(i + 1):
+        for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v
@@ -156,18 +163,23 @@ def refresh(S: Array, R: Array, work: Array) -> None:
 
 
 @core
-def outside(phi: Array, S: Array, R: Array, work: Array) -> tuple[int, float]:
-    """The first free column j along which phi leaves the span, and u_j; (-1, 0) for a phi that is within it."""
-    for j in range(len(S)):
-        if S[j, j] == 0.0:
-            u = phi[j]
-            terms = abs(u)
-            for i in range(j):
-                u += R[i, j] * phi[i]
-                terms += abs(phi[i]) * (abs(R[i, j]) + work[STD, i] * work[LOOSE, j])
-            if abs(u) > ROUNDING * terms:
-                return j, u
-    return -1, 0.0
+def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
+    """The first free column j along which phi leaves the span, and u_j; or -1, 0 and |S^-T phi|^2 for a phi within it.
+
+    u_j is summed as phi_j - x' S_.j with S' x = phi: its rounding grows with |x|, and not with each entry of R.
+    """
+    n = len(S)
+    squares = 0.0
+    for j in range(n):
+        u = phi[j]
+        for i in range(j):
+            u -= S[i, j] * work[ROW, i]
+        x = u / S[j, j] if S[j, j] > 0.0 else 0.0
+        work[ROW, j] = x
+        if S[j, j] == 0.0 and abs(u) > ROUNDING * (abs(phi[j]) + np.sqrt(squares) * work[LOOSE, j]):
+            return j, u, np.inf
+        squares += x * x
+    return -1, 0.0, squares
 
 
 @core
@@ -272,25 +284,11 @@ def covariance(S: Array, R: Array, P: Array) -> None:
 
 
 @core
-def spread_of(phi: Array, S: Array, x: Array) -> float:
-    """|S^-T phi|^2 for a phi within the span."""
-    total = 0.0
-    for i in range(len(S)):
-        t = phi[i]
-        for j in range(i):
-            t -= S[j, i] * x[j]
-        x[i] = t / S[i, i] if S[i, i] > 0.0 else 0.0
-        total += x[i] * x[i]
-    return total
-
-
-@core
 def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
     """Take in a sample, if there is one, after time has passed; ``now`` is ``at_start``."""
     n = len(S)
     refresh(S, R, work)
-    entering, u = outside(phi, S, R, work)
-    now[BEFORE] = spread_of(phi, S, work[ROW]) if entering < 0 else np.inf
+    entering, u, now[BEFORE] = outside(phi, S, work)
     now[SQUARE] = 0.0
     if now[OK] > 0.0:
         root = np.sqrt(1.0 / now[NOISE])
@@ -397,7 +395,7 @@ def reform(s: State, l: int) -> None:
 @kernel
 def hand_over(s: State, l: int) -> None:
     """Let the covariance be the state from now on, where it will do."""
-    s.root[l] = 0 if s.at_start[INFLATION, l] <= WORST else 1
+    s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
 
 
 @kernel

@@ -45,7 +45,6 @@ from driftfit.trackers.diffuse import (
     measurement,
     reform,
     spanned_variance,
-    symmetric_product,
     take_in,
     wander,
 )
@@ -124,9 +123,24 @@ def correct_direction(s: State, l: int) -> None:
 
 
 @kernel
+def product_of_roots(s: State, l: int) -> None:
+    """s.g = R R' phi, which loses half the digits that P phi does."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.g[i, l] = 0.0
+    for k in range(n):
+        x = 0.0
+        for i in range(k + 1):
+            x += s.R[i, k, l] * s.phi[i, l]
+        x = x if s.S[k, k, l] > 0.0 else 0.0
+        for i in range(k + 1):
+            s.g[i, l] += s.R[i, k, l] * x
+
+
+@kernel
 def begin_direction(s: State, l: int) -> None:
     n = s.theta.shape[0]
-    symmetric_product(s, l)
+    product_of_roots(s, l)
     take_in(s, l)
     for i in range(n):
         s.H[i, n - 1, l] = s.g[i, l]

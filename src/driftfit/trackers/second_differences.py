@@ -29,6 +29,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel
 from driftfit.trackers.diffuse import (
+    LEFT,
     MACHINES,
     hand_over,
     knowing_nothing,
@@ -101,8 +102,9 @@ def measurement(s: State, l: int) -> None:
         s.slope[i, l] += gain * s.g[n + i, l] * e
     for i in range(2 * n):
         k = gain * s.g[i, l]
-        for j in range(i + 1):
+        for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v
