@@ -22,9 +22,10 @@ UNITS = [(1e-12, 1e12, 1.0), (1e12, 1e-12, 3e-12), (7e-5, 1.3e5, 1e12), (3e-9, 7
 
 def record(offset, T=200):
     rng = np.random.default_rng(5)
-    x = rng.standard_normal((T, 2)) + [0.0, offset]
+    at = np.array([0.0, offset])
+    x = rng.standard_normal((T, 2)) + at
     theta = np.array([2.0, -1.0]) + np.cumsum(0.01 * rng.standard_normal((T, 2)), axis=0)
-    return 3.0 + np.sum(theta * (x - [0.0, offset]), axis=1) + 0.1 * rng.standard_normal(T), x
+    return 3.0 + np.sum(theta * (x - at), axis=1) + 0.1 * rng.standard_normal(T), x
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
