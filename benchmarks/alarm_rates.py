@@ -7,7 +7,7 @@ large), and one parameter that walks and stands at the very edge of its band, wh
 The second table is of fleets of 50 series, 10 of which have a fault, watched together: false alarms of all series in
 "every" samples, and of the series that are said to have had something the share that had nothing.
 
-Run: python benchmarks/alarm_rates.py [records a line, 20 by default] [fleets, 20 by default]
+Run: python benchmarks/alarm_rates.py [records a line, 20 by default] [fleets, 20 by default] [--quick]
 """
 
 import sys
@@ -22,11 +22,12 @@ from scipy import signal
 from driftfit import ARX, Bank, Change, Kalman, Regression, Sensor, Track, track
 from driftfit.judges.onsets import onsets
 
-T = 20_000
+T, QUICK = 20_000, 6000
+"""Samples a record."""
 A, B = [1.0, -1.2, 0.5], [0.0, 1.0, 0.4]
 
 
-def system(seed: int, outliers: bool) -> Track:
+def system(seed: int, outliers: bool, T: int) -> Track:
     """A constant ARX(2, 2), followed by a filter that allows a little drift."""
     rng = np.random.default_rng(seed)
     u, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
@@ -35,7 +36,7 @@ def system(seed: int, outliers: bool) -> Track:
     return track(ARX(2, 2), Kalman(q=0.0, r=0.01 * (5.95 if outliers else 1.0)), y, u)
 
 
-def at_the_edge(seed: int, every: float) -> tuple[int, int]:
+def at_the_edge(seed: int, every: float, T: int) -> tuple[int, int]:
     """Onsets of "outside the band" for a band that ends exactly where the walking parameter is."""
     rng = np.random.default_rng(seed)
     u, theta = rng.normal(size=T), 1.0 + np.cumsum(0.03 * rng.normal(size=T))
@@ -47,15 +48,15 @@ def at_the_edge(seed: int, every: float) -> tuple[int, int]:
     return len(onsets(z[50:] > said.limits[0])), T - 50
 
 
-def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, float], tuple[int, int]]:
-    def count(seed: int, every: float) -> tuple[int, int]:
-        said = system(seed, outliers).detect(kind, every=every, **settings)  # type: ignore[arg-type]
+def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, float, int], tuple[int, int]]:
+    def count(seed: int, every: float, T: int) -> tuple[int, int]:
+        said = system(seed, outliers, T).detect(kind, every=every, **settings)  # type: ignore[arg-type]
         return len(said.onsets), T - said.start
 
     return count
 
 
-def jumps(seed: int, every: float) -> tuple[int, int]:
+def jumps(seed: int, every: float, T: int) -> tuple[int, int]:
     """Onsets of the change probability of a bank that waits for jumps, where there are none."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=T)
@@ -66,7 +67,7 @@ def jumps(seed: int, every: float) -> tuple[int, int]:
     return len(said.onsets), T - said.start
 
 
-LINES: list[tuple[str, Callable[[int, float], tuple[int, int]]]] = [
+LINES: list[tuple[str, Callable[[int, float, int], tuple[int, int]]]] = [
     ("band, parameter at its edge", at_the_edge),
     ("band, first 5000 as reference", watched("band", False, reference=5000)),
     ("innovation, window 10", watched("innovation", False, window=10)),
@@ -112,20 +113,23 @@ def fleets(count: int) -> Table:
     return table
 
 
-def main(records: int = 20, count: int = 20) -> None:
+def main(records: int = 20, of_fleets: int = 20, T: int = T) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Samples for one false alarm, {records} records of {T}")
     for head in ("alarm", "set", "measured", "from", "to"):
         table.add_column(head, justify="left" if head == "alarm" else "right")
-    for name, count in LINES:
+    for name, alarms in LINES:
         for every in (500.0, 5000.0):
-            found = np.array([count(seed, every) for seed in range(records)])
+            found = np.array([alarms(seed, every, T) for seed in range(records)])
             begun, samples = found.sum(axis=0)
             spread = 2.0 * found[:, 0].std() * np.sqrt(records)
             ends = (f"{samples / max(begun + spread, 0.5):.0f}", f"{samples / max(begun - spread, 0.5):.0f}")
             table.add_row(name, f"{every:g}", f"{samples / max(begun, 0.5):.0f}", *ends)
     Console(width=110).print(table)
-    Console(width=110).print(fleets(count))
+    Console(width=110).print(fleets(of_fleets))
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:3]))
+    if "--quick" in sys.argv:
+        main(1, 1, QUICK)
+    else:
+        main(*map(int, sys.argv[1:3]))

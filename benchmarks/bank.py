@@ -3,10 +3,12 @@
 Prints microseconds a step in record mode and live, for three changes with a beam of eight leaves at n = 4, for
 twenty-seven leaf updates at n = 3, and for beams of growing width; and the same of filterpy's IMM with three Kalman
 filters where it is installed. Least of several runs, processor time of one core. Run: python benchmarks/bank.py
+[--quick], which takes the first three lines of short records.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 
@@ -17,7 +19,7 @@ from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide
 from driftfit.hypotheses.sensor import Sensor
 
-T = 20_000
+T, QUICK = 20_000, 400
 THREE = [Change(1e-6), Change(0.5, prob=0.006), Change(1.5, prob=0.004, which=[0])]
 KNOWN = [Sensor.nominal(0.01)]
 
@@ -33,7 +35,7 @@ def least(work: Callable[[], object], steps: int, times: int = 5) -> float:
     return 1e6 * min(found) / steps
 
 
-def record(n: int) -> tuple[ARX, np.ndarray, np.ndarray]:
+def record(n: int, T: int = T) -> tuple[ARX, np.ndarray, np.ndarray]:
     """A record of ARX(2, n - 2)."""
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal(T), np.zeros(T)
@@ -42,8 +44,8 @@ def record(n: int) -> tuple[ARX, np.ndarray, np.ndarray]:
     return ARX(2, n - 2), y, u
 
 
-def ours(n: int, bank: Bank | Kalman) -> float:
-    model, y, u = record(n)
+def ours(n: int, bank: Bank | Kalman, T: int = T) -> float:
+    model, y, u = record(n, T)
     return least(lambda: track(model, bank, y, u), T)
 
 
@@ -84,12 +86,15 @@ def filterpy_imm(n: int, steps: int = 200) -> float | None:
     return least(feed, steps, 3)
 
 
-def main() -> None:
-    kalman = ours(4, Kalman(1e-6, 0.01, p0=2.0))
-    eight = ours(4, Bank(THREE, KNOWN, reduce=Beam(8), p0=2.0))
+def main(quick: bool = False) -> None:
+    size = QUICK if quick else T
+    kalman = ours(4, Kalman(1e-6, 0.01, p0=2.0), size)
+    eight = ours(4, Bank(THREE, KNOWN, reduce=Beam(8), p0=2.0), size)
     print(f"Kalman filter, n = 4                       {kalman:8.3f} us a step")
     print(f"three changes, Beam(8), n = 4              {eight:8.3f} us a step")
     print(f"the same live                              {live(4, Bank(THREE, KNOWN, reduce=Beam(8), p0=2.0)):8.3f}")
+    if quick:
+        return
     print(f"27 leaf updates, Decide(3), n = 3          {ours(3, Bank(THREE, KNOWN, reduce=Decide(3), p0=2.0)):8.3f}")
     print(f"27 leaf updates, GPB(3), n = 3             {ours(3, Bank(THREE, KNOWN, reduce=GPB(3), p0=2.0)):8.3f}")
     print(f"27 leaf updates, Beam(9), n = 3            {ours(3, Bank(THREE, KNOWN, reduce=Beam(9), p0=2.0)):8.3f}")
@@ -107,4 +112,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main("--quick" in sys.argv)

@@ -10,7 +10,7 @@ rules for "the drift is set too high", each beside constants that are not reject
 
 "constant" is a tracker that holds the coefficients, which has fault found where constancy is rejected at 1 %.
 
-Run: python benchmarks/diagnose_constancy.py [records a cell, 60 by default]
+Run: python benchmarks/diagnose_constancy.py [records a cell, 60 by default] [--quick]
 """
 
 import sys
@@ -61,13 +61,16 @@ def judged(run: Track) -> tuple[float, bool, bool, bool]:
     )  # fmt: skip
 
 
-def main(records: int = 60) -> None:
+def main(
+    records: int = 60, lengths: tuple[int, ...] = (200, 1000, 5000), trackers: tuple[str, ...] = tuple(TRACKERS)
+) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Fault found, % of {records} constant records", width=100)
     for head in ("model", "tracker", "T", "loss, %", "ratio", "worse", "by 3 %"):
         table.add_column(head, justify="left" if head in ("model", "tracker") else "right")
     for name, model in (("regression", Regression(3)), ("ARX(2, 2)", ARX(2, 2))):
-        for tracker, given in TRACKERS.items():
-            for T in (200, 1000, 5000):
+        for tracker in trackers:
+            given = TRACKERS[tracker]
+            for T in lengths:
                 rows = np.array([judged(track(model, given, *record(name, seed, T))) for seed in range(records)])
                 shares = (f"{100.0 * share:.1f}" for share in rows[:, 1:].mean(axis=0))
                 table.add_row(name, tracker, str(T), f"{100.0 * np.median(rows[:, 0]):.2f}", *shares)
@@ -76,4 +79,7 @@ def main(records: int = 60) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:2]))
+    if "--quick" in sys.argv:
+        main(2, (200,), ("constant",))
+    else:
+        main(*map(int, sys.argv[1:2]))

@@ -1,6 +1,6 @@
 """Speed of Hammerstein-Wiener tracking: stage one beside a regression of its size, separation, a stream with blocks.
 
-    python benchmarks/hammerstein_wiener.py
+    python -m benchmarks.hammerstein_wiener [--quick]
 
 Targets: stage one at the rate of a regression with as many regressors, 1.1 times at most; separation of
 a whole record at most 5 times the filter step; an update with blocks at n = 14 below 10 us.
@@ -8,6 +8,7 @@ a whole record at most 5 times the filter step; an update with blocks at n = 14 
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 
 import numpy as np
@@ -18,10 +19,10 @@ from driftfit.blocks.separate import METHODS, separate
 from driftfit.kernel import Array
 from driftfit.models.basis import Legendre, Polynomial
 from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.reproduce.hammerstein_wiener.cost import least
 from driftfit.systems.hammerstein_wiener import CUBIC, example
+from lab.reproduce.hammerstein_wiener.cost import least
 
-T = 5000
+T, QUICK = 5000, 500
 MODELS = {
     "cubic": CUBIC,
     "Legendre": HammersteinWiener(3, 3, input=Legendre(3, (-4.0, 4.0)), output=Legendre(4, (-4.0, 4.0))),
@@ -34,6 +35,7 @@ TURNS = 4
 
 def beside_regression(name: str, model: HammersteinWiener, y: Array, u: Array, tracker: Kalman) -> float:
     """Print what stage one takes beside a regression of its size; returns the nanoseconds a sample."""
+    T = len(y)
     phi = np.random.default_rng(0).normal(size=(T, model.n))
     plain, stage = np.inf, np.inf
     for _ in range(TURNS):
@@ -50,14 +52,15 @@ def stream(live: Live, y: list[float], u: list[float]) -> None:
         live.blocks()
 
 
-def main() -> None:
+def main(T: int = T, names: tuple[str, ...] = tuple(MODELS)) -> None:
     s = example(1, 0, T=T)
     tracker = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
-    stage, *_ = [beside_regression(name, model, s.y, s.u, tracker) for name, model in MODELS.items()]
+    stage, *_ = [beside_regression(name, MODELS[name], s.y, s.u, tracker) for name in names]
     run = track(CUBIC, tracker, s.y, s.u)
-    theta, parts = np.ascontiguousarray(run.theta), empty(CUBIC, T)
+    *groups, quality = empty(CUBIC, T)
+    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, tuple(groups), quality)
     for place, method in enumerate(METHODS[:3]):
-        cost = least(partial(separate, theta, tuple(CUBIC.structure[:4]), place, *parts), T)
+        cost = least(partial(separate, theta, (CUBIC.na, CUBIC.out.n, place), *parts), T)
         print(f"{method:10s} {cost:5.0f} ns a sample, {cost / stage:.2f} filter steps")
     gls = least(lambda: run.blocks("gls"), T)
     print(f"gls        {gls:5.0f} ns a sample, with the replay for P")
@@ -67,4 +70,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*((QUICK, ("cubic",)) if "--quick" in sys.argv else ()))

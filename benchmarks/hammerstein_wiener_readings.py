@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from driftfit.models.basis import DeadZone
-from driftfit.reproduce.hammerstein_wiener import runs
-from driftfit.reproduce.hammerstein_wiener.tables import BIAS
 from driftfit.systems.arc_furnace import furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, Simulated, example
 from driftfit.track import track
 from driftfit.trackers.kalman import Kalman
+from lab.reproduce.hammerstein_wiener import runs
+from lab.reproduce.hammerstein_wiener.tables import BIAS, end
 
 
 def thresholds() -> None:
@@ -130,6 +130,29 @@ def rises() -> None:
     print(f"estimates that do not increase, Q/R = 1e3: {100.0 * np.mean(shares):.0f} %")
 
 
+def recovery() -> None:
+    """Example 3 without noise: samples after the jump of d until the error is at most twice what it was, ten on end."""
+    found: dict[str, list[int]] = {"average": [], "svd": [], "svd-joint": []}
+    for seed in range(24):
+        s = example(3, seed)
+        run = track(s.model, runs.PAPER, s.y, s.u)
+        for method, samples in found.items():
+            error = runs.off(runs.separated(run, method), s)
+            small = error[1000:] <= 2.0 * np.median(error[500:1000])
+            samples.append(int(np.argmax(np.convolve(small, np.ones(10), "valid") > 9.5)))
+    told = ", ".join(f"{method} {np.median(samples):.0f} (most {max(samples)})" for method, samples in found.items())
+    print(f"samples to recover from the jump of example 3: {told}")
+
+
+def legendre() -> None:
+    """Example 4 on Legendre polynomials of higher order: squared errors of a and p, and the local gain, at the end."""
+    furnaces = [furnace(seed) for seed in range(20)]
+    for q in (4, 5, 6):
+        rows = [runs.fourth_example(f, q, False, "svd") for f in furnaces]
+        gain = np.median([np.median(row.gain[-runs.LAST :]) for row in rows])
+        print(f"Legendre q = {q}: a {end([r.a for r in rows]):.1g}, p {end([r.p for r in rows]):.1g}, gain {gain:.2f}")
+
+
 if __name__ == "__main__":
-    for part in (thresholds, one_step, bias, noise_aware, arrivals, likelihood, rises):
+    for part in (thresholds, one_step, bias, noise_aware, arrivals, likelihood, rises, recovery, legendre):
         part()

@@ -1,7 +1,7 @@
 """Speed of the kernel against a loop in C, against streaming its bytes, against peers, and of a second process.
 
-    python benchmarks/kernel.py                every part, about two minutes
-    python benchmarks/kernel.py --part record --part lanes --quick
+    python -m benchmarks.kernel                every part, about two minutes
+    python -m benchmarks.kernel --part record --part lanes --quick
 
 Every figure is a ratio of medians: what is compared takes turns within one run, so that a busy machine slows both. No
 accuracy is measured here, except that the loop in C must give the same numbers before it is timed.
@@ -30,8 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
-from driftfit.bench.machine import installed, machine, times
 from driftfit.drivers import drivers, known_factors, make_tile, output_type
+from lab.bench.machine import installed, machine, times
 
 HERE = Path(__file__).parent
 SEED = 1

@@ -2,7 +2,7 @@
 
 "one ratio" puts the ratio of the scenario on every rung of the ladder (without drift: closes the ways up), so that
 nothing has to be learned about it; "one noise level" leaves the outliers only; "groups" tells it which parameter is
-fast. Medians over the twenty scored runs. Run: python benchmarks/losses.py
+fast. Medians over the twenty scored runs. Run: python -m benchmarks.losses
 """
 
 from collections.abc import Iterator
@@ -11,10 +11,10 @@ from contextlib import contextmanager
 import numpy as np
 
 from driftfit import AdaptiveKalman
-from driftfit.bench.contestants import run
-from driftfit.bench.records import simulated
-from driftfit.bench.scores import parameter_error
 from driftfit.trackers import drift_ladder, noise_levels
+from lab.bench.contestants import run
+from lab.bench.records import simulated
+from lab.bench.scores import parameter_error
 
 LEARNED = {"missing_data": ("regression",), "collinear_inputs": ("regression",), "lost_excitation": ("arx",)}
 RATIO = 1e-3

@@ -7,7 +7,7 @@ inputs that are autoregressions with 0.8. "joint" is the share of records whose 
 share in which at least one is named, "no lags" the joint test that takes scores to be white, "Hansen" what its
 statistic and the published table would say.
 
-Run: python benchmarks/verdict_error_rate.py [records a cell, 1000 by default]
+Run: python benchmarks/verdict_error_rate.py [records a cell, 1000 by default] [--quick]
 """
 
 import sys
@@ -53,13 +53,13 @@ def record(model: str, kind: str, rng: np.random.Generator, T: int, jump: float)
     return np.column_stack([y[1:-1], y[:-2], drive[1:-1], drive[:-2]]), y[2:]
 
 
-def main(records: int = 1000) -> None:
+def main(records: int = 1000, lengths: tuple[int, ...] = (100, 300, 1000)) -> None:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell", width=108)
     for head in ("model", "noise", "T", "joint", "named", "no lags", "Hansen", "finds a jump of 0.5"):
         table.add_column(head, justify="left" if head in ("model", "noise") else "right")
     for model in ("regression", "arx"):
         for kind in NOISES:
-            for T in (100, 300, 1000):
+            for T in lengths:
                 rng = np.random.default_rng([T, *model.encode(), *kind.encode()])
                 records_of = [record(model, kind, rng, T, 0.0) for _ in range(records)]
                 still, bare = ([constancy(*made, lags) for made in records_of] for lags in (None, 0))
@@ -75,4 +75,7 @@ def main(records: int = 1000) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:2]))
+    if "--quick" in sys.argv:
+        main(4, (100,))
+    else:
+        main(*map(int, sys.argv[1:2]))

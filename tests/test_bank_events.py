@@ -23,7 +23,10 @@ def test_probabilities_are_probabilities(run):
     told = run.hypotheses
     there = ~np.isnan(told.lag_prob[..., 0])
     np.testing.assert_allclose(told.lag_prob[there].sum(axis=1), 1.0, atol=1e-12)
-    assert there[:8].sum() == 36  # one more floor a sample, until there are eight
+    assert told.lags == (0, 1, 2, 3, 4, 5, 6, 23)
+    assert there.sum(axis=1).tolist() == [min(t + 1, 7) + (t >= 23) for t in range(150)]  # one more floor a sample
+    with pytest.raises(ValueError, match="one of 0, 1, 2, 3, 4, 5, 6, 23"):
+        told.prob(7)
     assert same(told.prob(3)[40], told.lag_prob[43, 3])
     assert same(told.mode_prob, told.lag_prob[:, 0])
     assert ((told.window >= -1e-12) & (told.window <= 1.0)).all()
@@ -37,13 +40,19 @@ def test_jumps_are_found_and_dated(run):
     for event, jump in zip(events, JUMPS, strict=True):
         assert abs(event.date - jump) <= 2
         assert event.first <= jump <= event.last
+        assert event.level == 0.95
         assert event.prob > 0.9
         assert event.known <= jump + 5
     table = run.hypotheses.table()
     assert table.height == 2
     assert table["theta1"].to_list() == [event.shift["theta1"] for event in events]
     assert table["std_theta2"].is_between(0.01, 0.3).all()
-    assert table["time"].to_list() == [event.date for event in events]
+    assert table["sample"].to_list() == [event.span.date for event in events]
+    dates = np.datetime64("2026-01-01") + 2 * np.arange(150)
+    dated = track(Regression(N), BANK, run.y, run.u, time=dates, dt=np.timedelta64(2, "D")).hypotheses.events()
+    assert [event.span for event in dated] == [event.span for event in events]
+    for event in dated:
+        assert (event.date, event.first, event.last, event.known) == tuple(dates[list(event.span)])
     assert "2 changes; see" in str(run.summary())
     assert len(run.hypotheses.plot().axes) == N + 1
 
@@ -82,9 +91,9 @@ def test_a_stream_says_what_the_record_says(run, tmp_path):
         if t == 70:
             live.save(tmp_path / "state")
             live = Live.load(tmp_path / "state")
-    wanted = run.hypotheses.events()
-    assert [(e.date, e.first, e.last, e.name) for _, e in found] == [(e.date, e.first, e.last, e.name) for e in wanted]
-    assert all(event.date < t < event.date + 20 for t, event in found)
+    wanted = run.hypotheses.found()
+    assert [(e.span, e.name) for _, e in found] == [(e.span, e.name) for e in wanted]
+    assert all(event.date + 23 <= t < event.date + 40 for t, event in found)
     np.testing.assert_allclose(live.hypotheses.mixture().mean, run.theta[-1])
 
 

@@ -16,6 +16,8 @@ from driftfit.models.basis import (
     Legendre,
     PiecewiseLinear,
     Polynomial,
+    Saturation,
+    Sigmoid,
     basis_of,
 )
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -42,13 +44,21 @@ def test_bases_are_what_they_say():
         assert np.isnan(spline.value(3.31)).all()
     zone = DeadZone(3.0).known(1.0, -0.5)
     np.testing.assert_allclose(zone.value([2.0, 0.5, -2.0]) @ [1.0, 1.0, -0.5], [1.0, 0.0, -1.5])
+    limited = Saturation(3.0).known(1.0, -0.5)
+    np.testing.assert_allclose(limited.value(x) @ [1.0, 1.0, -0.5], np.clip(x, -0.5, 1.0))
+    bent = np.tanh((x[:, None] - [-1.0, 0.5]) / 0.7) + np.tanh(np.array([-1.0, 0.5]) / 0.7)
+    np.testing.assert_allclose(Sigmoid([-1.0, 0.5], 0.7).value(x), bent, atol=1e-15)
+    assert np.isnan(Sigmoid([0.0], 1.0).value(np.nan)).all()
+    assert basis_of(("sigmoid", 0.7, -1.0, 0.5)) == Sigmoid([-1.0, 0.5], 0.7)
+    with pytest.raises(ValueError, match="centres must be at least 1 increasing"):
+        Sigmoid([1.0, 0.0], 1.0)
 
 
 @pytest.mark.parametrize(
     "basis",
     [
         Polynomial(3), Legendre(4, (-2, 4)), Chebyshev(4, (-2, 4)), PiecewiseLinear([-1.0, 1.0]),
-        BSpline(3, [-2.0, 0.0, 4.0]), DeadZone(3.0),
+        BSpline(3, [-2.0, 0.0, 4.0]), DeadZone(3.0), Saturation(3.0), Sigmoid([-1.0, 0.5], 0.7),
     ],
     ids=repr,
 )  # fmt: skip

@@ -6,7 +6,8 @@ import pytest
 from typer.testing import CliRunner
 
 import driftfit
-from driftfit import ARX, Kalman, Regression, Track, arguments, cli, track, trackers
+from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
+from driftfit.cli import arguments
 from driftfit.export import as_table
 from driftfit.files import read_columns
 from driftfit.models.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial

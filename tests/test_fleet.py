@@ -64,7 +64,7 @@ def test_series_of_unequal_length_end_in_the_state_they_had_alone():
 def test_times_weights_and_drift_per_row():
     y, u = rows(12, 200, seed=3)
     rng = np.random.default_rng(4)
-    time = np.cumsum(rng.choice([1.0, 2.0], (12, 200)), axis=1)
+    time = np.cumsum(rng.choice([1.0, 1.0, 2.0], (12, 200)), axis=1)
     weights, drift = rng.choice([0.0, 1.0, 2.0], (12, 200)), rng.choice([1.0, 50.0], (12, 200))
     fleet = track(MODEL, KALMAN, y, u, by="row", time=time, weights=weights, drift=drift)
     shared = track(MODEL, KALMAN, y, u, by="row", time=time[0])

@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 from scipy import stats
-from support import THETA, arx_record
+from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
 from driftfit.judges.many import discoveries
@@ -47,7 +47,10 @@ def test_those_that_move_are_found_and_named(fleet):
     table = said.table
     assert table["key"][0] in said.drifting
     assert table.filter(pl.col("drifts"))["moving"].to_list() == ["b1[u]"] * 2
-    assert "b1[u]" in str(said)
+    printed = {row[0]: row for row in rows_of(said)}
+    for key in said.drifting:
+        assert "b1[u]" in printed[key]
+    assert not any("b1[u]" in printed[f"<{k}>"] for k in range(7) if k not in MOVED)
     with pytest.raises(KeyError, match="<9>"):
         said["<9>"]
 
@@ -68,7 +71,12 @@ def test_diagnoses_are_counted(fleet):
         assert count == sum(not health[key][name].ok for key in fleet)
     assert health.table.height == 7
     assert "whiteness (p)" in health.table.columns
-    assert "Out of bounds" in str(health)
+    printed = rows_of(health)
+    for name, count in health.counts.items():
+        assert [*name.split(), str(count), "7"] in printed
+    for key in fleet:
+        wrong = [check.name for check in health[key].checks if not check.ok]
+        assert (f"{key} {', '.join(wrong)}".split() in printed) == bool(wrong)
     assert health.ok == (sum(health.counts.values()) == 0)
 
 
@@ -121,9 +129,15 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
     assert len(table) == sum(len(row.alarms.onsets) for row in said.rows)
     assert set(table["key"]) == {f"<{k}>" for k in MOVED}
     assert said.rows[0].first.endswith(said.rows[0].alarms.cause(int(said.rows[0].alarms.onsets[0])))
-    text = str(said)
-    assert "one false alarm of all 6 series in 1000 samples" in text
-    assert "not judged, <6>" in text
+    printed = rows_of(said)
+    assert ["Alarm", "band,", "one", "false", "alarm", "of", "all", "6", "series", "in", "1000", "samples"] in printed
+    assert f"Alarms {len(table)} in 2 series; 0.14 false alarms expected".split() in printed
+    for row in said.rows:
+        judged = [str(len(row.alarms.onsets)), *row.first.split()]
+        told = next(line for line in printed if line[0] == row.key)
+        assert told[1 : 1 + len(judged)] == judged
+        assert (told[-1] == "something") == row.faulty
+    assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
     with pytest.raises(KeyError, match="too little"):
         said["<6>"]
 
@@ -147,13 +161,15 @@ def test_alarms_of_several_outputs():
 
 
 def test_without_faults_few_series_are_accused():
-    """p-values of series without a fault are not too small."""
+    """p-values of series without a fault are not too small, and not much too large."""
     rng = np.random.default_rng(6)
     u, v = rng.normal(size=(2, 200, 400))
     fleet = track(Regression(1), Kalman(q=0.0, r=1.0), u + v, u, by="row")
     p = np.array([row.alarms.p for row in fleet.detect("innovation", window=20).rows])
-    assert np.mean(p < 0.05) < 0.08
-    assert np.mean(p < 0.5) > 0.2
+    for level in (0.01, 0.05, 0.2, 0.5):
+        assert np.mean(p < level) < level + 2.0 * np.sqrt(level * (1.0 - level) / 200)
+    assert np.mean(p < 0.2) > 0.08
+    assert np.mean(p < 0.5) > 0.3
 
 
 @pytest.mark.parametrize(

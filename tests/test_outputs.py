@@ -86,8 +86,18 @@ def test_rows_of_one_instant_are_one_vector_measurement():
         np.testing.assert_allclose(run.cov(t), P, rtol=1e-8)
     assert run.prediction.shape == (60, 2)
     assert run.theta.shape == (60, 2)
-    smoothed = run.smooth().theta
-    np.testing.assert_allclose(smoothed[::2], smoothed[1::2], rtol=1e-12)
+    path = run.smooth(keep="cov")
+    rows = path.rows.theta
+    np.testing.assert_allclose(rows[::2], rows[1::2], rtol=1e-12)
+    np.testing.assert_array_equal(path.theta, rows[1::2])
+    assert path.theta.shape == path.std.shape == run.theta.shape
+    assert path.residual.shape == path.loo.shape == path.leverage.shape == path.rows.run.y.reshape(60, 2).shape
+    np.testing.assert_allclose(path.residual, y - np.einsum("tkn,tn->tk", phi, path.theta), atol=1e-12)
+    np.testing.assert_allclose(np.sqrt(np.diag(path.cov(-1))), path.std[-1], rtol=1e-12)
+    np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9)  # all has been seen there
+    low, high = path.band()
+    assert low.shape == high.shape == (60, 2)
+    assert len(path.plot().axes[0].lines[0].get_xdata()) == 60
 
 
 def test_a_missing_row_leaves_the_other():

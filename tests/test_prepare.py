@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from driftfit import ARX, Kalman, Regression, prepare, track
@@ -103,6 +104,10 @@ def test_resampling_uses_what_lies_before():
     )
     with pytest.raises(ValueError, match="time must increase"):
         prepare.resample(time[::-1], values, 1.0)
+    same = prepare.resample(pd.Series(dates), values[:, 0], "10s")
+    assert np.array_equal(same.time, prepare.resample(dates, values[:, 0], np.timedelta64(10, "s")).time)
+    with pytest.raises(ValueError, match="fixed interval"):
+        prepare.resample(dates, values[:, 0], "month")
 
 
 @pytest.mark.parametrize("lag", [0, 1, 7])

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
-from driftfit.report import LONG, page, svg
+from driftfit.report import page
+from driftfit.report_parts import LONG, svg
 
 K = Kalman(q=1e-3, r=0.01)
 OPEN = {"meta", "br", "img", "link", "hr"}
@@ -97,7 +98,11 @@ def test_long_records_stay_small():
 def test_other_models_and_trackers(tmp_path):
     y, u = arx_record(300, 2)
     for model, tracker in ((Regression(1), K), (ARX(2, 2), AugmentedFLS(mu=10.0))):
-        read(page(track(model, tracker, y, u)))
+        run = track(model, tracker, y, u)
+        said = " ".join(read(page(run)).text)
+        assert all(name in said for name in run.names)
+        assert ("largest pole" in said) == isinstance(model, ARX)
+        assert f"{run.verdict().rms:.5g}" in said
     read(page(track(ARX(2, 2), K, y[:30], u[:30])))
 
 
@@ -135,7 +140,31 @@ def test_command_line_writes_a_page(tmp_path):
     ]
     done = CliRunner().invoke(app, [*base, "--report", str(tmp_path / "r.html")])
     assert done.exit_code == 0, done.output
-    read((tmp_path / "r.html").read_text())
+    expected = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"))
+    said = " ".join(" ".join(read((tmp_path / "r.html").read_text()).text).split())
+    for sentence in (*expected.verdict().sentences, *expected.diagnose().sentences):
+        assert " ".join(sentence.split()) in said
     fleet = CliRunner().invoke(app, [*base, "--by", "unit", "--report", str(tmp_path / "f.html")])
     assert fleet.exit_code == 0, fleet.output
-    read((tmp_path / "f.html").read_text())
+    both = track(ARX(2, 2), K, "y", "u", data=str(tmp_path / "r.csv"), by="unit")
+    said = " ".join(" ".join(read((tmp_path / "f.html").read_text()).text).split())
+    for sentence in both.verdict().sentences:
+        assert " ".join(sentence.split()) in said
+
+
+def test_page_shows_faults_and_alarms(run):
+    labels = np.zeros(400, bool)
+    labels[250:300], labels[390:395] = True, True
+    alarms = run.detect("innovation", reference=200, every=500)
+    text = page(run, None, alarms, labels)
+    read(text)
+    plain = " ".join(" ".join(read(text).text).split())
+    score = alarms.score(labels)
+    assert f"{score.found} of 2 labelled stretches found, {score.false} false alarms" in plain
+    assert plain.index("Faults and alarms") < plain.index("Parameters over time")
+    for t in (250, 299, 390, 394, *alarms.onsets):
+        assert run.time_text(int(t)) in plain
+    assert read(text).tags.count("svg") == 4
+    assert "Faults and alarms" not in page(run)
+    with pytest.raises(ValueError, match="labels have shape"):
+        page(run, None, None, labels[1:])

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from scipy import stats
-from support import THETA, arx_record, damaged, same
+from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
 from driftfit.compare import compare, persistence
@@ -104,10 +104,17 @@ def test_numbers_of_the_summary():
         assert (row.name, row.theta, row.std) == (run.names[i], run.theta[-1, i], run.std[-1, i])
         assert (row.low, row.high) == (low[-1, i], high[-1, i])
         assert (row.path_low, row.path_high) == (run.theta[50:, i].min(), run.theta[50:, i].max())
-    text = str(summary)
-    for word in (*run.names, "persistence", "constant LS", "constant ARX", f"{summary.used} used", "Kalman", "ARX"):
-        assert word in text
-    assert max(map(len, text.splitlines())) <= 96
+    printed = rows_of(summary)
+    for row in summary.rows:
+        cells = (row.theta, row.std, row.low, row.high, row.path_low, row.path_high)
+        assert [row.name, *(f"{value:.4g}" for value in cells)] in printed
+    c = summary.comparison
+    assert [f"{value:.5g}" for value in (c.tracked, c.persistence, c.constant_ls, c.constant_arx)] in printed
+    skipped = summary.samples - summary.used
+    assert f"Samples {summary.samples}, {summary.used} used, {skipped} skipped".split() in printed
+    assert ["Log-likelihood", f"{run.loglik:.6g}"] in printed
+    assert [*["Tracker"], *repr(K).split()] in printed
+    assert max(map(len, str(summary).splitlines())) <= 96
 
 
 def test_loglik_is_the_sum_over_used_samples():
@@ -159,8 +166,20 @@ def test_pictures_are_drawn_without_warnings(name, run, tmp_path):
         warnings.simplefilter("error")
         figure = run.plot()
         figure.savefig(tmp_path / "run.png", dpi=40)
-        str(run.summary())
-    assert {axis.get_ylabel() for axis in figure.axes} == {*run.names, "y", "innovation"}
+        printed = rows_of(run.summary())
+    assert [f"{run.theta[-1, 0]:.4g}", f"{run.std[-1, 0]:.4g}"] in [row[1:3] for row in printed]
+    lines = {axis.get_ylabel(): [line.get_ydata() for line in axis.get_lines()] for axis in figure.axes}
+    assert lines.keys() == {*run.names, "y", "innovation"}
+    low, high = run.band()
+    for i, name in enumerate(run.names):
+        assert same(lines[name][0], run.theta[:, i])
+        band = next(axis for axis in figure.axes if axis.get_ylabel() == name).collections[0]
+        edges = [set(path.vertices[:, 1]) for path in band.get_paths()]
+        assert bool(edges) == bool(np.isfinite(low[:, i]).any())
+        assert not edges or {low[-1, i], high[-1, i]} <= set.union(*edges)
+    assert same(lines["y"][0], run.y)
+    assert same(lines["y"][1], np.where(np.isinf(run.innovation_std), np.nan, run.prediction))
+    assert same(lines["innovation"][0], run.innovation)
     assert (tmp_path / "run.png").stat().st_size > 2000
 
 

@@ -7,6 +7,7 @@ from support import arx_record, damaged
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
 from driftfit.judges.delta import jacobian
+from driftfit.simulate import fit
 from driftfit.system import fieller
 
 K = Kalman(q=1e-3, r=0.01)
@@ -171,3 +172,41 @@ def test_what_is_not_an_arx_model_says_so(run):
         run.dc_gain(at=400)
     with pytest.raises(ValueError, match="ahead"):
         run.ahead(0)
+
+
+def test_fit_is_that_of_the_field():
+    y = np.array([1.0, 2.0, 4.0, np.nan, 3.0])
+    assert fit(y, y) == 100.0
+    assert fit(y, np.full(5, 2.5)) == pytest.approx(0.0)
+    known = y[[0, 1, 2, 4]]
+    expected = 100.0 * (1.0 - 1.0 / np.sqrt(np.sum((known - 2.5) ** 2)))
+    assert fit(y, y + np.array([0.0, 1.0, 0.0, 5.0, 0.0])) == pytest.approx(expected)
+    assert np.isnan(fit([2.0, 2.0], [1.0, 3.0]))
+    assert np.isnan(fit([np.nan], [1.0]))
+    with pytest.raises(ValueError, match="shape"):
+        fit([1.0, 2.0], [1.0])
+
+
+def test_picture_of_the_system_shows_what_is_computed(run):
+    step, magnitude, plane, gain, *_ = run.plot_system(at=[100, 399], h=12).axes
+    drawn = [line.get_ydata() for line in step.lines]
+    assert np.allclose(drawn, run.step_response(12, at=[100, 399]).value)
+    assert [text.get_text() for text in step.get_legend().get_texts()] == ["100", "399"]
+    _, high = run.step_response(12, at=[100, 399]).band(0.95)
+    (area,) = {round(float(c.get_paths()[0].get_extents().y1), 9) for c in step.collections[1:]}
+    assert area == pytest.approx(high[1].max())
+    assert np.allclose(magnitude.lines[1].get_ydata(), run.frequency_response(at=399).magnitude[0])
+    points = np.concatenate([c.get_offsets() for c in plane.collections])
+    assert {complex(*p) for p in points.round(9)} >= {complex(p) for p in run.poles(at=[60])[0].round(9)}
+    assert np.allclose(gain.lines[0].get_ydata(), run.dc_gain().value[:, 0])
+    with pytest.raises(ValueError, match="ARX"):
+        track(Regression(1), K, np.ones(60), np.ones(60)).plot_system()
+
+
+def test_picture_of_a_validation_says_the_fit(run):
+    y, u = arx_record(100, 7)
+    signal, error = run.plot_validation(y, u).axes
+    said = run.simulate(u, y=y[:2])
+    assert np.allclose(signal.lines[1].get_ydata(), said.y_hat)
+    assert np.allclose(error.lines[0].get_ydata(), y - said.y_hat)
+    assert signal.get_title(loc="left") == f"fit {fit(y[2:], said.y_hat[2:]):.1f} %"

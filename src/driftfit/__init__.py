@@ -13,6 +13,7 @@ from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.result import Track
 from driftfit.select import grid, select
+from driftfit.settings import DataWarning
 from driftfit.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
@@ -36,6 +37,7 @@ __all__ = [
     "Bank",
     "Beam",
     "Change",
+    "DataWarning",
     "Decide",
     "ExtendedKalman",
     "FirstFloor",

@@ -14,6 +14,7 @@ import narwhals as nw
 import numpy as np
 import polars as pl
 
+from driftfit.clock import zone_name
 from driftfit.kernel import Array
 from driftfit.settings import near
 from driftfit.signals import as_numbers
@@ -51,8 +52,8 @@ def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int) -> 
     for name in wanted.names:
         if name not in frame.columns:
             raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
-    time, zone = (None, None) if wanted.time is None else _times(frame[wanted.time], where, base)
-    numbers = {name: _numbers(frame[name], where, base) for name in wanted.numbers}
+    time, zone = (None, None) if wanted.time is None else times_of_column(frame[wanted.time], where, base)
+    numbers = {name: numbers_of(frame[name], where, base) for name in wanted.numbers}
     return Columns(numbers, time, zone, [_units(frame[name]) for name in wanted.by], len(frame))
 
 
@@ -67,7 +68,7 @@ def _as_text(series: nw.Series[Any]) -> pl.Series:
     return text.zip_with(~text.str.to_lowercase().is_in(MISSING), pl.Series([None], dtype=pl.String))
 
 
-def _numbers(series: nw.Series[Any], where: str, base: int) -> Array:
+def numbers_of(series: nw.Series[Any], where: str, base: int) -> Array:
     """A column as floats, NaN where it has no value."""
     if _is_text(series):
         return _numbers_of_text(_as_text(series), where, base)
@@ -89,21 +90,24 @@ def _numbers_of_text(text: pl.Series, where: str, base: int) -> Array:
     return np.array(values.fill_null(np.nan).to_numpy())
 
 
-def _times(series: nw.Series[Any], where: str, base: int) -> tuple[Array, str | None]:
+def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Array, str | None]:
     """(numbers or datetime64 in UTC, zone); NaN or NaT where a row has no time."""
     if _is_text(series):
         text = _as_text(series)
         if text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
         series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
+    native: Any = series.to_native()
+    if hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None:  # narwhals lacks zones that pandas has
+        return np.asarray(native.dt.tz_convert(None).to_numpy()), zone_name(native.dtype.tz)
     if series.dtype == nw.Date:
         series = series.cast(nw.Datetime("us"))
     if not isinstance(series.dtype, nw.Datetime):
-        return _numbers(series, where, base), None
+        return numbers_of(series, where, base), None
     zone = series.dtype.time_zone
     if zone is not None:
         series = series.dt.convert_time_zone("UTC").dt.replace_time_zone(None)
-    return np.asarray(series.to_numpy()), zone
+    return np.asarray(series.to_numpy()), None if zone is None else zone_name(zone)
 
 
 def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:

@@ -17,6 +17,12 @@
   its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
   rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
 
+What was found stands in ``said.rule`` (`driftfit.judges.alarm_rule.AlarmRule`), a small frozen object: `Live.detect`
+watches a stream by it, and ``other.detect(said.rule)`` another record.
+
+Which kind when: docs/alarms.md. A tracker that finds its own drift follows a fault, and takes it for drift: its
+innovations are soon normal again, so that "innovation" rings, if at all, in the first samples of the fault.
+
 ``p`` is the chance that a record without a fault gets as extreme as this one: from the same rates (the least of the
 columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
 
@@ -26,27 +32,27 @@ runs as 50 every / T for a calibration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from io import StringIO
+import warnings
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.judges.alarm_statistics import STATISTICS, Reference, Watched
+from driftfit.judges.alarm_rule import KINDS, AlarmRule, check_fits, value_text
+from driftfit.judges.alarm_statistics import Reference, chance_of, rule_of, statistic_of
 from driftfit.judges.calibrate import limit_of, null_records
 from driftfit.judges.onsets import held, onsets
+from driftfit.judges.reference import burn, in_samples
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import numbers, one_of, whole
-from driftfit.summary import WIDTH, facts, table_of
+from driftfit.summary import Printed, facts, table_of
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-KINDS = ("band", "innovation", "probability")
 
 
 class Score(NamedTuple):
@@ -55,52 +61,66 @@ class Score(NamedTuple):
     events: int
     """Stretches of samples with a true label."""
     found: int
-    """Stretches during which an alarm was on."""
+    """Stretches in which an alarm began."""
     delay: float
-    """Median samples from the beginning of a found stretch to its alarm."""
+    """Median samples from the beginning of a found stretch to its first alarm."""
     false: int
-    """Alarms that began outside all stretches, and ended before the next one."""
+    """Alarms that began outside all stretches, also those that were still on when the next one began."""
     normal: int
     """Samples outside all stretches that were judged."""
 
 
 @dataclass(frozen=True)
-class Alarms:
+class Alarms(Printed):
     """What `Track.detect` returns; printing it shows a table.
 
     Attributes
     ----------
+    rule : AlarmRule
+        What is compared with which limits; `Live.detect` takes it, and `Track.detect` of other runs.
     active : (T,) bool
         An alarm is on.
     onsets : (k,) int
         Samples at which one begins.
     statistic : (T, c)
         What is compared; NaN where there is nothing to judge.
-    limits : (c,)
-        What it is compared with.
-    names : tuple of str
-        What the columns are: parameters, "power" and "mean" of the innovations, or "probability".
     start : int
         First sample that is judged; what comes before is the start of the run, or the reference.
     p : number
         Chance of an extreme like the largest here without a fault; NaN where nothing was judged.
     """
 
-    kind: str
-    every: float
+    rule: AlarmRule
     active: Array
     onsets: Array
     statistic: Array
-    limits: Array
-    names: tuple[str, ...]
     start: int
     p: float
     run: Track = field(repr=False, compare=False)
 
+    @property
+    def kind(self) -> str:
+        """Kind of alarm."""
+        return self.rule.kind
+
+    @property
+    def every(self) -> float:
+        """Samples in which one false alarm may begin."""
+        return self.rule.every
+
+    @property
+    def limits(self) -> Array:
+        """What the columns are compared with, (c,)."""
+        return np.array(self.rule.limits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the columns are: parameters, "power" and "mean" of the innovations, or "probability"."""
+        return self.rule.names
+
     def cause(self, t: int) -> str:
         """The column that is furthest beyond its limit at sample t."""
-        ratio = np.where(np.isfinite(self.statistic[t]), self.statistic[t] / self.limits, -np.inf)
-        return self.names[int(np.argmax(ratio))]
+        return self.names[self.rule.cause(self.statistic[t])]
 
     def score(self, labels: Any) -> Score:
         """Compare with labels (T,), true where something is wrong; ValueError for another length."""
@@ -111,11 +131,11 @@ class Alarms:
         last = np.array([t + int(np.argmin(np.append(wrong[t:], False))) for t in first], int)
         delays = []
         for a, b in zip(first, last, strict=True):
-            on = np.flatnonzero(self.active[a:b])
-            delays += [int(on[0])] if len(on) else []
-        false = sum(not wrong[t] and not wrong[t : self._end(t)].any() for t in self.onsets)
+            begun = self.onsets[(self.onsets >= a) & (self.onsets < b)]
+            delays += [int(begun[0] - a)] if len(begun) else []
         delay = float(np.median(delays)) if delays else float("nan")
-        return Score(len(first), len(delays), delay, int(false), int(np.sum(~wrong[self.start :])))
+        false, normal = int(np.sum(~wrong[self.onsets])), int(np.sum(~wrong[self.start :]))
+        return Score(len(first), len(delays), delay, false, normal)
 
     def span(self, t: int) -> tuple[str, str]:
         """First and last time of the alarm that began at t."""
@@ -128,25 +148,23 @@ class Alarms:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         judged = len(self.active) - self.start
         expected = judged / self.every
+        chance = "that a record without a fault gets as extreme as this one"
+        limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))
         yield facts(
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
+            ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
             ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
             ("Alarms", f"{len(self.onsets)}"),
-            ("Chance", f"{p_text(self.p)} that a record without a fault gets as extreme as this one"),
+            *([] if np.isnan(self.p) else [("Chance", f"{p_text(self.p)} {chance}")]),
         )
         table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
         for t in self.onsets[:20]:
             j = self.names.index(self.cause(int(t)))
-            numbers = (f"{self.statistic[t, j]:.4g}", f"{self.limits[j]:.4g}")
+            numbers = (value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j))
             table.add_row(*self.span(int(t)), Text(self.names[j]), *numbers)
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
     def plot(self, labels: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded."""
@@ -157,7 +175,7 @@ class Alarms:
 
 def detect(
     run: Track,
-    kind: str = "band",
+    kind: str | AlarmRule = "band",
     *,
     every: float = 10_000.0,
     reference: Reference = None,
@@ -166,6 +184,7 @@ def detect(
     calibrate: bool = False,
     at: int = -1,
     seed: int = 0,
+    start: int | None = None,
 ) -> Alarms:
     """Find alarms in a run.
 
@@ -173,13 +192,15 @@ def detect(
     ----------
     run : Track
         What is watched.
-    kind : "band", "innovation" or "probability"
-        See the module.
+    kind : "band", "innovation" or "probability", or an AlarmRule
+        See the module. A rule, ``said.rule`` of another run, brings limits and settings with it.
     every : number
         Samples in which one false alarm may begin.
-    reference : mapping from names to (low, high), or a number of samples
-        For "band": where the parameters belong; or the first samples, whose range after the start of the run is the
-        band. For "innovation": the first samples, which are normal. They are not judged.
+    reference : mapping from names to (low, high), a number of samples, or (from, to)
+        For "band": where the parameters belong; or a stretch of the record, whose range after the start of the run is
+        the band. For "innovation": a stretch that is normal. A stretch is so many first samples, or from one time up to
+        but not including another: dates where the record has them, numbers as in ``run.time`` (without times:
+        samples). It is not judged, nor is what comes before it.
     window : int
         Samples in the sums of "innovation", at least 4.
     hold : int
@@ -190,35 +211,69 @@ def detect(
         The sample whose parameters are true in that simulation.
     seed : int
         Of that simulation.
+    start : int or None
+        With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
+
+    Warns
+    -----
+    UserWarning
+        For "innovation" of a tracker that finds its own drift (`AdaptiveKalman`), which follows a fault away.
 
     Raises
     ------
     ValueError
         For a kind that is unknown, a reference that does not fit, or a tracker that has not what the kind needs.
     """
+    if not isinstance(run, Track):
+        raise TypeError(f"detect: the run comes first, as in detect(run, 'band'); got {run!r}.")
+    if isinstance(kind, AlarmRule):
+        return judged(run, kind, start)
     one_of("detect", "kind", kind, KINDS)
     every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
-    whole("detect", "window", window, 4)
-    whole("detect", "hold", hold, 0)
-    seen = STATISTICS[kind](run, every, reference, window)
-    statistic, limits, names, start, likely = seen
-    highest, judged = _highest(seen), int(np.isfinite(statistic[start:]).any(axis=1).sum())
-    if calibrate or kind == "probability":
-        made = [STATISTICS[kind](null, every, reference, window) for null in null_records(run, every, at, seed)]
-        limits = limit_of(((part.statistic, part.start) for part in made), every)
-        as_far = [np.max(_highest(part) / limits) >= np.max(highest / limits) for part in made]
-        p = (1.0 + sum(as_far)) / (1.0 + len(made))
-    else:
-        p = likely(highest, judged) if likely is not None else float("nan")
-    with np.errstate(invalid="ignore"):
-        active = held((statistic > limits).any(axis=1) & (np.arange(len(run)) >= start), hold)
-    return Alarms(
-        kind, float(every), active, onsets(active), statistic, np.asarray(limits), names, start,
-        p if judged else float("nan"), run,
-    )  # fmt: skip
+    asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
+    reference = in_samples(run, reference)
+    rule, first = rule_of(run, asked, reference)
+    if kind == "innovation" and run.tracker.adapts:
+        _warn_of_following(run)
+    if not calibrate and kind != "probability":
+        return judged(run, rule, first)
+    made = []
+    for null in null_records(run, every, at, seed):
+        own, begin = rule_of(null, asked, reference)
+        made.append((statistic_of(null, own, begin), begin))
+    limits = limit_of(made, every)
+    said = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
+    extreme = _highest(said.statistic, first)
+    as_far = [np.max(_highest(*one) / limits) >= np.max(extreme / limits) for one in made]
+    p = (1.0 + sum(as_far)) / (1.0 + len(made)) if np.isfinite(extreme).any() else float("nan")
+    return replace(said, p=p)
 
 
-def _highest(seen: Watched) -> Array:
+def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
+    """Alarms of a run by a rule; ``start`` as for `detect`."""
+    check_fits(rule, run.tracker, run.names)
+    if start is None:
+        start = burn(run) if run._start is None else 0
+    statistic = statistic_of(run, rule, start)
+    count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
+    p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")
+    active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
+    return Alarms(rule, active, onsets(active), statistic, start, p, run)
+
+
+def _highest(statistic: Array, start: int) -> Array:
     """The largest value of each column, (c,), over the samples that are judged; -inf where there is none."""
-    part = seen.statistic[seen.start :]
+    part = statistic[start:]
     return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))
+
+
+def _warn_of_following(run: Track) -> None:
+    """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
+    warnings.warn(
+        f"detect: {type(run.tracker).__name__} finds its own drift and noise, so it follows a fault away: its "
+        "innovations are soon normal again, and a slow fault hardly shows in them. Watch where the parameters are, "
+        'detect("band", reference=...), or track with numbers that are fitted to the reference and then stay, '
+        "tune(model, Kalman(), ...).tracker.",
+        UserWarning,
+        stacklevel=4,
+    )

@@ -24,7 +24,6 @@ Source: Mehra (1970), Bar-Shalom et al. (2001, section 5.4) for innovation tests
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from io import StringIO
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +40,7 @@ from driftfit.judges.scale import core
 from driftfit.judges.whiteness import Whiteness, crossing, whiteness
 from driftfit.kernel import Array
 from driftfit.result import Track, root_mean_square
-from driftfit.summary import WIDTH, table_of
+from driftfit.summary import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Printed):
     """What `Track.diagnose` returns; printing it shows it, `plot` draws one page.
 
     Attributes
@@ -116,11 +115,6 @@ class Diagnosis:
         yield table
         for sentence in self.sentences or ("Everything is within its limits.",):
             yield Text(f" {sentence}")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
     def plot(self) -> Figure:
         """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
+from driftfit.clock import Clock
 from driftfit.kernel import Array
+from driftfit.records import Labels
 from driftfit.result import Track
 from driftfit.settings import one_of
 
@@ -113,6 +115,27 @@ def _of_outputs(run: Outputs | Shared) -> pl.DataFrame:
         for i, name in enumerate(names):
             columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
     return pl.DataFrame(columns)
+
+
+def forecasts_table(runs: Mapping[Any, Track], labels: Labels, h: int, u: Any) -> pl.DataFrame:
+    """The forecasts of many runs, one after the other, a row a sample."""
+    parts = []
+    for key, run in runs.items():
+        found = run.forecast(h, u.get(key) if isinstance(u, Mapping) else u)
+        columns: dict[str, Any] = {"step": np.arange(1, h + 1)}
+        ahead = None if run._time is None else Clock.of(labels.dt, labels.zone).ahead(run._time[-1], h)
+        if ahead is not None:
+            columns[_time_name(run)] = ahead
+        columns |= {"y_hat": found.y_hat, "y_std": found.y_std}
+        for i, name in enumerate(run.names):
+            columns |= {f"theta_{name}": found.theta[:, i], f"std_{name}": found.std[:, i]}
+        keys = zip(labels.by, key if isinstance(key, tuple) else (key,), strict=True)
+        part = pl.DataFrame(columns).select([*(pl.lit(k).alias(name) for name, k in keys), pl.all()])
+        if labels.zone is not None and ahead is not None:
+            shown = pl.col(_time_name(run)).dt.replace_time_zone("UTC").dt.convert_time_zone(labels.zone)
+            part = part.with_columns(shown)
+        parts.append(part)
+    return pl.concat(parts)
 
 
 def to_table(result: Track | Fleet, kind: str = "polars") -> Any:

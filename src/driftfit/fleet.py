@@ -21,13 +21,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.drivers import drivers, make_tile, output_type, repeat_tile
 from driftfit.judges.methods import JudgedMany
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver
 from driftfit.models.base import Model
 from driftfit.records import Records
 from driftfit.result import Track
@@ -169,6 +168,31 @@ class Fleet(JudgedMany):
 
         to_parquet(self, path)
 
+    def forecast(self, h: int, u: Any = None) -> Any:
+        """The h nominal samples after the end of every series as one polars table, a row a sample.
+
+        Columns: what tells the series apart, ``step`` (1 .. h), the time where the record has one, ``y_hat`` and
+        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
+        inputs (h,) or (h, m), or one array for all; a key that is not in it has none. See `driftfit.forecast`.
+        """
+        from driftfit.export import forecasts_table
+
+        return forecasts_table(self._runs(), self.records.labels, h, u)
+
+    def crossing(
+        self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,
+        level: float = 0.9,
+    ) -> Any:  # fmt: skip
+        """When a parameter or the output of every series crosses a limit, as one polars table, the first on top.
+
+        Limits are one for all, or a mapping from every key. Columns: what tells the series apart, ``probability``
+        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times where the
+        record has them. See `driftfit.crossing`.
+        """
+        from driftfit.crossing import crossings
+
+        return crossings(self._runs(), self.records.labels.by, what, below, above, horizon, u, level)
+
     def summary(self) -> FleetSummary:
         """Series ranked by how much their parameters moved; print it."""
         from driftfit.fleet_summary import summarise
@@ -189,7 +213,6 @@ def run_fleet(
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
     before: Fleet | None = None,
-    dt: Any = None,
 ) -> Fleet:
     """Run every series of ``records`` with its tracker and return the results.
 
@@ -197,7 +220,7 @@ def run_fleet(
     fleet and returns what is finished, with a warning.
     """
     places: list[Place | None] = [None] * len(trackers)
-    starts, records = _warm(model, trackers, records, before, dt)
+    starts, records = _warm(model, trackers, records, before)
     jobs = [job for group in _groups(model, trackers) for job in _jobs(model, trackers, records, group, keep)]
     for job in jobs:
         for lane, k in enumerate(job.series):
@@ -220,7 +243,7 @@ def run_fleet(
 
 
 def _warm(
-    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None, dt: Any
+    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None
 ) -> tuple[dict[int, dict[str, Array]], Records]:
     """(fields that each series takes over, by its number; the records with the intervals since the runs before)."""
     if before is None:
@@ -232,7 +255,7 @@ def _warm(
             run = before[key]
             starts[k] = carried(run, model, trackers[k])
             if records.time is not None:
-                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], dt)
+                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], records.labels)
     return starts, replace(records, known=known)
 
 
@@ -356,7 +379,7 @@ def _words(tile: Array, L: int) -> Array:
     return flat[: len(flat) // L * L].reshape(-1, L)
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def _gather(
     y: Array, u: Array, known: Array, first: Array, length: Array, a: int, b: int,
     to_y: Array, to_u: Array, to_known: Array,

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
-from io import StringIO
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +23,7 @@ from rich.text import Text
 from driftfit.compare import persistence
 from driftfit.kernel import Array
 from driftfit.result import root_mean_square
-from driftfit.summary import WIDTH, counts, facts, key_text, table_of
+from driftfit.summary import Printed, counts, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.fleet import Fleet
@@ -54,7 +53,7 @@ class Unit:
 
 
 @dataclass(frozen=True)
-class FleetSummary:
+class FleetSummary(Printed):
     """What `Fleet.summary` returns: ``units``, those that moved most first; printing it shows the first twenty."""
 
     model: str
@@ -63,6 +62,7 @@ class FleetSummary:
     failed: dict[Hashable, str]
     dropped: dict[str, int]
     scaled: bool
+    missing: dict[str, int] = field(default_factory=dict)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         samples, used = sum(unit.samples for unit in self.units), sum(unit.used for unit in self.units)
@@ -75,6 +75,8 @@ class FleetSummary:
         ]
         if self.dropped:
             pairs.append(("Rows left out", counts(self.dropped)))
+        if self.missing:
+            pairs.append(("Taken as missing", counts(self.missing)))
         yield facts(*pairs)
         yield from self._ranking()
         for key, reason in list(self.failed.items())[:SHOWN]:
@@ -91,11 +93,6 @@ class FleetSummary:
         yield table
         if len(self.units) > SHOWN:
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
 
 def summarise(fleet: Fleet) -> FleetSummary:
@@ -118,7 +115,10 @@ def summary_of(
     units = [_unit(*each) for each in zip(fleet, runs, paths, moved, strict=True)]
     units.sort(key=lambda unit: -unit.moved if np.isfinite(unit.moved) else np.inf)
     trackers = tuple(dict.fromkeys(repr(run.tracker) for run in runs))
-    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled)
+    missing: Counter[str] = Counter()
+    for run in runs:
+        missing.update(run.labels.missing)
+    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled, dict(missing))
 
 
 @dataclass(frozen=True)

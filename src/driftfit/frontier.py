@@ -18,6 +18,7 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.roles import check_role
 from driftfit.track import track
 from driftfit.trackers.fls import FLS
 
@@ -59,6 +60,7 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     ValueError
         If a mu is not positive, or what `track` refuses.
     """
+    check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
         raise ValueError("frontier: of one output at a time: take run[name], and frontier(run[name].model, .y, .u).")
     if mu is None:

@@ -14,10 +14,13 @@ from __future__ import annotations
 import dis
 import hashlib
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
+from threading import Lock, RLock
 from types import CellType, CodeType, FunctionType
 from typing import Any
+from weakref import ref
 
 import numba
 import numpy as np
@@ -28,7 +31,10 @@ from numba.core import cgutils
 from numba.core.datamodel import models, register_default
 from numba.extending import intrinsic
 
-from driftfit.linked import only_linked
+from driftfit import disk_cache
+from driftfit.linked import StepDispatcher, only_linked
+from driftfit.machine_code import Code, compiled, loaded
+from driftfit.notice import compiling
 
 Array = npt.NDArray[Any]
 State = Any
@@ -88,11 +94,7 @@ def _identity_of(value: Any, function: FunctionType, name: str) -> str:
 
 
 def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
-    """Compile under IEEE rules and without the GIL; Numba's cache and `identity` know it by what it does.
-
-    What is kept on disk gets a name that goes with its identity: Numba's cache for a function does not see that a
-    function in another file, which this one calls, was edited.
-    """
+    """Compile under IEEE rules and without the GIL; the cache on disk and `identity` know it by what it does."""
     assert isinstance(function, FunctionType)
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
     if cache:
@@ -100,7 +102,9 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
         defaults, closure = source.__defaults__, source.__closure__
         function = FunctionType(source.__code__, source.__globals__, source.__name__, defaults, closure)
         function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
-    dispatcher = njit(error_model="numpy", nogil=True, cache=cache, **options)(function)
+    dispatcher = njit(error_model="numpy", nogil=True, **options)(function)
+    if cache:
+        dispatcher._cache = disk_cache.Kept(function.__name__, name)
     dispatcher.identity = name
     dispatcher._set_uuid(name)
     dispatcher.again = lambda other: _compiled(other, cache, **options)
@@ -113,7 +117,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     Always inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at
     n = 4). Division follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
-    return _compiled(function, forceinline=True, no_cfunc_wrapper=True)
+    return only_linked(_compiled(function, forceinline=True, no_cfunc_wrapper=True), StepDispatcher)
 
 
 def shared(function: Callable[..., Any]) -> Any:
@@ -177,6 +181,11 @@ class Outside(types.ExternalFunction):
 
     identity: str
 
+    @property
+    def py_func(self) -> Any:
+        """The Python function that it was made of."""
+        return _OUTSIDE[self.symbol].py_func
+
     def __reduce__(self) -> Any:
         """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
         return _machine, (self.symbol,)
@@ -185,7 +194,8 @@ class Outside(types.ExternalFunction):
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
             dispatcher = _OUTSIDE[self.symbol]
-            dispatcher.compile(self.sig.args)
+            with compiling():
+                dispatcher.compile(self.sig.args)
             owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
             _LOADED[self.symbol] = owner  # of the code, which would go with it
             add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
@@ -275,15 +285,14 @@ _pointer._set_uuid("pointer")  # Numba would give it a new one in every process,
 
 def routine(function: Callable[..., Any]) -> Any:
     """Compile a part of a step that the lane loop is better without: it may be called instead of inlined."""
-    return _compiled(function, no_cfunc_wrapper=True)
+    return only_linked(_compiled(function, no_cfunc_wrapper=True), StepDispatcher)
 
 
 class Driver:
-    """A function that Python calls with arrays: compiled, and kept on disk, once for every signature.
+    """A function that Python calls with arrays and numbers: compiled, and kept on disk, once for every signature.
 
-    Numba keeps all signatures of a function in one cache, and numbers the entries by what its index held when it was
-    read: two processes that compile different things at once may store both under one number, and a third would run
-    the wrong code. Here every signature has a name, and so a cache, of its own.
+    Entry points that were not used for long are let go, and their memory with them, when a process has many
+    (`MOST_ENTRIES`); one that is needed again comes back from disk in milliseconds.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -292,13 +301,14 @@ class Driver:
         self._identity = identity(function)
         self._entries: dict[Any, Any] = {}
 
-    def __call__(self, *arrays: Array) -> Any:
-        """Run on arrays. Whether they are read-only is not part of the signature."""
-        kind = tuple((a.dtype, a.ndim, a.flags.c_contiguous, a.flags.aligned) for a in arrays)
+    def __call__(self, *given: Any) -> Any:
+        """Run on arrays and numbers. Whether arrays are read-only is not part of the signature."""
+        kind = tuple(_kind(a) for a in given)
         found = self._entries.get(kind)
         if found is None:  # the compiler's own types take half a millisecond to make and compare
-            found = self._entries[kind] = self.entry(*(numba.typeof(a).copy(readonly=False) for a in arrays))
-        return found(*arrays)
+            found = self._entries[kind] = self.entry(*(_type(a) for a in given))
+        _entries.used(found, self)
+        return found(*given)
 
     def entry(self, *arguments: types.Type) -> Any:
         """The compiled entry point for one signature.
@@ -308,15 +318,68 @@ class Driver:
         """
         found = self._entries.get(arguments)
         if found is None:
-            found = self._entries[arguments] = self._compile(arguments).overloads[arguments].entry_point
+            with _compiler:  # of two threads that need it one compiles
+                found = self._entries.get(arguments) or self._made(arguments)
+                self._entries[arguments] = found
+        _entries.used(found, self)
         return found
 
-    def _compile(self, arguments: tuple[types.Type, ...]) -> Any:
+    def _made(self, arguments: tuple[types.Type, ...]) -> Any:
+        """From disk, or from the compiler."""
         source = self.function
-        twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
-        name = hashlib.sha256(f"{self._identity}{arguments}".encode()).hexdigest()[:16]
-        twin.__qualname__ = f"{source.__name__}_{name}"
-        return njit(arguments, error_model="numpy", nogil=True, cache=True)(twin)
+        name = disk_cache.name_of(source.__name__, self._identity, arguments)
+        code = disk_cache.read(name)
+        if code is None:
+            twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
+            twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
+            with compiling():
+                code = compiled(twin, arguments)
+            if code.lasting:
+                disk_cache.write(name, tuple(code))
+        return loaded(Code(*code))
+
+    def let_go(self, found: Any) -> None:
+        """Forget an entry point; who holds it may go on using it."""
+        self._entries = {key: one for key, one in self._entries.items() if one is not found}
+
+
+def _kind(value: Any) -> Any:
+    """What the type of an argument depends on."""
+    if not isinstance(value, np.ndarray):
+        return type(value)
+    return value.dtype, value.ndim, value.flags.c_contiguous, value.flags.f_contiguous, value.flags.aligned
+
+
+def _type(value: Any) -> types.Type:
+    kind = numba.typeof(value)
+    return kind.copy(readonly=False) if isinstance(kind, types.Array) else kind
+
+
+MOST_ENTRIES = 256
+"""Entry points of drivers that a process keeps, of some 0.3 MB each."""
+
+
+class _Entries:
+    """Entry points of all drivers, those used last at the end."""
+
+    def __init__(self) -> None:
+        self._owners: OrderedDict[Any, ref[Driver]] = OrderedDict()
+        self._lock = Lock()
+
+    def used(self, entry: Any, owner: Driver) -> None:
+        """Note that an entry point is in use, and let go of those that were not for longest."""
+        with self._lock:
+            self._owners.setdefault(entry, ref(owner))
+            self._owners.move_to_end(entry)
+            while len(self._owners) > MOST_ENTRIES:
+                old, place = self._owners.popitem(last=False)
+                holder = place()
+                if holder is not None:
+                    holder.let_go(old)
+
+
+_entries = _Entries()
+_compiler = RLock()
 
 
 @kernel

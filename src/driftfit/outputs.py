@@ -11,6 +11,7 @@ the joint run used, with everything that a Track can do.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
+from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Self
@@ -147,14 +148,17 @@ class Outputs(JudgedMany):
         known = self._known[..., lane].copy()
         known[:, 0] = seen["dt"][:, lane]
         tile = fresh_tile(alone, tracker)
-        own = [name for name in storage.fields(tile) if name != "u"]
+        shapes = {name: tile[name].shape[:-1] for name in storage.fields(tile) if name != "u"}
+        own = [name for name, shape in shapes.items() if shape == self._tile[name].shape[:-1]]
         for name in own:
             tile[name][0, ..., 0] = self._tile[name][0, ..., lane]
         out = np.empty(len(self), output_type(tile, tracker.outputs, "cov" if "P" in names_of(self._out) else "std"))
         for name in names_of(out):
             out[name][..., 0] = self._out[name][..., lane]
         start = {name: value for name, value in self._starts[lane].items() if name in own} if self._starts else None
-        labels = Labels(self.outputs[lane], self.names[lane], self.labels.time, {}, self.labels.zone)
+        others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
+        missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
+        labels = replace(self.labels, y=self.outputs[lane], u=self.names[lane], missing=missing)
         return Track(alone, tracker, self.y[:, lane], phi, self._time, known, out, tile, 0, labels, start)
 
     def __iter__(self) -> Iterator[Track]:
@@ -203,8 +207,8 @@ class Outputs(JudgedMany):
             arrays |= {f"start{lane}_{name}": value for name, value in start.items()}
         header: dict[str, Any] = {"model": storage.describe(self.model)}
         header |= {"trackers": [storage.describe(one) for one in self.trackers]}
-        header |= {"keep": "cov" if "P" in names_of(self._out) else "std", "time": self.labels.time}
-        storage.write(path, {"kind": "outputs of a record", "zone": self.labels.zone, **header}, arrays)
+        header |= {"keep": "cov" if "P" in names_of(self._out) else "std", "labels": asdict(self.labels)}
+        storage.write(path, {"kind": "outputs of a record", **header}, arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -218,7 +222,7 @@ class Outputs(JudgedMany):
         storage.restore(path, trackers[0], arrays, "out_", {name: out[name] for name in names_of(out)})
         lanes = [f"start{lane}_" for lane in range(len(trackers))]
         starts = [{n.removeprefix(lane): arrays[n] for n in arrays if n.startswith(lane)} for lane in lanes]
-        labels = Labels(time=header["time"], zone=header["zone"])
+        labels = Labels(**header["labels"])
         return cls(
             model, trackers, arrays["y"], arrays["u"], arrays.get("time"), arrays["known"], out, tile,
             starts if starts[0] else (), labels,

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import signal, stats
 
+from driftfit.clock import Clock, instants
 from driftfit.kernel import Array
 from driftfit.result import Track
 from driftfit.settings import one_of, whole
@@ -146,15 +147,17 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
     ----------
     time : (T,) numbers or datetime64, increasing
     values : (T,) or (T, m)
-    dt : number or timedelta64
-        Interval of the grid, whose first point is time[0].
+    dt : number or duration
+        Interval of the grid, whose first point is time[0], as for `track`: 10, "15min", a timedelta.
     how : "mean" or "last"
         Mean of the interval, or the last value in it. An interval without a value is NaN.
     """
     one_of("resample", "how", how, ("mean", "last"))
-    axis, array = np.asarray(time), as_numbers("values", values)
+    (axis, _), array, clock = instants(time), as_numbers("values", values), Clock.of(dt)
+    if clock.kind not in ("number", "duration"):
+        raise ValueError(f"resample: a grid has a fixed interval, such as 10 or '1h'; got dt={dt!r}.")
     columns = array.reshape(len(array), -1)
-    steps = (axis - axis[0]) / dt
+    steps = clock.between(axis[0], axis)
     if not (np.diff(steps) > 0.0).all():
         raise ValueError("resample: time must increase; sort the record and drop repeated times first.")
     bins = np.ceil(steps - 1e-9).astype(np.int64)
@@ -169,7 +172,9 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
         for j in range(columns.shape[1]):
             grid[bins[seen[:, j]], j] = columns[seen[:, j], j]  # of several the last stands
     return Resampled(
-        axis[0] + np.arange(size) * dt, grid.reshape(size, *array.shape[1:]), np.bincount(bins, minlength=size)
+        axis[0] + np.arange(size) * (clock.count if clock.duration is None else clock.duration),
+        grid.reshape(size, *array.shape[1:]),
+        np.bincount(bins, minlength=size),
     )
 
 

@@ -6,14 +6,20 @@ settings: a lane reads from ``first`` on, for ``length`` samples.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from driftfit.clock import LABEL, Clock, instants, warn_of_gaps
 from driftfit.drivers import known_factors
+from driftfit.frames import held, ordered, times_of, together
 from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.restrict import Limits, marked, within_each
 from driftfit.signals import as_inputs, as_numbers, as_output, factor, intervals, noise_of
 
 
@@ -22,7 +28,9 @@ class Labels:
     """What the signals of a series are called, in which units they are, and what was left out of it.
 
     ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
-    counts rows that never became samples, by reason. ``by`` names what tells the series of a fleet apart.
+    counts rows that never became samples, ``missing`` what was taken as missing though a number stood there, by
+    reason. ``by`` names what tells the series of a fleet apart. ``dt`` is the nominal interval as
+    `driftfit.clock.Clock.of` takes it.
     """
 
     y: str = "y"
@@ -32,6 +40,8 @@ class Labels:
     zone: str | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
     by: tuple[str, ...] = ("series",)
+    missing: Mapping[str, int] = field(default_factory=dict)
+    dt: float | str | None = None
 
     def __post_init__(self) -> None:
         for name in ("u", "by"):  # lists, after a passage through JSON
@@ -50,14 +60,37 @@ class Labels:
 PLAIN = Labels()
 
 
+def time_text(time: Any, zone: str | None) -> str:
+    """A time as text, dates in a time zone."""
+    if not isinstance(time, np.datetime64):
+        return f"{time:g}"
+    text = time.astype("datetime64[us]").item()
+    if zone is None:
+        return f"{text:%Y-%m-%d %H:%M:%S}"
+    return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How signals are to be read: what `driftfit.track.track` is given beside them, see there."""
+
+    time: Any = None
+    dt: Any = None
+    weights: Any = 1.0
+    drift: Any = 1.0
+    units: Mapping[str, str] | None = None
+    limits: Mapping[Any, Any] | None = None
+    exclude: Any = None
+
+
 @dataclass(frozen=True)
 class Records:
     """Series in flat arrays of N samples.
 
     ``y`` (N,), ``u`` (N, m), ``known`` (N, 3) or (1, 3), ``time`` (N,) or None; series k is ``length[k]`` samples from
-    ``first[k]`` on and is called ``keys[k]``. ``dropped`` counts, per key, rows that never became samples. ``drifts``
-    (N, k) are factors of the drift for each parameter or change, until the tracker has made columns of ``known`` of
-    them.
+    ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that never became
+    samples and numbers that were taken as missing. ``drifts`` (N, k) are factors of the drift for each parameter or
+    change, until the tracker has made columns of ``known`` of them.
     """
 
     keys: tuple[Hashable, ...]
@@ -70,6 +103,7 @@ class Records:
     labels: Labels = PLAIN
     dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
     drifts: Array | None = None
+    missing: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
 
     def part(self, k: int) -> tuple[Array, Array, Array | None, Array]:
         """(y, u, time, known) of series k, as views."""
@@ -79,28 +113,71 @@ class Records:
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""
-        return replace(
-            self, keys=keys, first=np.repeat(self.first, len(keys)), length=np.repeat(self.length, len(keys))
+        dropped, missing = (
+            {key: counts.get(self.keys[0], {}) for key in keys} for counts in (self.dropped, self.missing)
         )
+        first, length = np.repeat(self.first, len(keys)), np.repeat(self.length, len(keys))
+        return replace(self, keys=keys, first=first, length=length, dropped=dropped, missing=missing)
 
     def labels_of(self, k: int) -> Labels:
         """The labels of series k."""
-        dropped = self.dropped.get(self.keys[k])
-        return replace(self.labels, dropped=dropped) if dropped else self.labels
+        key = self.keys[k]
+        counted = {"dropped": self.dropped.get(key), "missing": self.missing.get(key)}
+        return replace(self.labels, **{name: counts for name, counts in counted.items() if counts})  # type: ignore[arg-type]
+
+    def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
+        """Inputs in the order of a model with named inputs, valid ranges and stretches taken into account.
+
+        Warns where most samples cannot be used because of dt, lags going back ``reach`` samples, or the model's.
+        """
+        u, names = ordered(model, self.u, self.labels.u)
+        found = replace(self, u=u, labels=replace(self.labels, u=names))
+        found = found._restricted(names or model.input_names, reading)
+        if self.time is not None and len(self.known) > 1:
+            clock, zone = Clock.of(self.labels.dt), self.labels.zone
+            warn_of_gaps(clock, self.time, self.known[:, 0], self.first, reach or model.reach, zone)
+        return found
+
+    def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
+        """With NaN for what is outside valid ranges or in a stretch to leave out, counted."""
+        if not reading.limits and not reading.exclude:
+            return self
+        y, u, keys = self.y.copy(), self.u.copy(), self.keys
+        owner = np.repeat(np.arange(len(keys)), self.length)
+        limits = Limits(reading.limits or {}, (self.labels.y,), inputs, u.shape[1])
+        out_y, out_u = limits.outside(y[:, None], u)
+        number = np.arange(len(y)) - self.first[owner]
+        excluded = within_each(reading.exclude, keys, owner, self.time, number, self.labels.zone)
+        flags = np.hstack([out_y, out_u]) & ~excluded[:, None]
+        missing = marked(keys, owner, dict(zip(limits.names, flags.T, strict=True)), excluded)
+        y[out_y[:, 0] | excluded] = np.nan
+        u[out_u | excluded[:, None]] = np.nan
+        return replace(self, y=y, u=u, missing=missing)
 
 
-def one_series(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Records:
-    """One series; y (T,), u (T,), (T, m) or None, time (T,) or None."""
-    output = as_output(y)
+def one_series(y: Any, u: Any, reading: Reading) -> Records:
+    """One series; y (T,), u (T,), (T, m) or None."""
+    signals = {"y": held("y", y), "u": held("u", u)}
+    beside = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    together(**signals, **beside)
+    output = as_output(signals["y"].values)
     T = len(output)
-    axis, gaps = (None, 1.0) if time is None else intervals(time, dt, T)
+    times = times_of(reading.time, list(signals.values()))
+    dt = LABEL if times.labels and reading.dt is None else reading.dt
+    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
+    drift = beside["drift"].values
     common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", common, T))
-    return Records((0,), np.array([0]), np.array([T]), output, as_inputs(u, T), known, axis, drifts=drifts)
+    known = known_factors(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
+    labels = Labels(
+        (signals["y"].names or ("y",))[0], signals["u"].names, times.name, zone=times.zone, dt=Clock.of(dt).plain
+    )
+    inputs = as_inputs(signals["u"].values, T)
+    return Records((0,), np.array([0]), np.array([T]), output, inputs, known, axis, labels, drifts=drifts)
 
 
-def rows(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Records:
+def rows(y: Any, u: Any, reading: Reading) -> Records:
     """Series as rows: y (units, T), u (units, T), (units, T, m) or None, time (T,) or (units, T) or None."""
+    time, dt, weights, drift = reading.time, reading.dt, reading.weights, reading.drift
     output = as_numbers("y", y)
     if output.ndim != 2 or output.size == 0:
         raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
@@ -113,7 +190,8 @@ def rows(y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record
     known, axis = _known_of_rows(units, T, time, dt, weights, drift if each is None else 1.0)
     return Records(
         tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
-        _inputs_of_rows(u, units, T), known, axis, drifts=None if each is None else each.reshape(units * T, -1),
+        _inputs_of_rows(u, units, T), known, axis, Labels(dt=Clock.of(dt).plain),
+        drifts=None if each is None else each.reshape(units * T, -1),
     )  # fmt: skip
 
 
@@ -138,7 +216,8 @@ def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: 
     axis: Array | None = None
     gaps: Any = 1.0
     if time is not None:
-        given = np.asarray(time)
+        given, zone = instants(time)
+        dt = Clock.of(dt, zone)
         if given.ndim == 1:
             axis, gaps = intervals(given, dt, T)
             axis = np.broadcast_to(axis, shape)

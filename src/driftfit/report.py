@@ -7,10 +7,7 @@ nothing is loaded from anywhere. What a long record draws is an image inside the
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
 from html import escape
-from io import StringIO
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,13 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.diagnose import Diagnosis, diagnose
-from driftfit.judges.page import READING, STYLE
+from driftfit.judges.page import READING
 from driftfit.judges.plots import draw_diagnosis
 from driftfit.models.arx import ARX
 from driftfit.plots import (
-    BLUE,
-    GREY,
-    RED,
     date_axis,
     draw_innovation,
     draw_parameter,
@@ -32,6 +26,8 @@ from driftfit.plots import (
     new_figure,
     time_label,
 )
+from driftfit.report_faults import faults
+from driftfit.report_parts import document, picture, section, table
 from driftfit.result import Track
 from driftfit.summary import Summary, summarise
 from driftfit.system import dc_gain, largest_pole
@@ -40,19 +36,17 @@ from driftfit.verdict import Verdict, p_text, verdict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-LONG = 3000
-"""Records longer than this have the points of their pictures as an image inside the SVG."""
-
-SHORT = 12
-"""A table of at most so many rows is not broken over two pages."""
-
-INK = "#1b1b1b"
-"""Text and axes while a picture is drawn; becomes the ink of the page."""
-
-COLOURS = {INK: "ink", BLUE: "blue", RED: "red", GREY: "grey", "#b0b0b0": "rule"}
+    from driftfit.detect import Alarms
+    from driftfit.kernel import Array
 
 
-def report(run: Track, path: str | PathLike[str], title: str | None = None) -> None:
+def report(
+    run: Track,
+    path: str | PathLike[str],
+    title: str | None = None,
+    alarms: Alarms | None = None,
+    labels: Array | None = None,
+) -> None:
     """Write a page about a run.
 
     Parameters
@@ -63,15 +57,19 @@ def report(run: Track, path: str | PathLike[str], title: str | None = None) -> N
         Where the page goes; ends in .html.
     title : str or None
         Its heading; the names of the signals otherwise.
+    alarms : Alarms or None
+        What `detect` found: their dates, causes and picture.
+    labels : (T,) or None
+        True where something was wrong: the dates, and which of them the alarms found.
 
     Raises
     ------
     ValueError
-        If the path does not end in .html or .htm.
+        If the path does not end in .html or .htm, or labels have another length than the record.
     OSError
         If it cannot be written.
     """
-    check_path(path).write_text(page(run, title), encoding="utf-8")
+    check_path(path).write_text(page(run, title, alarms, labels), encoding="utf-8")
 
 
 def check_path(path: str | PathLike[str]) -> Path:
@@ -81,7 +79,7 @@ def check_path(path: str | PathLike[str]) -> Path:
     return Path(path)
 
 
-def page(run: Track, title: str | None = None) -> str:
+def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
     """The page as text."""
     facts, said, health = summarise(run), verdict(run), diagnose(run)
     heading = title or _heading(run)
@@ -89,6 +87,7 @@ def page(run: Track, title: str | None = None) -> str:
         f"<h1>{escape(heading)}</h1>",
         f'<p class="soft">{escape(_subtitle(run, facts))}</p>',
         _verdict(said, health),
+        *([section("Faults and alarms", faults(run, alarms, labels))] if alarms or labels is not None else []),
         section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
         section("Parameters", _parameter_table(facts, said) + _system_table(run)),
         section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
@@ -97,16 +96,6 @@ def page(run: Track, title: str | None = None) -> str:
         section("How to read this", READING),
     ]
     return document(heading, sections)
-
-
-def document(heading: str, sections: Sequence[str]) -> str:
-    """Sections as one page."""
-    body = "\n".join(sections)
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(heading)}</title><style>{STYLE}</style></head>\n<body><main>\n{body}\n</main></body></html>\n"
-    )
 
 
 PARAMETERS = "Each parameter after every sample (line) with its 95 % band: what was known then, nothing looks ahead."
@@ -126,10 +115,6 @@ def _subtitle(run: Track, facts: Summary) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def section(title: str, body: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>\n{body}</section>"
-
-
 def _verdict(said: Verdict, health: Diagnosis) -> str:
     count = len(health.sentences)
     state = (
@@ -139,21 +124,6 @@ def _verdict(said: Verdict, health: Diagnosis) -> str:
     )
     lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
     return f'<div class="verdict">{lines}</div>'
-
-
-def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]], words: Sequence[int] = ()) -> str:
-    """A table; cells are HTML already, and ``words`` the columns that are read as text, besides the first."""
-    kinds = [' class="words"' if column in words else "" for column in range(len(heads))]
-
-    def line(tag: str, cells: tuple[str, ...]) -> str:
-        return "".join(f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
-
-    top, body = line("th", heads), "".join(f"<tr>{line('td', row)}</tr>" for row in rows)
-    short = " short" if len(rows) <= SHORT else ""
-    return (
-        f'<div class="wide{short}"><table><caption>{escape(caption)}</caption>'
-        f"<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>"
-    )
 
 
 def _parameter_table(facts: Summary, said: Verdict) -> str:
@@ -248,51 +218,3 @@ def _signals(run: Track) -> Figure:
     error.set_xlabel(time_label(run))
     date_axis(error, run)
     return figure
-
-
-def picture(figure: Figure, run: Track, caption: str) -> str:
-    return f"<figure>{svg(figure, len(run) > LONG)}<figcaption>{escape(caption)}</figcaption></figure>\n"
-
-
-def svg(figure: Figure, thin: bool = False) -> str:
-    """A figure as SVG text whose colours are those of the page; ``thin`` makes images of what it draws of samples."""
-    import matplotlib
-
-    for axis in figure.axes:
-        _inked(axis)
-        for artist in (*axis.lines, *axis.collections, *axis.patches):
-            artist.set_rasterized(thin)
-    figure.patch.set_alpha(0.0)
-    text = StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": figure.axes[0].get_ylabel() or "driftfit"}):
-        figure.savefig(text, format="svg", dpi=110, metadata={"Date": None, "Creator": None}, transparent=True)
-    drawn = text.getvalue()
-    drawn = drawn[drawn.index("<svg") :]
-    drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, flags=re.S)
-    for colour, name in COLOURS.items():
-        drawn = drawn.replace(colour, f"var(--{name})")
-    drawn = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px system-ui, sans-serif", drawn)
-    return drawn
-
-
-def _inked(axis: object) -> None:
-    """Give text, ticks and frame of an axis the ink of the page."""
-    from matplotlib.axes import Axes
-
-    assert isinstance(axis, Axes)
-    for side in axis.spines.values():
-        side.set_edgecolor(INK)
-        side.set_linewidth(0.6)
-    axis.tick_params(colors=INK, which="both")
-    legend = axis.get_legend()
-    titles = [axis.title, axis._left_title] if hasattr(axis, "_left_title") else [axis.title]
-    words = [
-        axis.xaxis.label,
-        axis.yaxis.label,
-        axis.xaxis.get_offset_text(),
-        axis.yaxis.get_offset_text(),
-        *axis.texts,
-    ]
-    for word in (*titles, *words, *(legend.get_texts() if legend else ())):
-        if word.get_color() in ("black", "k", "#000000"):
-            word.set_color(INK)

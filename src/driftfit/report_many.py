@@ -14,11 +14,15 @@ import numpy as np
 
 from driftfit.judges.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judges.page import READING
-from driftfit.report import PARAMETERS, document, parameter_figure, picture, section, table
+from driftfit.report import PARAMETERS, parameter_figure
+from driftfit.report_faults import many_faults
+from driftfit.report_parts import document, picture, section, table
 from driftfit.summary import key_text
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
+    from driftfit.judges.many_alarms import ManyAlarms
+    from driftfit.kernel import Array
     from driftfit.result import Track
 
 LISTED = 200
@@ -33,8 +37,14 @@ MANY = """<p>Each row was judged by itself. Where many are tested some look as i
 of false ones among all with a q this small or smaller (false discovery rate).</p>"""
 
 
-def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapping[Hashable, str]) -> str:
-    """The page as text; ``failed`` says why some have no result."""
+def page_of_many(
+    runs: Mapping[Hashable, Track],
+    title: str | None,
+    failed: Mapping[Hashable, str],
+    alarms: ManyAlarms | None = None,
+    labels: Mapping[Hashable, Array] | None = None,
+) -> str:
+    """The page as text; ``failed`` says why some have no result; ``labels`` of a key are true where it was wrong."""
     if not runs:
         raise ValueError("report: there is no run with a result to report on.")
     said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
@@ -48,6 +58,7 @@ def page_of_many(runs: Mapping[Hashable, Track], title: str | None, failed: Mapp
             f"<h1>{escape(heading)}</h1>",
             f'<p class="soft">{escape(counted)}</p>',
             _verdict(said, health),
+            *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
             section("All series", _rows(said, health)),
             section(
                 "Those that move most clearly" if said.drifting else "The clearest",

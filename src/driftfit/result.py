@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC
 from functools import cached_property
 from os import PathLike
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any, Self, cast
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from driftfit.drivers import drivers, output_type
 from driftfit.judges.methods import Judged
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.records import PLAIN, Labels
+from driftfit.records import PLAIN, Labels, time_text
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End, fresh_tile
 
@@ -76,6 +74,19 @@ class Track(Judged):
         self.labels = labels
         self._start = start
 
+    def __reduce__(self) -> Any:
+        """A copy, and what is sent to another process, leaves the other series of a fleet's tile behind."""
+        out, tile = self._out, self._tile
+        if tile["theta"].shape[-1] > 1:
+            tile = fresh_tile(self.model, self.tracker)
+            for name in storage.fields(tile):
+                tile[name][0, ..., 0] = self._tile[name][0, ..., self._lane]
+            out = np.empty(len(self), output_type(tile, self.tracker.outputs, "cov" if "P" in _names(out) else "std"))
+            for name in _names(out):
+                out[name][..., 0] = self._written(name)
+        signals = (self.y, self.u, self._time, self._known)
+        return type(self), (self.model, self.tracker, *signals, out, tile, 0, self.labels, self._start)
+
     def _written(self, name: str) -> Array:
         """A field of what the driver wrote, for this lane."""
         field: Array = self._out[name][..., self._lane]
@@ -106,13 +117,7 @@ class Track(Judged):
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
-        time = self.time[t]
-        if not isinstance(time, np.datetime64):
-            return f"{time:g}"
-        text = time.astype("datetime64[us]").item()
-        if self.labels.zone is None:
-            return f"{text:%Y-%m-%d %H:%M:%S}"
-        return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(self.labels.zone)):%Y-%m-%d %H:%M:%S %Z}"
+        return time_text(self.time[t], self.labels.zone)
 
     @property
     def theta(self) -> Array:
@@ -140,23 +145,34 @@ class Track(Judged):
 
     @cached_property
     def loglik(self) -> float:
-        """Gaussian log-likelihood of the one-step predictions; the diffuse likelihood after a diffuse start.
+        """Log-likelihood of the record: the sum of `log_density`; the diffuse likelihood after a diffuse start.
 
-        Sum over used samples of -1/2 (log 2 pi s + e^2 / s), and -1/2 log F for each sample that determined a new
-        direction; a model whose innovation is not that of y adds its log Jacobian. NaN for trackers without an
+        To the sum comes -1/2 log F for each sample that determined a new direction. NaN for trackers without an
         innovation variance.
         """
         if not self.tracker.covariance:
             return float("nan")
-        s = self._written("s")
-        counted = self.ok & np.isfinite(s) & (s > 0.0)
-        e, s = self.innovation[counted], s[counted]
-        total = -0.5 * np.sum(np.log(2.0 * np.pi * s) + e * e / s)
+        total = np.nansum(self.log_density)
         if "F" in _names(self._tile):
             total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
-        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
-            total += np.sum(self.model.log_jacobian(self.theta[counted], self.y[counted]))
         return float(total)
+
+    @cached_property
+    def log_density(self) -> Array:
+        """(T,): log density of each used sample given those before it, NaN where there is none.
+
+        The Gaussian one of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses that of
+        their mixture. A model whose innovation is not that of y adds its log Jacobian.
+        """
+        s = self._written("s")
+        counted = self.ok & np.isfinite(s) & (s > 0.0)
+        own = self.tracker.log_density(self._out)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
+        terms = np.where(counted, gaussian if own is None else own[:, self._lane], np.nan)
+        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
+            terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
+        return terms
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
@@ -266,11 +282,14 @@ class Track(Judged):
             raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
         return cast("tuple[Array, list[Array]]", convert(self.theta))
 
-    def blocks(self, method: str = "svd-joint", input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+    def blocks(
+        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    ) -> Blocks:
         """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
 
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see `driftfit.blocks.separate`;
-        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`.
+        ``input``, ``output`` and ``at`` choose the gauge, see `driftfit.blocks.paths.Blocks.gauge`; None is "unit", or
+        "c1" for a tracker that follows the minimal parameters.
         """
         from driftfit.blocks.of_run import blocks_of
 

@@ -23,9 +23,8 @@ weights in closed form. Cost: one run a structure.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from io import StringIO
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -33,15 +32,16 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.drivers import known_factors
 from driftfit.judges.paired import newey_west
 from driftfit.judges.structures import Pool, Predicted, Structure, pool_of
 from driftfit.judges.subsets import subsets
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.signals import as_inputs, as_output, check_ready, factor, intervals, noise_of
-from driftfit.summary import WIDTH, table_of
+from driftfit.records import Reading, one_series
+from driftfit.roles import check_roles
+from driftfit.signals import check_ready, factor
+from driftfit.summary import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
@@ -68,7 +68,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Printed):
     """What `select` returns; printing it shows the table.
 
     Attributes
@@ -154,11 +154,6 @@ class Selection:
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
-
     def plot(self, most: int = 20) -> Figure:
         """How far structures are below the best, with standard errors, and where in time they lost it."""
         from driftfit.judges.plots import plot_selection
@@ -172,6 +167,8 @@ def grid(kind: type[Model], **choices: Any) -> list[Model]:
     A list is a choice; anything else, a tuple too, is one value for all. Combinations that the model refuses are left
     out; ValueError where none is left.
     """
+    if not (isinstance(kind, type) and issubclass(kind, Model)):
+        raise TypeError(f"grid: it makes the models, so give their class, as in grid(ARX, na=[1, 2]); got {kind!r}.")
     options = [value if isinstance(value, list | range) else [value] for value in choices.values()]
     models: list[Model] = []
     refused = ""
@@ -197,6 +194,8 @@ def select(
     dt: Any = None,
     weights: Any = 1.0,
     drift: Any = 1.0,
+    limits: Any = None,
+    exclude: Any = None,
 ) -> Selection:
     """Compare structures by predictive likelihood.
 
@@ -204,8 +203,8 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or the model whose regressors are to be chosen, at most 30.
-    y, u, time, dt, weights, drift
-        As for `track`.
+    y, u, time, dt, weights, drift, limits, exclude
+        As for `track`; one number or (T,) for drift.
     tracker : Tracker
         How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
         parameters: one q, not a vector.
@@ -220,23 +219,27 @@ def select(
         No candidate, a tracker without a variance, more than 30 regressors, names that are not there, or what `track`
         refuses.
     """
-    tracker = check_ready(AdaptiveKalman() if tracker is None else tracker)
+    tracker = AdaptiveKalman() if tracker is None else tracker
+    candidates = list(models) if isinstance(models, Iterable) else [models]
+    for model in candidates:
+        check_roles("select", model, tracker)
+    check_ready(tracker)
     if not tracker.covariance:
         raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
-    output = as_output(y)
-    T = len(output)
-    inputs = as_inputs(u, T)
-    gaps = 1.0 if time is None else intervals(time, dt, T)[1]
-    known = known_factors(gaps, noise_of(weights, T), factor("drift", drift, T))
-    given = [models] if isinstance(models, Model) else list(models)
-    if not given:
+    if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
-    bound = [_bound(model, inputs.shape[1]) for model in given]
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    records = one_series(y, u, reading)
+    factor("drift", drift, len(records.y))
+    named = max(candidates, key=lambda model: len(model.input_names))
+    records = records.for_model(named, reading, max(model.reach for model in candidates))
+    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
     if any(len(model.outputs) > 1 for model in bound):
         raise ValueError("select: structures are compared for one output at a time.")
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
-    pool, structures = pool_of(bound, [repr(model) for model in given], output, inputs, known)
+    names = [repr(model) for model in candidates]
+    pool, structures = pool_of(bound, names, records.y, records.u, records.known)
     if isinstance(models, Model):
         structures, predictions = subsets(pool, tracker, structures[0], keep, most)
     else:
@@ -244,11 +247,16 @@ def select(
     return _judged(pool, tracker, structures, predictions)
 
 
-def _bound(model: Model, m: int) -> Model:
-    """A candidate for m inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
+    """A candidate for these inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+    m = inputs if isinstance(inputs, int) else len(inputs)
     if isinstance(model, ARX) and model.inputs == 0 and m > 0:
         model = replace(model, inputs=m)
-    return model.bind(m)
+    if not isinstance(inputs, int) and model.input_names not in ((), tuple(inputs)):
+        raise ValueError(
+            f"select: candidates name the same inputs in the same order; {model!r} has others than {', '.join(inputs)}."
+        )
+    return model.bind(inputs)
 
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+import warnings
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import fields
 from difflib import get_close_matches
@@ -14,12 +16,25 @@ from typing import Any, Self
 import numpy as np
 
 
+class DataWarning(UserWarning):
+    """Something in the data that makes a result less than it seems; what was found, and the way out."""
+
+
+def warn(message: str) -> None:
+    """Warn of data, at the line of the user's program that called the library."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "driftfit":
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, DataWarning, stacklevel=level)
+
+
 class Settings:
     """Base of models and trackers: a frozen dataclass, equal by value, hashable, saved without pickle."""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]  # a dataclass leaves alone what its class has
+        if "__repr__" not in vars(cls):  # a dataclass leaves alone what its class has
+            cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
         """What makes it again: settings without a default, and those that differ from it."""

@@ -8,12 +8,10 @@ knows the first one already.
 from __future__ import annotations
 
 from dataclasses import replace
-from io import StringIO
 from os import PathLike
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from rich.console import Console
 
 from driftfit import storage
 from driftfit.joint import end_of
@@ -22,8 +20,8 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.outputs import missing
 from driftfit.result import Track, root_mean_square
-from driftfit.smoothers.smoothed import Smoothed
-from driftfit.summary import WIDTH, table_of
+from driftfit.smoothers.shared import SmoothedShared
+from driftfit.summary import printed, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.warm import End
 
@@ -115,11 +113,11 @@ class Shared:
         low, high = self.rows.band(level)
         return self._last(low), self._last(high)
 
-    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
-        """The smoothed path of the rows; take every ny-th of them, between rows of one instant theta does not move."""
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
+        """The smoothed path: theta (T, n) as here, residuals of every output (T, ny)."""
         if order_by is not None:
             raise ValueError("smooth: order_by= would tear the rows of an instant apart; it is for single outputs.")
-        return self.rows.smooth(keep, undetermined=undetermined)
+        return SmoothedShared(self.rows.smooth(keep, undetermined=undetermined), self)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """The h nominal samples after the record, u (h, ny, m): theta, std (h, n), y_hat, y_std (h, ny)."""
@@ -154,9 +152,7 @@ class Shared:
         errors = table_of("One-step prediction error, root mean square", *self.outputs)
         kept = self.innovation[max(50, 5 * len(self.names)) :]
         errors.add_row(*(f"{root_mean_square(e[np.isfinite(e)]):.5g}" for e in kept.T))
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(table, errors)
-        return text.getvalue()
+        return printed(table, errors)
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters with bands, predictions and innovations of the rows."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from driftfit.clock import Clock, instants
 from driftfit.kernel import Array
 from driftfit.settings import missing_settings
 
@@ -88,50 +88,16 @@ def noise_of(weights: Any, T: int | None = None) -> Array:
         return np.asarray(1.0 / factor("weights", weights, T))
 
 
-def interval_of(last: Any, time: Any, dt: Any) -> float:
-    """Nominal intervals from ``last`` to ``time``; 1 before the first sample; at most 0 when time does not advance."""
-    unit = nominal(time, dt)
-    if last is None:
-        return 1.0
-    step = time - last
-    return float(step / unit)
-
-
-def nominal(time: Any, dt: Any) -> Any:
-    """The nominal interval in the unit of ``time``: 1 for numbers; must be given for datetimes."""
-    if isinstance(time, int | float | np.number):
-        unit = 1.0 if dt is None else float(dt)
-        if not unit > 0.0:
-            raise ValueError(f"dt must be positive; got {dt!r}.")
-        return unit
-    if dt is None:
-        raise ValueError("with datetimes dt must be given: the nominal interval, as in dt=timedelta(seconds=1).")
-    if isinstance(time, np.datetime64):
-        return dt if isinstance(dt, np.timedelta64) else np.timedelta64(dt)
-    return dt if isinstance(dt, timedelta) else dt.astype("timedelta64[us]").item()
-
-
 def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
     """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise."""
-    axis = np.asarray(time)
+    axis, _ = instants(time)
     if axis.shape != (T,):
         raise ValueError(f"time has shape {axis.shape}, but y has {T} samples.")
-    if axis.dtype.kind not in "iufM":
-        axis = np.asarray(time, dtype="datetime64[us]")
-    unit = nominal(axis[0], dt)
-    steps = np.ones(T)
-    if axis.dtype.kind == "M":
-        if isinstance(unit, timedelta):
-            unit = np.timedelta64(unit)
-        steps[1:] = np.diff(axis) / unit
-    else:
-        axis = axis.astype(float)
-        steps[1:] = np.diff(axis) / unit
-    bad = np.flatnonzero(~(steps > 0.0))
+    bad = np.flatnonzero(~(axis[1:] > axis[:-1])) + 1
     if bad.size:
         i = int(bad[0])
         raise ValueError(
             f"time must increase: time[{i - 1}] = {axis[i - 1]} is followed by time[{i}] = {axis[i]}; "
             "sort the record and drop repeated times first."
         )
-    return axis, steps
+    return axis, Clock.of(dt).steps(axis)

@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.drivers import LARGEST
+from driftfit.frames import inputs_for
 from driftfit.kernel import Array
 from driftfit.models.arx import ARX, GAP
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.settings import whole
-from driftfit.signals import as_inputs
 from driftfit.system import covariances, taken
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
         If u does not fit the model, or the model cannot be run forward.
     """
     h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
-    inputs = as_inputs(u, h)
+    inputs = inputs_for(run.model, u, h)
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
     given = np.zeros(0) if y is None else np.asarray(y, float)
@@ -143,6 +143,21 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
             energy[k] = np.sum(psi[: k - len(given) + 1] ** 2)
     of_theta = np.einsum("ti,ij,tj->t", S, cov, S)
     return Prediction(out, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
+
+
+def fit(y: Any, y_hat: Any) -> float:
+    """Fit in per cent, 100 (1 - |y - y_hat| / |y - mean y|) over the samples where both are known.
+
+    100 is perfect, 0 no better than the mean, and below that worse; the measure of Ljung (1999) and of MATLAB's
+    ``compare``. NaN where nothing is known or y stands still.
+    """
+    measured, predicted = np.asarray(y, float), np.asarray(y_hat, float)
+    if measured.shape != predicted.shape:
+        raise ValueError(f"fit: y has shape {measured.shape}, but y_hat has {predicted.shape}.")
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    spread = float(np.linalg.norm(measured[known] - measured[known].mean())) if known.any() else 0.0
+    error = float(np.linalg.norm(measured[known] - predicted[known]))
+    return 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
 
 
 def noise_at(run: Track, at: int) -> float:

@@ -9,17 +9,17 @@ from __future__ import annotations
 import json
 import os
 import secrets
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from datetime import datetime, timedelta
 from importlib import import_module
+from io import BytesIO
 from os import PathLike
-from typing import Any, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from driftfit.drivers import make_tile
 from driftfit.kernel import Array
-from driftfit.models.base import Model
 from driftfit.settings import Settings
 from driftfit.trackers.base import Tracker
 
@@ -52,12 +52,11 @@ def rebuild(description: Mapping[str, Any], kind: type) -> Any:
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Write a header and arrays, all or nothing."""
     target = os.path.abspath(os.fspath(path))
-    text = json.dumps({"format": FORMAT, **header}, default=_encode)
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
     file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
     try:
         with file:
-            np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
+            _put(file, header, arrays)
             file.flush()
             os.fsync(file.fileno())
         os.replace(name, target)
@@ -69,19 +68,63 @@ def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[
 def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Header and arrays of a file that holds a ``kind`` ("state" or "track"); ValueError where it does not."""
     with open(path, "rb") as handle:
-        try:
-            with np.load(handle, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
-        except Exception as error:  # damage has many faces: zipfile, NumPy and JSON raise a dozen kinds
-            raise ValueError(f"{os.fspath(path)} is not a driftfit file, or it is damaged ({error}).") from None
+        return _take(handle, os.fspath(path), kind)
+
+
+def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    text = json.dumps({"format": FORMAT, **header}, default=_encode)
+    np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
+
+
+def _take(file: Any, name: str, kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
+    except Exception as error:  # damage has many faces: zipfile, NumPy and JSON raise a dozen kinds
+        raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
     if header.get("format", 0) > FORMAT:
         raise ValueError(
-            f"{os.fspath(path)} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
+            f"{name} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
         )
     if header.get("kind") != kind:
-        raise ValueError(f"{os.fspath(path)} holds a {header.get('kind')}, not a {kind}.")
+        raise ValueError(f"{name} holds a {header.get('kind')}, not a {kind}.")
     return header, arrays
+
+
+class Kept(ABC):
+    """A stream that is saved, or sent as bytes, and goes on as if it had never stopped."""
+
+    _kind: ClassVar[str]
+
+    @abstractmethod
+    def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Header and arrays."""
+
+    @classmethod
+    @abstractmethod
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        """The inverse of `_written`; ``source`` is for the message of an error."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write model, settings and state to one file, without pickle; complete or not at all."""
+        write(path, *self._written())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Continue from a file as if never stopped."""
+        return cls._read(os.fspath(path), *read(path, cls._kind))
+
+    def to_bytes(self) -> bytes:
+        """What `save` writes, for a queue or a database."""
+        file = BytesIO()
+        _put(file, *self._written())
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The inverse of `to_bytes`."""
+        return cls._read("what was given", *_take(BytesIO(data), "what was given", cls._kind))
 
 
 def _encode(value: Any) -> Any:
@@ -108,32 +151,15 @@ def _decode(value: dict[str, Any]) -> Any:
     return value
 
 
-def save_state(
-    path: str | PathLike[str], model: Model, tracker: Tracker, tile: Array, extra: Mapping[str, Any]
-) -> None:
-    """Write the state of one stream."""
-    header = {"kind": "state", "model": describe(model), "tracker": describe(tracker), "extra": dict(extra)}
-    write(path, header, {f"state_{name}": tile[name][0, ..., 0] for name in fields(tile)})
-
-
-def load_state(path: str | PathLike[str]) -> tuple[Model, Tracker, Array, dict[str, Any]]:
-    """Read what `save_state` wrote."""
-    header, arrays = read(path, "state")
-    model, tracker = rebuild(header["model"], Model), rebuild(header["tracker"], Tracker)
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
-    restore(path, tracker, arrays, "state_", {name: tile[name][0, ..., 0] for name in fields(tile)})
-    return model, tracker, tile, header["extra"]
-
-
 def restore(
-    path: str | PathLike[str], tracker: Tracker, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
+    source: str | PathLike[str], tracker: Tracker, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
 ) -> None:
     """Write stored arrays into the fields of a record; ValueError where one is missing or of another shape."""
     for name, field in into.items():
         stored = arrays.get(prefix + name)
         if stored is None or stored.shape != field.shape:
             raise ValueError(
-                f"{os.fspath(path)} does not fit {type(tracker).__name__} in this version: field {name!r}."
+                f"{os.fspath(source)} does not fit {type(tracker).__name__} in this version: field {name!r}."
             )
         field[...] = stored
 

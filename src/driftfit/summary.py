@@ -6,12 +6,14 @@ import re
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from io import StringIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.table import Table
+from rich.jupyter import JupyterMixin
+from rich.table import Column, Table
 from rich.text import Text
 
 from driftfit.compare import Comparison, compare
@@ -22,6 +24,28 @@ if TYPE_CHECKING:
 WIDTH = 96
 
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
+
+
+def printed(*parts: Any) -> str:
+    """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
+
+    Left to itself rich hands what is printed to the display of a notebook, and takes colours and widths from the
+    environment.
+    """
+    text = StringIO()
+    console = Console(
+        file=text, width=WIDTH, height=100, color_system=None, force_jupyter=False, force_terminal=False,
+        legacy_windows=False,
+    )  # fmt: skip
+    console.print(*parts)
+    return text.getvalue()
+
+
+class Printed(JupyterMixin):
+    """A result that rich draws: ``str`` gives it as plain text, and a notebook shows it as the value of a cell."""
+
+    def __str__(self) -> str:
+        return printed(self)
 
 
 @dataclass(frozen=True)
@@ -39,7 +63,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Summary:
+class Summary(Printed):
     """What `Track.summary` returns; printing it shows two tables."""
 
     model: str
@@ -85,11 +109,6 @@ class Summary:
             return f"on the {self.comparison.samples} samples after the first {self.burn} that all four could predict"
         return f"the record has no sample after the first {self.burn} that all four could predict: nothing to compare"
 
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
-
 
 def summarise(run: Track) -> Summary:
     """Build the summary of a run."""
@@ -103,9 +122,10 @@ def summarise(run: Track) -> Summary:
         )
         for i, name in enumerate(run.names)
     )  # fmt: skip
+    tracker = shortened(repr(run.tracker))
     return Summary(
-        repr(run.model), _short(repr(run.tracker)), len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), run.tracker.remarks(run),
+        repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
+        _signals(run), _span(run), counts(run.labels.dropped), (*_missing(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -116,6 +136,11 @@ def _signals(run: Track) -> str:
         return ""
     named = [f"{name} ({labels.units[name]})" if name in labels.units else name for name in (labels.y, *labels.u)]
     return f"{named[0]} from {', '.join(named[1:])}" if labels.u else named[0]
+
+
+def _missing(run: Track) -> tuple[tuple[str, str], ...]:
+    """What was taken as missing though a number stood there."""
+    return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
 
 
 def _span(run: Track) -> str:
@@ -136,7 +161,7 @@ def counts(dropped: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items())
 
 
-def _short(text: str) -> str:
+def shortened(text: str) -> str:
     """Numbers of more than six digits in six."""
     return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 
@@ -149,12 +174,34 @@ def facts(*pairs: tuple[str, str]) -> Table:
     return table
 
 
+SHORT = 10
+"""Cells of at most so many signs stand on one line: numbers, and p-values such as < 0.0001."""
+
+
+class Numbers(Table):
+    """A table no wider than `WIDTH` or the terminal, in which nothing is cut: what is too wide is broken at blanks."""
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        """Add a row; every column is at least as wide as its longest word."""
+        super().add_row(*cells, **options)
+        for column, cell in zip(self.columns, cells, strict=False):
+            _widen(column, str(cell))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        return super().__rich_console__(console, options.update(max_width=min(WIDTH, options.max_width)))
+
+
+def _widen(column: Column, text: str) -> None:
+    words = [text] if len(text) <= SHORT else text.split()
+    column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
+
+
 def table_of(title: str, *heads: str, names: int = 1) -> Table:
     """A table of numbers over the full width: the first ``names`` columns to the left, numbers to the right."""
-    table = Table(
-        title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, width=WIDTH
+    table = Numbers(
+        title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, expand=True
     )
     for place, head in enumerate(heads):
-        name = place < names
-        table.add_column(Text(head), justify="left" if name else "right", ratio=None if name else 1, no_wrap=True)
+        table.add_column(Text(head), justify="left" if place < names else "right", overflow="fold")
+        _widen(table.columns[-1], head)
     return table

@@ -17,7 +17,7 @@ method fails, and Fieller's interval is unbounded, which is the truth.
 from __future__ import annotations
 
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
@@ -28,7 +28,22 @@ from driftfit.models.arx import ARX
 from driftfit.settings import whole
 
 if TYPE_CHECKING:
+    from driftfit.models.base import Model
     from driftfit.result import Track
+
+
+class Followed(Protocol):
+    """What has parameters over time: a `Track`, or the present of a stream (`driftfit.live_system`)."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def theta(self) -> Array: ...
+
+    model: Model
+
+    def __len__(self) -> int: ...
+    def cov(self, t: int) -> Array: ...
 
 
 class Response(NamedTuple):
@@ -63,7 +78,7 @@ class LongRun(NamedTuple):
     high: float
 
 
-def arx_of(run: Track) -> ARX:
+def arx_of(run: Followed) -> ARX:
     """The ARX model of a run; ValueError where it has another."""
     if not isinstance(run.model, ARX) or len(run.model.outputs) > 1 or run.names != run.model.names:
         raise ValueError(
@@ -93,20 +108,20 @@ def _finite(cov: Array) -> Array:
     return np.where(known, cov, np.nan)
 
 
-def taken(run: Track, at: Any) -> tuple[Array, Array]:
+def taken(run: Followed, at: Any) -> tuple[Array, Array]:
     """(theta, covariance) of samples: all of them, one, or several."""
     theta = run.theta
     if at is None:
-        return theta, covariances(run)
+        return theta, covariances(cast("Track", run))
     picked = np.atleast_1d(np.asarray(at))
     if picked.dtype.kind not in "iu" or (picked < -len(run)).any() or (picked >= len(run)).any():
         raise IndexError(f"at= must be samples within the record of {len(run)}; got {at!r}.")
     if len(picked) == 1:
         return theta[picked], _finite(run.cov(int(picked[0]))[None])
-    return theta[picked], covariances(run)[picked]
+    return theta[picked], covariances(cast("Track", run))[picked]
 
 
-def poles(run: Track, at: Any = None) -> Array:
+def poles(run: Followed, at: Any = None) -> Array:
     """Poles of the frozen systems, (T, na) complex, largest magnitude first; at= picks samples."""
     model = arx_of(run)
     theta = run.theta if at is None else run.theta[np.atleast_1d(at)]
@@ -121,7 +136,7 @@ def poles(run: Track, at: Any = None) -> Array:
     return np.take_along_axis(roots, order, axis=1)
 
 
-def largest_pole(run: Track, at: Any = None) -> Response:
+def largest_pole(run: Followed, at: Any = None) -> Response:
     """Magnitude of the largest pole over time, with its standard deviation; below 1 the system is stable."""
     model = arx_of(run)
     na = model.na
@@ -136,7 +151,7 @@ def largest_pole(run: Track, at: Any = None) -> Response:
     return Response(*spread(largest, *taken(run, at)))
 
 
-def dc_gain(run: Track, at: Any = None) -> Response:
+def dc_gain(run: Followed, at: Any = None) -> Response:
     """Gain of every input for a signal that stands, (T, m), with its standard deviation."""
     model = arx_of(run)
     return Response(*spread(lambda theta: _gain(model, theta), *taken(run, at)))
@@ -149,7 +164,7 @@ def _gain(model: ARX, theta: Array) -> Array:
     return np.moveaxis(gains, 0, -1)
 
 
-def step_response(run: Track, h: int, input: int | str = 0, at: Any = -1) -> Response:
+def step_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit step of one input at sample 0; ``at`` picks samples, None takes all (T h n numbers)."""
     model, j = arx_of(run), input_of(run, input)
     whole("step_response", "h", h, 1)
@@ -157,7 +172,7 @@ def step_response(run: Track, h: int, input: int | str = 0, at: Any = -1) -> Res
     return Response(*spread(lambda theta: _filtered(model, theta, j, drive), *taken(run, at)))
 
 
-def impulse_response(run: Track, h: int, input: int | str = 0, at: Any = -1) -> Response:
+def impulse_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit impulse of one input at sample 0."""
     model, j = arx_of(run), input_of(run, input)
     whole("impulse_response", "h", h, 1)
@@ -176,7 +191,7 @@ def _filtered(model: ARX, theta: Array, j: int, drive: Array) -> Array:
     return y
 
 
-def frequency_response(run: Track, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
+def frequency_response(run: Followed, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
     """B_j / A on the unit circle at w (k,) radians per sample, 0.01 to pi by default."""
     model, j = arx_of(run), input_of(run, input)
     grid = np.geomspace(0.01, np.pi, 100) if w is None else np.atleast_1d(np.asarray(w, float))
@@ -198,7 +213,7 @@ def _at(polynomial: Array, w: Array) -> Array:
     return polynomial @ powers
 
 
-def input_of(run: Track, input: int | str) -> int:
+def input_of(run: Followed, input: int | str) -> int:
     """The number of an input, by number or name."""
     m = run.model.m
     names = run.model.inputs if isinstance(run.model, ARX) and isinstance(run.model.inputs, tuple) else ()
@@ -211,7 +226,7 @@ def input_of(run: Track, input: int | str) -> int:
     return input
 
 
-def to_scipy(run: Track, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
+def to_scipy(run: Followed, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
     """The frozen system of a sample, from one input to y, as `scipy.signal.dlti` (a transfer function in z)."""
     from scipy import signal
 
@@ -223,7 +238,7 @@ def to_scipy(run: Track, at: int = -1, dt: float = 1.0, input: int | str = 0) ->
     return signal.dlti(num[lead:], den, dt=dt)
 
 
-def long_run(run: Track, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
+def long_run(run: Followed, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
     """Long-run effect of every input at a sample: b / (1 - a), its standard error, and Fieller's interval at ``level``.
 
     In a model of logarithms it is the long-run elasticity. ValueError for models other than ARX.

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from driftfit.clock import Clock
 from driftfit.columns import Columns, Wanted
 from driftfit.drivers import known_factors
 from driftfit.files import read
 from driftfit.kernel import Array
-from driftfit.records import Labels, Records, drift_of
-from driftfit.signals import noise_of, nominal
+from driftfit.records import Labels, Reading, Records, drift_of
+from driftfit.signals import noise_of
 
 
 def read_records(
-    data: Any, y: str, u: str | Sequence[str] | None, time: str | None, by: str | Sequence[str] | None, dt: Any,
-    weights: Any, drift: Any, units: Mapping[str, str] | None,
-) -> tuple[Records, dict[Hashable, str]]:  # fmt: skip
+    data: Any, y: str, u: str | Sequence[str] | None, by: str | Sequence[str] | None, reading: Reading
+) -> tuple[Records, dict[Hashable, str]]:
     """Columns of a table as records, and the reasons of units and files that gave none.
 
     Raises
@@ -33,7 +33,7 @@ def read_records(
         A column that is not there (with near matches), a cell that is not a number (with row and value), a file that
         cannot be read, a table without a usable row.
     """
-    inputs = _names("u", u)
+    inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
     axis = None if time is None else _name("time", time)
     each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
     factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
@@ -49,14 +49,15 @@ def read_records(
         raise ValueError(f"there is nothing to track: the {columns.rows} rows have no unit or no time.")
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
+    clock = Clock.of(reading.dt, columns.zone)
     known = known_factors(
-        1.0 if times is None else _gaps(times, first, dt),
+        1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),
         _factor(1.0 if each else drift, values, drift_of),
     )
     drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
     signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
-    labels = Labels(y, inputs, axis, dict(units or {}), columns.zone, {}, wanted.by)
+    labels = Labels(y, inputs, axis, dict(reading.units or {}), columns.zone, {}, wanted.by, dt=clock.plain)
     named = tuple(keys[k] for k in there)
     return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
 
@@ -111,11 +112,9 @@ def _count(dropped: dict[Hashable, dict[str, int]], keys: Sequence[Hashable], co
         dropped.setdefault(keys[k], {})[reason] = int(count)
 
 
-def _gaps(time: Array, first: Array, dt: Any) -> Array:
+def _gaps(time: Array, first: Array, clock: Clock) -> Array:
     """Nominal intervals since the last sample of the same unit; 1 at its first."""
-    unit = nominal(time[0], dt)
-    gaps = np.ones(len(time))
-    gaps[1:] = np.diff(time) / unit
+    gaps = clock.steps(time)
     gaps[first] = 1.0
     return gaps
 

@@ -14,8 +14,9 @@ from driftfit.drivers import drivers, output_type
 from driftfit.fleet import Fleet, run_fleet
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.records import Records, one_series, rows
+from driftfit.records import Reading, Records, one_series, rows
 from driftfit.result import Track
+from driftfit.roles import check_roles
 from driftfit.settings import one_of
 from driftfit.signals import check_ready
 from driftfit.trackers.base import Tracker
@@ -23,6 +24,9 @@ from driftfit.warm import Run, carried, first_interval, fresh_tile
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
+
+Ranges = Mapping[Any, tuple[float | None, float | None]] | None
+"""From signals to their valid ranges."""
 
 CHUNK = 1_000_000
 """Samples between two looks at the progress bar."""
@@ -42,6 +46,8 @@ def track(
     weights: Any = 1.0,
     drift: Any = 1.0,
     units: Mapping[str, str] | None = None,
+    limits: Ranges = None,
+    exclude: Any = None,
     keep: str = "std",
     warm_start: Run | None = None,
     prob: Any = None,
@@ -62,6 +68,8 @@ def track(
     weights: Any = 1.0,
     drift: Any = 1.0,
     units: Mapping[str, str] | None = None,
+    limits: Ranges = None,
+    exclude: Any = None,
     keep: str = "std",
     warm_start: Fleet | None = None,
 ) -> Fleet: ...
@@ -80,6 +88,8 @@ def track(
     weights: Any = 1.0,
     drift: Any = 1.0,
     units: Mapping[str, str] | None = None,
+    limits: Ranges = None,
+    exclude: Any = None,
     keep: str = "std",
     warm_start: Any = None,
     prob: Any = None,
@@ -96,20 +106,23 @@ def track(
         How theta is followed, such as ``Kalman(q=1e-4, r=0.1)``. Without ``by`` several trackers are a grid of settings
         over the one record; with it they are the settings of each series, in order or by key.
     y : (T,), with by="row" (units, T), or the name of a column of ``data``
-        Output. NaN, inf and None are missing.
+        Output. NaN, inf and None are missing. A Series keeps its name; its index of dates labels the samples.
     u : (T,), (T, m) or None, with by="row" (units, T) or (units, T, m), or names of columns
-        Inputs.
+        Inputs. The columns of a data frame, of a mapping or of ``data`` go to a model with named inputs by name.
     data : table, path, pattern or list of paths
         A table that narwhals reads (pandas, polars, pyarrow), or CSV and Parquet files such as ``"runs/*.parquet"``.
         y, u, time, by, weights and drift are then names of its columns.
     time : (T,) numbers or datetimes, increasing, or the name of a column
         When the samples were taken. Drift scales with the interval, and a gap above 1.5 ``dt`` breaks the lags. Rows
-        of a table are put in order; of rows at the same time the first stands.
+        of a table are put in order; of rows at the same time the first stands. An index of dates of y or u stands for
+        it where it is not given, with ``dt="label"`` unless dt is.
     by : names of columns, "row" or None
         What tells the series of a table apart ("file": the file a row comes from). "row": every row of the array y is
         a series of its own.
-    dt : number or timedelta
-        Nominal interval in the unit of ``time``: 1 by default, required for datetimes.
+    dt : number, duration, step of the calendar or "label"
+        Nominal interval: in the unit of ``time`` 1 by default, required for datetimes ("1s", "15min", "30d", a
+        timedelta, "business day", "month", "quarter", "year", an offset of pandas; `driftfit.clock`). "label": times
+        are only labels, and samples are one step apart.
     weights : number or (T,)
         The noise variance of a sample is r / weight; 0 marks a sample that is not to be used.
     drift : number or (T,), or (T, n), with by="row" (units, T) or (units, T, n), or names of columns
@@ -118,6 +131,12 @@ def track(
         drift, `Kalman` and `ExtendedKalman` a drift of their own. For a `Bank` a column for each change.
     units : mapping from names of columns to their units, such as {"flow": "l/min"}
         Carried to summary, plots and exports.
+    limits : mapping from signals to (low, high), such as {"flow": (0, 80), "pressure": (None, 16)}
+        Valid ranges: a number outside is missing, and the summary counts it. Signals of arrays are "y", "u", "u1", ..,
+        the names of the model's inputs, or 0, 1, .. for the inputs.
+    exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
+        Stretches to leave out, both ends included, in times or, without time, in sample numbers: nothing of them is
+        used or reaches a lag, and the summary counts their samples (`driftfit.restrict`).
     keep : "std" or "cov"
         "cov" also stores the covariance of every sample, n * n numbers each.
     warm_start : Track, Live, Fleet or None
@@ -135,22 +154,31 @@ def track(
     ------
     ValueError
         Shapes that do not fit, times of arrays that do not increase, settings that are incomplete; columns that are not
-        there, cells that are not numbers, files that cannot be read. Missing and non-finite data never raise.
+        there, cells that are not numbers, files that cannot be read; names of inputs that are not those of the model,
+        indices of pandas that differ. Missing and non-finite data never raise.
+
+    Warns
+    -----
+    DataWarning
+        Where most samples cannot be used because of ``dt``.
     """
+    check_roles("track", model, tracker, several=True)
+    reading = Reading(time, dt, weights, drift, units, limits, exclude)
     if len(model.outputs) > 1:
         if prob is not None:
             raise ValueError("track: prob= is for one series and one tracker.")
         from driftfit.track_outputs import track_outputs
 
-        run = track_outputs(model, tracker, y, u, data, time, by, dt, weights, drift, units, keep, warm_start)
+        run = track_outputs(model, tracker, y, u, data, by, reading, keep, warm_start)
         return cast("Track", run)
     one_of("track", "keep", keep, ("std", "cov"))
-    records, failed = _records(y, u, data, time, by, dt, weights, drift, units)
+    records, failed = _records(y, u, data, by, reading)
+    records = records.for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
     if by is None and isinstance(tracker, Tracker):
         records = with_drifts(bound, [_checked(tracker, keep)], records, prob)
-        return _one(bound, tracker, records, keep, warm_start, dt)
+        return _one(bound, tracker, records, keep, warm_start)
     if prob is not None:
         raise ValueError("track: prob= is for one series and one tracker.")
     if by is None and not isinstance(tracker, Tracker):
@@ -160,24 +188,22 @@ def track(
     for one in set(trackers):
         _checked(one, keep)
     records = with_drifts(bound, trackers, records)
-    return run_fleet(bound, trackers, records, keep, failed, warm_start, dt)
+    return run_fleet(bound, trackers, records, keep, failed, warm_start)
 
 
-def _records(
-    y: Any, u: Any, data: Any, time: Any, by: Any, dt: Any, weights: Any, drift: Any, units: Any
-) -> tuple[Records, dict[Hashable, str]]:
+def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Records, dict[Hashable, str]]:
     """What is to be run, and the reasons of what cannot be."""
     if data is not None:
         from driftfit.tables import read_records  # narwhals and polars take as long to import as all the rest
 
-        return read_records(data, y, u, time, by, dt, weights, drift, units)
+        return read_records(data, y, u, by, reading)
     if by not in (None, "row"):
         raise ValueError(
             f"track: by={by!r} names a column of a table, so data= is needed; rows of arrays are by='row'."
         )
-    if units is not None:
+    if reading.units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
-    return (rows if by == "row" else one_series)(y, u, time, dt, weights, drift), {}
+    return (rows if by == "row" else one_series)(y, u, reading), {}
 
 
 def with_drifts(model: Model, trackers: Sequence[Tracker], records: Records, prob: Any = None) -> Records:
@@ -212,14 +238,14 @@ def _per_series(tracker: Trackers, keys: Sequence[Hashable]) -> list[Tracker]:
     return list(tracker)
 
 
-def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Run | None, dt: Any) -> Track:
+def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Run | None) -> Track:
     """Run the only series of ``records``."""
     y, u, time, known = records.part(0)
     start = None
     if before is not None:
         start = carried(before, model, tracker)
         known = known.copy()
-        known[0, 0] *= first_interval(before, None if time is None else time[0], dt)
+        known[0, 0] *= first_interval(before, None if time is None else time[0], records.labels)
     tile = fresh_tile(model, tracker, start)
     out = drive(model, tracker, tile, y, u, known, keep)
     return Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)

@@ -25,14 +25,15 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.records import one_series
+from driftfit.records import Reading, one_series
+from driftfit.roles import check_roles
 from driftfit.settings import one_of, whole
 from driftfit.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tuning.intervals import intervals_of
 from driftfit.tuning.knobs import find_knobs
 from driftfit.tuning.lanes import Record, score
-from driftfit.tuning.objective import along, objective
+from driftfit.tuning.objective import Criterion, along
 from driftfit.tuning.search import Counted, Search, minimise
 
 if TYPE_CHECKING:
@@ -129,15 +130,19 @@ def tune(
     dt: Any = None,
     weights: Any = 1.0,
     drift: Any = 1.0,
+    limits: Any = None,
+    exclude: Any = None,
 ) -> Tuned:
     """Find the settings that a tracker was left without: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
     ----------
-    model, y, u, time, dt, weights, drift
+    model, y, u, time, dt, weights, drift, limits, exclude
         As for `track`.
     tracker : Tracker
-        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays.
+        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays. Of a `Bank` the scales of
+        its changes are found, as factors of the standard deviations that it has, and their prior probabilities, by its
+        log evidence.
     method : "ml", "h-step", "loo" or "gcv"
         The criterion, see the module.
     groups : None, "each", or n labels
@@ -169,6 +174,7 @@ def tune(
     ValueError
         Nothing to find, a method that the tracker does not have, no usable sample, or what `track` refuses.
     """
+    check_roles("tune", model, tracker)
     one_of("tune", "method", method, METHODS)
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
@@ -179,12 +185,11 @@ def tune(
         from driftfit.tuning.outputs import tune_outputs
 
         options = (method, groups, h, bounds, level, order_by)
-        known = {"time": time, "dt": dt, "weights": weights, "drift": drift}
+        known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
         found = tune_outputs(model, tracker, y, u, known, lambda record: _tuned(record, tracker, *options))
         return cast("Tuned", found)
-    return _tuned(
-        _record(model, tracker, y, u, time, dt, weights, drift), tracker, method, groups, h, bounds, level, order_by
-    )
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    return _tuned(_record(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
@@ -194,7 +199,7 @@ def _tuned(
     if order_by is not None:
         record = along(record, tracker, order_by)
     knobs = find_knobs(record, tracker, groups, bounds)
-    f = Counted(objective(record, knobs, method, h))
+    f = Counted(Criterion(record, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
     final = score(record, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
@@ -229,8 +234,8 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _record(model: Model, tracker: Tracker, y: Any, u: Any, time: Any, dt: Any, weights: Any, drift: Any) -> Record:
-    records = one_series(y, u, time, dt, weights, drift)
-    bound = model.bind(records.u.shape[1])
+def _record(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Record:
+    records = one_series(y, u, reading).for_model(model, reading)
+    bound = model.bind(records.labels.u or records.u.shape[1])
     records = with_drifts(bound, [tracker], records)
     return Record(bound, records.y, records.u, records.known)

@@ -21,7 +21,6 @@ cumulated score. Cost: three constant fits, O(T n^2).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import StringIO
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -35,7 +34,7 @@ from driftfit.judges.regressors import Rows, regressors
 from driftfit.judges.whiteness import whiteness
 from driftfit.result import Track, root_mean_square
 from driftfit.settings import whole
-from driftfit.summary import WIDTH, facts, table_of
+from driftfit.summary import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "constant ARX")
 CORRELATED = 1e-3
@@ -65,7 +64,7 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Printed):
     """What `Track.verdict` returns; printing it shows it.
 
     Attributes
@@ -170,11 +169,6 @@ class Verdict:
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
-
-    def __str__(self) -> str:
-        text = StringIO()
-        Console(file=text, width=WIDTH, color_system=None).print(self)
-        return text.getvalue()
 
 
 def p_text(p: float) -> str:

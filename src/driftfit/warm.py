@@ -12,10 +12,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.clock import Clock, instant
 from driftfit.drivers import make_tile
 from driftfit.kernel import Array
 from driftfit.models.base import Model
-from driftfit.signals import interval_of
+from driftfit.records import Labels
 from driftfit.trackers.base import Tracker
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
@@ -23,12 +24,16 @@ _LEFT = ("interval", "noise", "drift", "each", "F")
 
 
 class End(NamedTuple):
-    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample."""
+    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample.
+
+    ``awaits`` says whether a stream still expects the input of that sample (`driftfit.late`).
+    """
 
     model: Model
     tracker: Tracker
     state: Mapping[str, Array]
     last: Any
+    awaits: int = 0
 
 
 class Run(Protocol):
@@ -65,12 +70,12 @@ def _same(one: Any, other: Any) -> bool:
     return np.shape(one) == np.shape(other) and bool(np.all(np.equal(one, other) | (np.not_equal(one, one))))
 
 
-def first_interval(run: Run, time: Any, dt: Any) -> float:
+def first_interval(run: Run, time: Any, labels: Labels) -> float:
     """Nominal intervals from the end of a run to the first sample of the next; 1 where either knows no time."""
     last = run.end().last
     if last is None or time is None:
         return 1.0
-    interval = interval_of(last, time, dt)
-    if not interval > 0.0:
+    interval = Clock.of(labels.dt, labels.zone).since(instant(last), instant(time))
+    if not interval >= 0.0:
         raise ValueError(f"warm_start: the record begins at {time}, not after the end of the run before, {last}.")
     return interval

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from driftfit.blocks.paths import split
+from driftfit.blocks.paths import Groups, minimal, split
 from driftfit.drivers import LARGEST
 from driftfit.kernel import Array
 from driftfit.models.basis import Polynomial
@@ -131,6 +131,6 @@ def _separated(model: HammersteinWiener, theta: Array, f: Array, y: Array) -> Co
     seen = y[np.abs(y) < LARGEST]
     grid = np.linspace(seen.min(), seen.max(), POINTS)
     level = np.maximum.accumulate(model.out.value(grid) @ d)
-    xi = model.structure.minimal(a, b, c, d, rest[0] if rest is not None else None)
+    xi = minimal(model, Groups(a, b, c, d), rest[0] if rest is not None else None)
     simulated = np.interp(w, level, grid)
     return Constant(theta, a, b, c, d, xi, simulated, np.interp(simulated, grid, np.gradient(level, grid)))

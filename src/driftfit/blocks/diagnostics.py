@@ -10,7 +10,7 @@
     trusted      excitation above a limit, slope above 0 and radius below 1
 
 The boundedness constants of Feng and Hong (2021), theorem 1, are no error bounds to be shown: they hold, and
-are too large by factors of 1e4 and more, as `driftfit reproduce hammerstein-wiener` measures.
+are too large by factors of 1e4 and more, as `python -m lab reproduce hammerstein-wiener` measures.
 
 Source: specification of the persistent excitation condition (42) there. Cost: O(n^3) per sample looked at.
 """

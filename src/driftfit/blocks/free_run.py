@@ -21,6 +21,7 @@ from driftfit.blocks.of_run import blocks_of
 from driftfit.blocks.paths import Blocks
 from driftfit.drivers import LARGEST
 from driftfit.kernel import Array
+from driftfit.models.basis import Thresholds
 from driftfit.models.block_curve import FAR, WIDER
 from driftfit.models.block_memory import GRID
 
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """``y``, ``w``, ``v`` (T,); ``rising`` and ``stable`` (T,) bool: where F increased and no pole was reflected."""
+    """``y``, ``w`` and ``v`` (T,), v the sum over all inputs; ``rising`` and ``stable`` (T,) bool: where F increased,
+    and where no pole was reflected.
+    """
 
     y: Array
     w: Array
@@ -49,7 +52,8 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
     begin = min(max(50, 5 * run.model.n), T) if start is None else max(int(start), 1)
     y, w, v = np.full((3, T), np.nan)
     result = FreeRun(y, w, v, np.ones(T, bool), np.ones(T, bool))
-    result.v[:] = inputs(found, run.u[:, 0])
+    nks, curves = found.model.delays, [inputs(found, run.u[:, i], i) for i in range(found.model.m)]
+    result.v[:] = np.sum(curves, axis=0)
     levels = np.sum(found.model.out.value(run.y) * found.d, axis=1)
     result.w[:begin] = np.where(np.isfinite(levels[:begin]), levels[:begin], 0.0)
     grid = _Grid(found, run.y)
@@ -60,28 +64,32 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
         if radius[t - 1] >= 1.0:
             a, result.stable[t] = reflected(a), False
         lags = result.w[max(t - na, 0) : t][::-1]
-        result.w[t] = _drive(found, result.v, t) - a[: len(lags)] @ lags
+        result.w[t] = _drive(found, curves, nks, t) - a[: len(lags)] @ lags
         result.y[t], result.rising[t] = grid.invert(found.d[t - 1], result.w[t])
     result.w[:begin] = np.nan
     return result
 
 
-def inputs(found: Blocks, u: Array) -> Array:
-    """v (T,), each with the coefficients after the sample before; a missing input is 0."""
-    late = np.concatenate([found.c[:1], found.c[:-1]])
-    if found.model.into.adaptive:
-        v = np.where(u >= late[:, 1], u - late[:, 1], np.where(u <= late[:, 2], u - late[:, 2], 0.0))
+def inputs(found: Blocks, u: Array, i: int = 0) -> Array:
+    """v (T,) of input i, each with the coefficients after the sample before; a missing input is 0."""
+    basis, c = found.model.bases[i], found.of_input(i)[1]
+    late = np.concatenate([c[:1], c[:-1]])
+    if isinstance(basis, Thresholds):
+        f = basis.split(u, u >= late[:, 1] / late[:, 0], u <= late[:, 2] / late[:, 0])
     else:
-        v = np.sum(found.model.into.value(u) * late, axis=1)
+        f = basis.value(u)
+    v = np.sum(f * late, axis=1)
     return np.where(np.abs(v) < LARGEST, v, 0.0)
 
 
-def _drive(found: Blocks, v: Array, t: int) -> float:
+def _drive(found: Blocks, curves: list[Array], nks: tuple[int, ...], t: int) -> float:
     """What the inputs add to w_t."""
-    nk = found.model.nk
-    past = v[max(t - nk - found.b.shape[1] + 1, 0) : t - nk + 1][::-1]
-    rest = 0.0 if found.intercept is None else found.intercept[t - 1]
-    return float(found.b[t - 1, : len(past)] @ past - rest)
+    total, at = 0.0 if found.intercept is None else -float(found.intercept[t - 1]), 0
+    for v, nb, nk in zip(curves, found.model.structure.nb, nks, strict=True):
+        past = v[max(t - nk - nb + 1, 0) : max(t - nk + 1, 0)][::-1]
+        total += float(found.b[t - 1, at : at + len(past)] @ past)
+        at += nb
+    return total
 
 
 def reflected(a: Array) -> Array:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.blocks.diagnostics import LEAST, excitation_of
+from driftfit.blocks.of_run import WEAK
 from driftfit.drivers import known_factors
 from driftfit.kernel import Array
 from driftfit.models.block_memory import MINIMAL
@@ -73,9 +74,17 @@ def hand_off(
     before = track(model, first, output[: last + 1], inputs[: last + 1])
     found = before.blocks("gls")
     assert found.cov is not None
+    head = np.abs(found.c[-1, 0])
+    if head < WEAK:
+        raise ValueError(
+            f"hand_off: {type(then).__name__} has c_1 = 1, but with |c| = 1 the curve has c_1 = {head:.1g}; order the "
+            "functions of the input block so that the first matters."
+        )
     if not np.isfinite(found.cov[-1]).all():
         raise ValueError(f"hand_off: the covariance of stage one is not finite at sample {last}; hand over later.")
-    P = widen * 0.5 * (found.cov[-1] + found.cov[-1].T)
+    cov = found.xi_cov
+    assert cov is not None
+    P = widen * 0.5 * (cov[-1] + cov[-1].T)
     tracker = replace(then, theta0=found.xi[-1], p0=P)
     bound = before.model
     ends, own = before.end().state, tracker.state_for(bound)

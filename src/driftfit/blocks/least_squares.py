@@ -1,8 +1,10 @@
 """Separation by generalised least squares: the minimal parameters nearest to theta in the metric of its covariance.
 
-    xi = argmin (theta - g(xi))' P^-1 (theta - g(xi)),     cov(xi) = (J' P^-1 J)^-1
+    zeta = argmin (theta - g(zeta))' P^-1 (theta - g(zeta)),     |c| = 1 for each input
+    cov(zeta) = (J' P^-1 J)^-1 over the directions with c'dc = 0,       J = dg/dzeta
 
-by Levenberg-Marquardt steps from another separation. Its standard deviations are those of the delta method under the
+with zeta = (a, b, c, d_2 .., l), by Levenberg-Marquardt steps from another separation. That all of c is free keeps the
+problem well posed where c_1 = 0. Its standard deviations are those of the delta method under the
 filter's own P, and only as good as q and r. P is scaled to a unit diagonal before its Cholesky factor is taken, with
 1e-13 added to the diagonal: a prior of 1e8 leaves computed eigenvalues below zero in every form that is no square root.
 
@@ -53,50 +55,126 @@ def whiten(L: Array, scale: Array, x: Array) -> None:
 
 
 @shared
-def residual(theta: Array, xi: Array, orders: tuple[int, int, int, int], out: Array) -> None:
-    """theta - g(xi)."""
-    na, nb, n_in, n_out = orders
-    at_d = na + nb
-    at_bc, x_c, x_d = at_d + n_out - 1, at_d, at_d + n_in - 1
-    at_ad = at_bc + nb * (n_in - 1)
-    for i in range(theta.shape[0]):
-        out[i] = theta[i]
-    for i in range(at_d):
-        out[i] -= xi[i]
-    for k in range(n_out - 1):
-        out[at_d + k] -= xi[x_d + k]
-        for i in range(na):
-            out[at_ad + k * na + i] -= xi[x_d + k] * xi[i]
-    for k in range(n_in - 1):
+def residual(theta: Array, zeta: Array, orders: tuple[int, int], sizes: Array, out: Array) -> None:
+    """theta - g(zeta)."""
+    na, n_out = orders
+    inputs, at_d, at_c = sizes.shape[1], na, na
+    for i in range(inputs):
+        at_d, at_c = at_d + sizes[0, i], at_c + sizes[0, i]
+    row, at_b = at_d + n_out - 1, na
+    for i in range(na):
+        out[i] = theta[i] - zeta[i]
+    for i in range(inputs):
+        nb, n_in = sizes[0, i], sizes[1, i]
         for j in range(nb):
-            out[at_bc + k * nb + j] -= xi[x_c + k] * xi[na + j]
-    last = at_ad + na * (n_out - 1)
-    for i in range(last, theta.shape[0]):
-        out[i] -= xi[x_d + n_out - 1]
+            out[at_b + j] = theta[at_b + j] - zeta[at_c] * zeta[at_b + j]
+        for k in range(1, n_in):
+            for j in range(nb):
+                out[row] = theta[row] - zeta[at_c + k] * zeta[at_b + j]
+                row += 1
+        at_b, at_c = at_b + nb, at_c + n_in
+    for k in range(n_out - 1):
+        out[at_d + k] = theta[at_d + k] - zeta[at_c + k]
+        for i in range(na):
+            out[row] = theta[row] - zeta[at_c + k] * zeta[i]
+            row += 1
+    for i in range(row, theta.shape[0]):
+        out[i] = theta[i] - zeta[at_c + n_out - 1]
 
 
 @shared
-def jacobian(xi: Array, orders: tuple[int, int, int, int], J: Array) -> None:
-    """dg/dxi, transposed: J (n_x, n)."""
-    na, nb, n_in, n_out = orders
-    at_d = na + nb
-    at_bc, x_c, x_d = at_d + n_out - 1, at_d, at_d + n_in - 1
-    at_ad = at_bc + nb * (n_in - 1)
+def jacobian(zeta: Array, orders: tuple[int, int], sizes: Array, J: Array) -> None:
+    """dg/dzeta, transposed: J (n_z, n)."""
+    na, n_out = orders
+    inputs, at_d, at_c = sizes.shape[1], na, na
+    for i in range(inputs):
+        at_d, at_c = at_d + sizes[0, i], at_c + sizes[0, i]
+    row, at_b = at_d + n_out - 1, na
     J[:] = 0.0
-    for i in range(at_d):
+    for i in range(na):
         J[i, i] = 1.0
-    for k in range(n_out - 1):
-        J[x_d + k, at_d + k] = 1.0
-        for i in range(na):
-            J[i, at_ad + k * na + i] = xi[x_d + k]
-            J[x_d + k, at_ad + k * na + i] = xi[i]
-    for k in range(n_in - 1):
+    for i in range(inputs):
+        nb, n_in = sizes[0, i], sizes[1, i]
         for j in range(nb):
-            J[na + j, at_bc + k * nb + j] = xi[x_c + k]
-            J[x_c + k, at_bc + k * nb + j] = xi[na + j]
-    last = at_ad + na * (n_out - 1)
-    for i in range(last, J.shape[1]):
-        J[x_d + n_out - 1, i] = 1.0
+            J[at_b + j, at_b + j] = zeta[at_c]
+            J[at_c, at_b + j] = zeta[at_b + j]
+        for k in range(1, n_in):
+            for j in range(nb):
+                J[at_b + j, row] = zeta[at_c + k]
+                J[at_c + k, row] = zeta[at_b + j]
+                row += 1
+        at_b, at_c = at_b + nb, at_c + n_in
+    for k in range(n_out - 1):
+        J[at_c + k, at_d + k] = 1.0
+        for i in range(na):
+            J[i, row] = zeta[at_c + k]
+            J[at_c + k, row] = zeta[i]
+            row += 1
+    for i in range(row, J.shape[1]):
+        J[at_c + n_out - 1, i] = 1.0
+
+
+@shared
+def starts(na: int, sizes: Array) -> tuple[int, int]:
+    """Where b and c begin in zeta."""
+    at_c = na
+    for i in range(sizes.shape[1]):
+        at_c += sizes[0, i]
+    return na, at_c
+
+
+@shared
+def rescale(zeta: Array, na: int, sizes: Array) -> None:
+    """The same products with |c| = 1 for each input."""
+    at_b, at_c = starts(na, sizes)
+    for i in range(sizes.shape[1]):
+        b, c = zeta[at_b : at_b + sizes[0, i]], zeta[at_c : at_c + sizes[1, i]]
+        size = np.sqrt(np.sum(c * c))
+        for j in range(len(b)):
+            b[j] *= size
+        for k in range(len(c)):
+            c[k] /= size
+        at_b, at_c = at_b + len(b), at_c + len(c)
+
+
+@shared
+def hold_scales(zeta: Array, na: int, sizes: Array, N: Array) -> None:
+    """Add c c' to N for each input, as large as what stands there: it moves no product, and c'dc = 0 follows."""
+    _, at_c = starts(na, sizes)
+    for i in range(sizes.shape[1]):
+        last = at_c + sizes[1, i]
+        weight = 0.0
+        for k in range(at_c, last):
+            weight += N[k, k]
+        weight = weight if weight > 0.0 else 1.0
+        for k in range(at_c, last):
+            for h in range(at_c, k + 1):
+                N[k, h] += weight * zeta[k] * zeta[h]
+        at_c = last
+
+
+@shared
+def project(zeta: Array, na: int, sizes: Array, cov: Array, v: Array, h: Array) -> None:
+    """cov <- (I - v g') cov (I - v g')', g = (0, c) and v = (-b, c): what is left has c'dc = 0 for each input."""
+    at_b, at_c = starts(na, sizes)
+    for i in range(sizes.shape[1]):
+        v[:] = 0.0
+        for j in range(at_b, at_b + sizes[0, i]):
+            v[j] = -zeta[j]
+        for k in range(at_c, at_c + sizes[1, i]):
+            v[k] = zeta[k]
+        s = 0.0
+        for x in range(len(v)):
+            h[x] = 0.0
+            for k in range(at_c, at_c + sizes[1, i]):
+                h[x] += cov[x, k] * zeta[k]
+        for k in range(at_c, at_c + sizes[1, i]):
+            s += zeta[k] * h[k]
+        for x in range(len(v)):
+            for z in range(x + 1):
+                cov[x, z] -= v[x] * h[z] + h[x] * v[z] - s * v[x] * v[z]
+                cov[z, x] = cov[x, z]
+        at_b, at_c = at_b + sizes[0, i], at_c + sizes[1, i]
 
 
 @shared
@@ -128,10 +206,13 @@ def solve(N: Array, damping: float, right: Array, C: Array, step: Array) -> bool
 
 
 @shared
-def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array, cov: Array, cost: Array) -> None:
-    """Refine xi (T, n_x) in place; fill cov (T, n_x, n_x) and cost (T,), NaN where P is no finite covariance."""
+def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: Array, cov: Array, cost: Array) -> None:
+    """Refine zeta (T, n_z) in place; fill cov (T, n_z, n_z) and cost (T,), NaN where P is no finite covariance.
+
+    ``orders`` are na and n_out, ``sizes`` (2, inputs) nb and n_in of the inputs; zeta has |c| = 1.
+    """
     T, n = theta.shape
-    n_x = xi.shape[1]
+    n_x = zeta.shape[1]
     L, scale, rho, trial = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n)
     J, N, C = np.zeros((n_x, n)), np.zeros((n_x, n_x)), np.zeros((n_x, n_x))
     right, step, moved = np.zeros(n_x), np.zeros(n_x), np.zeros(n_x)
@@ -140,15 +221,15 @@ def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array,
         cost[t] = np.nan
         if not factor(P[t], scale, L):
             continue
-        now = xi[t]
-        residual(theta[t], now, orders, rho)
+        now = zeta[t]
+        residual(theta[t], now, orders, sizes, rho)
         whiten(L, scale, rho)
         best = 0.0
         for i in range(n):
             best += rho[i] * rho[i]
         damping = 0.0
         for _ in range(STEPS):
-            jacobian(now, orders, J)
+            jacobian(now, orders, sizes, J)
             for x in range(n_x):
                 whiten(L, scale, J[x])
             for x in range(n_x):
@@ -161,12 +242,13 @@ def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array,
                     for i in range(n):
                         total += J[x, i] * J[z, i]
                     N[x, z] = total
+            hold_scales(now, orders[0], sizes, N)
             better = False
             for _ in range(10):
                 if solve(N, damping, right, C, step):
                     for x in range(n_x):
                         moved[x] = now[x] + step[x]
-                    residual(theta[t], moved, orders, trial)
+                    residual(theta[t], moved, orders, sizes, trial)
                     whiten(L, scale, trial)
                     value = 0.0
                     for i in range(n):
@@ -180,12 +262,13 @@ def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array,
             gain = best - value
             best = value
             now[:] = moved
+            rescale(now, orders[0], sizes)
             rho[:] = trial
             damping = 0.0 if damping < 1e-3 else 0.1 * damping
             if gain <= 1e-12 * best or gain == 0.0:
                 break
         cost[t] = best
-        jacobian(now, orders, J)
+        jacobian(now, orders, sizes, J)
         for x in range(n_x):
             whiten(L, scale, J[x])
         for x in range(n_x):
@@ -194,6 +277,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array,
                 for i in range(n):
                     total += J[x, i] * J[z, i]
                 N[x, z] = total
+        hold_scales(now, orders[0], sizes, N)
         for x in range(n_x):
             right[:] = 0.0
             right[x] = 1.0
@@ -204,3 +288,4 @@ def refine(theta: Array, P: Array, orders: tuple[int, int, int, int], xi: Array,
         for x in range(n_x):
             for z in range(x):
                 cov[t, z, x] = cov[t, x, z]
+        project(now, orders[0], sizes, cov[t], right, step)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.blocks.least_squares import refine
-from driftfit.blocks.paths import Blocks, Groups, split
+from driftfit.blocks.paths import Blocks, Groups, deviations, split
 from driftfit.blocks.separate import METHODS
 from driftfit.drivers import drivers, output_type
 from driftfit.kernel import Array
@@ -24,7 +24,9 @@ WEAK = 1e-3
 """1 / |(1, c)| below this: the first coefficient is next to nothing beside the others, and a bad gauge."""
 
 
-def blocks_of(run: Track, method: str = "svd-joint", input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+def blocks_of(
+    run: Track, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+) -> Blocks:
     """The blocks of a run; see `Track.blocks`."""
     model = run.model
     if not isinstance(model, HammersteinWiener):
@@ -38,15 +40,15 @@ def blocks_of(run: Track, method: str = "svd-joint", input: str = "c1", output: 
         a, b, c, d, quality = split(model, run.theta, method)
         none = Groups(*(np.full(part.shape, np.nan) for part in (a, b, c, d)))
         found = Blocks(model, method, a, b, c, d, quality, none, _intercept(run))
-    _warn(found, run)
-    return found if (input, output) == ("c1", "d1") else found.gauge(input, output, at)
+    _warn(found, run, input)
+    return found.gauge(found.gauged[0] if input is None else input, output, at)
 
 
 def _intercept(run: Track) -> Array | None:
     return run.theta[:, -1].copy() if getattr(run.model, "intercept", False) else None
 
 
-def _warn(found: Blocks, run: Track) -> None:
+def _warn(found: Blocks, run: Track, input: str | None) -> None:
     """Say where a separation cannot be relied on."""
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
@@ -56,14 +58,17 @@ def _warn(found: Blocks, run: Track) -> None:
             stacklevel=4,
         )
     late = slice(min(len(found) // 2, 5 * run.model.n), None)
-    with np.errstate(invalid="ignore"):
-        heads = 1.0 / np.linalg.norm(found.c[late], axis=1), 1.0 / np.linalg.norm(found.d[late], axis=1)
-    for head, name, other in zip(heads, ("c_1", "d_1"), ('input="b1"', 'output="slope"'), strict=True):
+    minimal = found.gauged[0] == "c1"
+    curves = [found.of_input(i)[1] for i in range(found.model.m)] if input == "c1" or minimal else []
+    ways = ("follow the products, with Kalman" if minimal else 'use input="unit"', "use Legendre on the range of y")
+    for group, name, way in (*((c, "c_1", ways[0]) for c in curves), (found.d, "d_1", ways[1])):
+        size = np.linalg.norm(group[late], axis=1)
+        head = np.divide(np.abs(group[late, 0]), size, out=np.full(len(size), np.nan), where=size > 0.0)
         usual = float(np.nanmedian(head)) if np.isfinite(head).any() else 1.0
         if usual < WEAK:
             warnings.warn(
                 f"blocks: {name} = 1 is a bad gauge here, the other coefficients are {1.0 / usual:.3g} times as large; "
-                f"order the functions so that the first matters, or use {other}.",
+                f"order the functions so that the first matters, or {way}.",
                 UserWarning,
                 stacklevel=4,
             )
@@ -79,20 +84,17 @@ def _warn(found: Blocks, run: Track) -> None:
             )
 
 
-def _groups_std(model: HammersteinWiener, var: Array) -> Groups:
-    """Standard deviations of the groups from variances of xi; those of the leading 1 are 0."""
-    parts = model.structure.groups(np.sqrt(np.maximum(var, 0.0)))
-    zero = [np.concatenate([np.zeros((*part.shape[:-1], 1)), part[..., 1:]], axis=-1) for part in parts[2:]]
-    return Groups(parts[0], parts[1], *zero)
-
-
 def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
     """The blocks of a tracker that follows the minimal parameters themselves."""
     a, b, c, d = model.structure.groups(run.theta)
-    P = run._written("P") if "P" in (run._out.dtype.names or ()) else None
-    std = _groups_std(model, run._written("var"))
-    exact = np.zeros((len(run), 2))
-    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), P)
+    at = model.structure.na + sum(model.structure.nb)
+    fixed = [at, at + model.structure.n_in[0] - 1]  # c_1 and d_1, before which free entries of xi they stand
+    var = np.insert(run._written("var"), fixed, 0.0, axis=1)
+    cov = None
+    if "P" in (run._out.dtype.names or ()):
+        cov = np.insert(np.insert(run._written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    exact, std = np.zeros((len(run), 2)), deviations(model, var)
+    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
 
 
 def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
@@ -100,17 +102,21 @@ def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
     if not run.tracker.covariance:
         raise ValueError(f'blocks: "gls" weighs by the covariance, and {type(run.tracker).__name__} carries none.')
     a, b, c, d, quality = split(model, run.theta, "svd-joint")
-    xi = np.ascontiguousarray(model.structure.minimal(a, b, c, d, _intercept(run)))
-    T, n_x = xi.shape
-    cov, cost = np.empty((T, n_x, n_x)), np.empty(T)
+    rest, at = _intercept(run), a.shape[1] + b.shape[1] + c.shape[1]
+    zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
+    T, n_z = zeta.shape
+    cov, cost = np.empty((T, n_z, n_z)), np.empty(T)
+    orders, sizes = (model.na, model.out.n), model.structure.sizes
     for first, P in covariances(run):
         part = slice(first, first + len(P))
         theta = np.ascontiguousarray(run.theta[part])
-        refine(theta, P, tuple(model.structure[:4]), xi[part], cov[part], cost[part])
-    a, b, c, d = model.structure.groups(xi)
-    std = _groups_std(model, np.einsum("tii->ti", cov))
-    intercept = xi[:, -1] if model.intercept else None
-    return Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost)
+        refine(theta, P, orders, sizes, zeta[part], cov[part], cost[part])
+    cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # of d_1
+    x = np.insert(zeta, at, 1.0, axis=1)
+    a, b, c, d, more = np.split(x, np.cumsum([a.shape[1], b.shape[1], c.shape[1], d.shape[1]]), axis=1)
+    std, intercept = deviations(model, np.einsum("tii->ti", cov)), more[:, 0] if model.intercept else None
+    found = Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost, ("free", "d1"))
+    return found.gauge()
 
 
 def covariances(run: Track) -> Any:

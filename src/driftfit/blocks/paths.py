@@ -2,30 +2,34 @@
 
     v = sum_k c_k f_k(u),   w_t = -sum_i a_i w_{t-i} + sum_j b_j v_{t-nk-j+1},   F(y) = sum_k d_k g_k(y) = w
 
-Two of the scales are free. The gauge of the model is c_1 = d_1 = 1; `Blocks.gauge` rescales,
+The scales of v (of each input) and of w are free. A gauge fixes them,
 
-    input "c1", "b1"     c_1 = 1, or b_1 = 1: the gain stands in the curve
-    output "d1", "slope"  d_1 = 1, or F'(at) = 1: w has the unit of y at the working point
+    input "unit", "c1", "b1"       |c| = 1 and the curve rises; c_1 = 1; or b_1 = 1: the gain stands in the curve
+    output "d1", "unit", "slope"   d_1 = 1; |d| = 1; or F'(at) = 1: w has the unit of y at the working point
 
-and takes standard deviations along by the delta method. Ratios such as b_j / b_1, and the local gain b_1 / F', depend
-on no gauge.
+and `Blocks.gauge` goes from one to another and takes standard deviations along by the delta method. "unit" cannot
+degenerate; c_1 = 1, the gauge of Feng and Hong (2021), makes the other coefficients infinite where c_1 passes zero, as
+in a valve that is dead about 0. A curve counts as rising where it is higher at the upper end of its range than at 0, or
+the point of the range nearest to it. Ratios such as b_j / b_1, and the local gain b_1 / F', depend on no gauge.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.blocks.separate import METHODS, separate
 from driftfit.kernel import Array
 from driftfit.models.base import Model
+from driftfit.models.basis import Thresholds
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.settings import one_of
 
-if TYPE_CHECKING:
-    pass
+INPUTS, OUTPUTS = ("unit", "c1", "b1"), ("d1", "unit", "slope")
 
 
 class Groups(NamedTuple):
@@ -44,18 +48,20 @@ class Blocks:
     Attributes
     ----------
     a, b, c, d : (T, na), (T, nb), (T, n_in), (T, n_out)
-        Coefficients after each sample.
+        Coefficients after each sample; b and c of several inputs stand side by side, see `of_input`.
     names : Groups of tuples of str
     quality : (T, 2)
         sigma_2 / sigma_1 of [b, BC] and of [a, AD]: 0 for an exact product, near 1 where there is none.
     std : Groups
         Standard deviations; NaN unless the method is "gls" or the tracker followed the minimal parameters.
-    cov : (T, n_x, n_x) or None
-        Covariance of the minimal parameters in the gauge of the model.
+    cov : (T, k, k) or None
+        Covariance of a, b, c, d and the intercept in this gauge, which leaves it singular.
     intercept : (T,) or None
         d_0 (1 + sum a) - c_0 sum b, if the model has one.
     cost : (T,) or None
-        Of "gls", (theta - g(xi))' P^-1 (theta - g(xi)).
+        Of "gls", (theta - g(zeta))' P^-1 (theta - g(zeta)).
+    gauged : (str, str)
+        The gauge.
     """
 
     model: HammersteinWiener
@@ -69,7 +75,7 @@ class Blocks:
     intercept: Array | None = None
     cov: Array | None = None
     cost: Array | None = None
-    gauged: tuple[str, str] = ("c1", "d1")
+    gauged: tuple[str, str] = ("unit", "d1")
 
     def __len__(self) -> int:
         return len(self.b)
@@ -79,15 +85,24 @@ class Blocks:
 
     @property
     def names(self) -> Groups:
-        counts = zip("abcd", (self.a, self.b, self.c, self.d), strict=True)
-        return Groups(*(tuple(f"{name}{k + 1}" for k in range(part.shape[1])) for name, part in counts))  # type: ignore[arg-type]
+        return Groups(*(self.model.called(group) for group in self.model.structure.groups_names))  # type: ignore[arg-type]
 
     @property
     def xi(self) -> Array:
-        """The minimal parameters, (T, n_x), in the gauge of the model."""
-        if self.gauged != ("c1", "d1"):
-            raise ValueError("xi: minimal parameters belong to the gauge c_1 = d_1 = 1; take them before `gauge`.")
-        return self.model.structure.minimal(self.a, self.b, self.c, self.d, self.intercept)
+        """The minimal parameters, (T, n_x), which have c_1 = d_1 = 1; ValueError where c_1 is 0."""
+        found = self.gauge("c1", "d1")
+        return self.model.structure.minimal(found.a, found.b, found.c, found.d, found.intercept)
+
+    @property
+    def xi_cov(self) -> Array | None:
+        """Covariance of the minimal parameters, (T, n_x, n_x), if that of the blocks is known."""
+        cov = self.gauge("c1", "d1").cov
+        if cov is None:
+            return None
+        structure = self.model.structure
+        c = structure.na + sum(structure.nb)
+        fixed = [*(c + structure.leads), c + sum(structure.n_in)]
+        return np.delete(np.delete(cov, fixed, axis=1), fixed, axis=2)
 
     @property
     def radius(self) -> Array:
@@ -103,13 +118,17 @@ class Blocks:
         found[known] = np.abs(np.linalg.eigvals(companion[known])).max(axis=1)
         return found
 
-    def input_curve(self, u: Any, t: int = -1) -> Array:
-        """v at inputs u (...), with the coefficients of sample t."""
-        return np.asarray(self._basis(t).value(u) @ self.c[t])
+    def of_input(self, i: int = 0) -> tuple[Array, Array]:
+        """b (T, nb) and c (T, n_in) of input i, a number from 0 on."""
+        structure = self.model.structure
+        return structure.of_inputs(self.b, structure.nb)[i], structure.of_inputs(self.c, structure.n_in)[i]
 
-    def _basis(self, t: int) -> Any:
-        into = self.model.into
-        return into.known(self.c[t, 1], self.c[t, 2]) if into.adaptive else into  # type: ignore[attr-defined]
+    def input_curve(self, u: Any, t: int = -1, i: int = 0) -> Array:
+        """v of input i at inputs u (...), with the coefficients of sample t."""
+        basis, c = self.model.bases[i], self.of_input(i)[1][t]
+        if isinstance(basis, Thresholds):
+            basis = basis.known(c[1] / c[0], c[2] / c[0])
+        return np.asarray(basis.value(u) @ c)
 
     def output_curve(self, y: Any, t: int = -1) -> Array:
         """w = F(y) at outputs y (...), with the coefficients of sample t: the inverse of the output block."""
@@ -119,78 +138,137 @@ class Blocks:
         """F'(y_t; d_t), (T,), for y (T,) or one number."""
         return np.asarray(np.sum(self.model.out.derivative(np.broadcast_to(y, len(self))) * self.d, axis=1))
 
-    def gauge(self, input: str = "c1", output: str = "d1", at: float = 0.0) -> Blocks:
+    def gauge(self, input: str = "unit", output: str = "d1", at: float = 0.0) -> Blocks:
         """The same system in another gauge.
 
         Parameters
         ----------
-        input : "c1" or "b1"
-            Which coefficient is 1.
-        output : "d1" or "slope"
-            d_1 = 1, or F'(at) = 1.
+        input : "unit", "c1" or "b1"
+            What is 1: the size of c, with the sign of a curve that rises, c_1 or b_1.
+        output : "d1", "unit" or "slope"
+            d_1 = 1, |d| = 1 with d_1 > 0, or F'(at) = 1.
         at : number
             Working point of y.
 
         Raises
         ------
         ValueError
-            If these paths are not in the gauge of the model, or a scale passes zero.
+            If the coefficient that is to be 1 is 0 in some sample.
         """
-        one_of("gauge", "input", input, ("c1", "b1"))
-        one_of("gauge", "output", output, ("d1", "slope"))
-        if self.gauged != ("c1", "d1"):
-            raise ValueError(f"gauge: these paths are in the gauge {self.gauged} already; begin with the original.")
-        slopes = self.model.out.derivative(float(at))
-        level = self.d @ slopes if output == "slope" else np.ones(len(self))
-        gain = self.b[:, 0] / level if input == "b1" else np.ones(len(self))
-        if not (level != 0.0).all() or not (gain != 0.0).all():
-            raise ValueError("gauge: the coefficient that is to be 1 passes zero; choose another gauge.")
-        L, G = level[:, None], gain[:, None]
-        std = self._std(L, G, slopes, input, output)
-        rest = None if self.intercept is None else self.intercept / level
-        return replace(
-            self, b=self.b / L / G, c=self.c * G, d=self.d / L, std=std, intercept=rest, gauged=(input, output)
-        )
+        one_of("gauge", "input", input, INPUTS)
+        one_of("gauge", "output", output, OUTPUTS)
+        if (input, output) == self.gauged and output != "slope":
+            return self
+        x, spans = self._together()
+        level, rate = _output_scale(self, output, at, x, spans)
+        scale, rates = np.ones(x.shape), np.zeros((self.model.m, *x.shape))
+        for own in spans.d, spans.rest:
+            scale[:, own] /= level[:, None]
+        for i, (b, c) in enumerate(zip(spans.b, spans.c, strict=True)):
+            gain, rates[i] = _input_scale(self, input, i, (level, rate), x, spans)
+            scale[:, b] *= (gain / level)[:, None]
+            scale[:, c] /= gain[:, None]
+        if not np.isfinite(scale).all() and np.isfinite(x).all():
+            raise ValueError('gauge: the coefficient that is to be 1 passes zero; choose input="unit", output="d1".')
+        cov = None if self.cov is None else _carried(self.cov, x * scale, scale, rate, rates, spans)
+        return self._apart(x * scale, cov, (input, output), spans)
 
-    def _std(self, L: Array, G: Array, slopes: Array, input: str, output: str) -> Groups:
-        """Standard deviations after a change of gauge, by the delta method."""
-        if self.cov is None or (input, output) == ("c1", "d1"):
-            return self.std
-        na, nb, n_in, n_out, _ = self.model.structure
-        T, n_x = len(self), self.cov.shape[1]
-        parts = [np.zeros((T, k, n_x)) for k in (na, nb, n_in, n_out)]
-        x_c, x_d = na + nb, na + nb + n_in - 1
-        parts[0][:, range(na), range(na)] = 1.0
-        parts[1][:, range(nb), range(na, na + nb)] = 1.0
-        parts[2][:, range(1, n_in), range(x_c, x_d)] = 1.0
-        parts[3][:, range(1, n_out), range(x_d, x_d + n_out - 1)] = 1.0
-        d_level, d_gain = np.zeros((T, n_x)), np.zeros((T, n_x))
-        if output == "slope":
-            d_level[:, x_d : x_d + n_out - 1] = slopes[1:]
-        if input == "b1":
-            d_gain = (parts[1][:, 0] - G * d_level) / L
-        rate_l, rate_g = (d_level / L)[:, None], (d_gain / G)[:, None]
-        J = (
-            parts[0],
-            (parts[1] - self.b[..., None] * (rate_l + rate_g)) / (L * G)[..., None],
-            (parts[2] + self.c[..., None] * rate_g) * G[..., None],
-            (parts[3] - self.d[..., None] * rate_l) / L[..., None],
-        )
-        with np.errstate(invalid="ignore"):
-            return Groups(*(np.sqrt(np.maximum(np.einsum("tix,txz,tiz->ti", j, self.cov, j), 0.0)) for j in J))
+    def _together(self) -> tuple[Array, _Spans]:
+        """a, b, c, d and the intercept side by side, (T, k), and where they stand."""
+        rest = [] if self.intercept is None else [self.intercept[:, None]]
+        return np.concatenate([self.a, self.b, self.c, self.d, *rest], axis=1), _spans(self.model)
+
+    def _apart(self, x: Array, cov: Array | None, gauged: tuple[str, str], spans: _Spans) -> Blocks:
+        """The blocks with other coefficients."""
+        if gauged[0] == "b1":
+            x[:, [b.start for b in spans.b]] = 1.0
+        _a, b, c, d, rest = np.split(x, [spans.b[0].start, spans.c[0].start, spans.d.start, spans.d.stop], axis=1)
+        intercept = rest[:, 0] if rest.size else None
+        std = Groups(self.std.a, *(np.full(part.shape, np.nan) for part in (b, c, d)))
+        if cov is not None:
+            std = deviations(self.model, np.einsum("tii->ti", cov))
+        return replace(self, b=b, c=c, d=d, std=std, intercept=intercept, cov=cov, gauged=gauged)
+
+
+class _Spans(NamedTuple):
+    """Where b and c of each input, d and the intercept stand among all coefficients."""
+
+    b: list[slice]
+    c: list[slice]
+    d: slice
+    rest: slice
+
+
+@lru_cache
+def _spans(model: HammersteinWiener) -> _Spans:
+    na, nb, n_in, n_out, intercept = model.structure
+    ends = np.cumsum([na, *nb, *n_in, n_out, intercept]).tolist()
+    all_of = [slice(first, last) for first, last in pairwise(ends)]
+    return _Spans(all_of[: len(nb)], all_of[len(nb) : -2], all_of[-2], all_of[-1])
+
+
+def _output_scale(found: Blocks, output: str, at: float, x: Array, spans: _Spans) -> tuple[Array, Array]:
+    """L (T,), by which d is divided, and d log L / dx (T, k)."""
+    rate = np.zeros(x.shape)
+    if output == "unit":
+        level = np.copysign(np.linalg.norm(found.d, axis=1), found.d[:, 0])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rate[:, spans.d] = found.d / level[:, None] ** 2
+        return level, rate
+    weights = np.eye(1, found.d.shape[1])[0] if output == "d1" else found.model.out.derivative(float(at))
+    level = found.d @ weights
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate[:, spans.d] = weights / level[:, None]
+    return level, rate
+
+
+def _input_scale(
+    found: Blocks, input: str, i: int, output: tuple[Array, Array], x: Array, spans: _Spans
+) -> tuple[Array, Array]:
+    """S (T,), by which c of input i is divided, and d log S / dx (T, k)."""
+    rate = np.zeros(x.shape)
+    own, lead = x[:, spans.c[i]], spans.c[i].start
+    rise = found.model.structure.of_inputs(found.model.rise, found.model.structure.n_in)[i]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if input == "unit" and rise.any():
+            gain = np.where(own @ rise >= 0.0, 1.0, -1.0) * np.linalg.norm(own, axis=1)
+            rate[:, spans.c[i]] = own / gain[:, None] ** 2
+        elif input == "b1":
+            first = spans.b[i].start
+            gain = output[0] / x[:, first]
+            rate += output[1]
+            rate[:, first] -= 1.0 / x[:, first]
+        else:
+            gain = x[:, lead].copy()
+            rate[:, lead] = 1.0 / gain
+    return gain, rate
+
+
+def _carried(cov: Array, x: Array, scale: Array, level: Array, gains: Array, spans: _Spans) -> Array:
+    """J cov J' of a change of gauge, x (T, k) the coefficients after it: J = diag(scale) + x r'."""
+    J = np.zeros(cov.shape)
+    J[:, range(x.shape[1]), range(x.shape[1])] = scale
+    for own in spans.d, spans.rest:
+        J[:, own] -= x[:, own, None] * level[:, None]
+    for b, c, gain in zip(spans.b, spans.c, gains, strict=True):
+        J[:, b] += x[:, b, None] * (gain - level)[:, None]
+        J[:, c] -= x[:, c, None] * gain[:, None]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(J @ cov @ J.transpose(0, 2, 1))
+
+
+def deviations(model: HammersteinWiener, var: Array) -> Groups:
+    """Standard deviations of the groups, from the variances of all coefficients (T, k)."""
+    na, nb, n_in, n_out, _ = model.structure
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(np.maximum(var, 0.0))
+    return Groups(*np.split(std, np.cumsum([na, sum(nb), sum(n_in), n_out]), axis=1)[:4])
 
 
 def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array, Array, Array, Array]:
     """a, b, c, d and quality to be filled."""
     na, nb, n_in, n_out, _ = model.structure
-    return np.empty((T, na)), np.empty((T, nb)), np.empty((T, n_in)), np.empty((T, n_out)), np.empty((T, 2))
-
-
-def split(model: HammersteinWiener, theta: Array, method: str) -> tuple[Array, Array, Array, Array, Array]:
-    """a, b, c, d and quality from theta (T, n) by one of the first three methods."""
-    parts = empty(model, len(theta))
-    separate(np.ascontiguousarray(theta, dtype=float), tuple(model.structure[:4]), METHODS.index(method), *parts)
-    return parts
+    return np.empty((T, na)), np.empty((T, sum(nb))), np.empty((T, sum(n_in))), np.empty((T, n_out)), np.empty((T, 2))
 
 
 class Separator:
@@ -200,16 +278,37 @@ class Separator:
         if not isinstance(model, HammersteinWiener):
             raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
         self.model = model
-        self._n, self._orders = model.n, tuple(model.structure[:4])
         self._theta, self._parts = np.empty((1, model.n)), empty(model, 1)
+        self._sizes, self._rise = model.structure.sizes, model.rise
 
     def __call__(self, theta: Array, method: str) -> Groups:
         """a, b, c, d from one theta (n,), or from minimal parameters."""
-        if len(theta) != self._n:
+        if len(theta) != self.model.n:
             return Groups(*self.model.structure.groups(theta))
         if method not in METHODS[:3]:
             one_of("blocks", "method", method, METHODS[:3])
-        a, b, c, d, _ = self._parts
+        na, _, _, n_out, _ = self.model.structure
+        *groups, quality = self._parts
         self._theta[0] = theta
-        separate(self._theta, self._orders, METHODS.index(method), *self._parts)
-        return Groups(a[0].copy(), b[0].copy(), c[0].copy(), d[0].copy())
+        separate(self._theta, (na, n_out, METHODS.index(method)), self._sizes, self._rise, tuple(groups), quality)
+        return Groups(*(group[0].copy() for group in groups))
+
+
+def split(model: HammersteinWiener, theta: Array, method: str) -> tuple[Array, Array, Array, Array, Array]:
+    """a, b, c, d and quality from theta (T, n) by one of the first three methods; gauge "unit" and "d1"."""
+    *groups, quality = empty(model, len(theta))
+    na, _, _, n_out, _ = model.structure
+    orders, path = (na, n_out, METHODS.index(method)), np.ascontiguousarray(theta, dtype=float)
+    separate(path, orders, model.structure.sizes, model.rise, tuple(groups), quality)
+    a, b, c, d = groups
+    return a, b, c, d, quality
+
+
+def minimal(model: HammersteinWiener, groups: Groups, intercept: Any = None) -> Array:
+    """xi (n_x,) from a, b, c, d of one sample in any gauge with d_1 = 1; not finite where c_1 = 0."""
+    structure = model.structure
+    pairs = zip(structure.of_inputs(groups.b, structure.nb), structure.of_inputs(groups.c, structure.n_in), strict=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = [(b * c[0], c / c[0]) for b, c in pairs]
+    b, c = (np.concatenate(part) for part in zip(*scaled, strict=True))
+    return structure.minimal(groups.a, b, c, groups.d, intercept)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.blocks.paths import Separator
+from driftfit.blocks.paths import Separator, minimal
 from driftfit.kernel import Array
 from driftfit.live import Live
 from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -47,7 +47,8 @@ def product_drift(model: HammersteinWiener, xi: Array, q: Any) -> Array:
     if len(four) != 4:
         raise ValueError(f"product_drift: q is one variance, or those of a, b, c and d; got {q!r}.")
     na, nb, n_in, n_out, intercept = model.structure
-    variances = np.repeat([*four, max(four)], [na, nb, n_in - 1, n_out - 1, int(intercept)])
+    counts = [na, sum(nb), sum(n_in) - len(n_in), n_out - 1, int(intercept)]
+    variances = np.repeat([*four, max(four)], counts)
     J = model.structure.jacobian(xi)
     Q: Array = (J * variances) @ J.T + FLOOR * max(four) * np.eye(model.n)
     return 0.5 * (Q + Q.T)
@@ -125,5 +126,5 @@ def renewed(live: Live, q: Any) -> Live:
 def _separated(model: HammersteinWiener, theta: Array, before: Any) -> Any:
     """xi of one theta (n,) by "svd-joint", or what held before where that is not finite."""
     groups = Separator(model)(theta, "svd-joint")
-    xi = model.structure.minimal(*groups, np.asarray(theta[-1]) if model.intercept else None)
+    xi = minimal(model, groups, np.asarray(theta[-1]) if model.intercept else None)
     return xi if np.isfinite(xi).all() else before

@@ -15,14 +15,14 @@ Change(forget=lam) is `RLS`, Change(forget=lam, kind="directional") `RLS` with d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from driftfit.hypotheses import forget
 from driftfit.kernel import Array
-from driftfit.settings import Settings, covariance, matrix, numbers, one_of, vector
+from driftfit.settings import Settings, covariance, matrix, numbers, one_of, plain, vector
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,18 @@ class Change(Settings):
         if self.size is not None:
             sizes[which] = vector("Change", "size", self.size, len(which)) ** 2
         return Q, sizes
+
+    def scales(self) -> tuple[Array, Array]:
+        """q and sizes as they were given, 0 where they were not."""
+        return np.asarray(self.q or 0.0, float), np.asarray(self.size or 0.0, float)
+
+    def scaled(self, factor: float) -> Change:
+        """The same with standard deviations ``factor`` times as large."""
+        q, size = self.scales()
+        return replace(
+            self, q=None if self.q is None else plain(factor * factor * q),
+            size=None if self.size is None else plain(factor * size),
+        )  # fmt: skip
 
 
 def probability(owner: str, value: Any) -> float:

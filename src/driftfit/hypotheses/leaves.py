@@ -159,6 +159,22 @@ def priors(
 
 
 @core
+def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
+    """Further steps of the chain of events; X has a row for each of them."""
+    H = len(prior)
+    for _ in range(steps):
+        for e in range(H):
+            for l in range(L):
+                X[e, l] = 0.0
+            for last in range(H):
+                for l in range(L):
+                    X[e, l] += P[last, e] * prior[last, l]
+        for e in range(H):
+            for l in range(L):
+                prior[e, l] = X[e, l]
+
+
+@core
 def standstill(prior: Array, L: int, Hm: int) -> None:
     """No time passes, so nothing changes: the sensors keep their shares, all changes but the first have none."""
     for l in range(L):
@@ -172,16 +188,24 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
 
 @part
 def increments(
-    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
-) -> None:
-    """out[i] = lower triangle of the covariance that change i adds in this interval; ``sizes`` may have no columns."""
+    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, each: float, factors: Array, out: Array
+) -> None:  # fmt: skip
+    """out[i] = lower triangle of the covariance that change i adds in this interval; ``sizes`` may have no columns.
+
+    The first change takes ``time``, the others ``each``.
+    """
     for i in range(len(Q)):
-        span = time * factors[i]
+        span = (time if i == 0 else each) * factors[i]
         for k in range(0, Q.shape[1], WIDTH):
             store(out, i, k, times(load(Q, i, k), fill(span)))
         for k in range(sizes.shape[1]):
             if sizes[i, k] > 0.0 and c[k] > 0.0:
                 out[i, k * (k + 1) // 2 + k] += sizes[i, k] * ((1.0 if unknown else r) / c[k]) * span
+
+
+@part
+def ready(Q: Array, n: int) -> None:
+    """Covariances of changes as leaves take them in: as they are."""
 
 
 @part

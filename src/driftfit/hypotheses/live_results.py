@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftfit.hypotheses.events import Event, Told, all_of
 from driftfit.hypotheses.memory import SINGLE
 from driftfit.hypotheses.mixture import Mixture, mixture_of
-from driftfit.hypotheses.table import CLOCK, IMPOSSIBLE, REPORTED_TO
+from driftfit.hypotheses.table import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 class LiveHypotheses:
     """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
 
-    ``lag_prob`` (W, H), ``window``, ``evidence``, ``leaves``, ``kept`` and ``impossible`` are those of `Hypotheses`
-    after the last sample.
+    ``lag_prob`` (len(lags), H), ``window``, ``evidence``, ``leaves``, ``kept`` and ``impossible`` are those of
+    `Hypotheses` after the last sample.
     """
 
     def __init__(self, live: Live) -> None:
@@ -45,16 +46,25 @@ class LiveHypotheses:
         """
         many, bank = self._lane["many"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
-        now, W = int(many[CLOCK]), len(self.lag_prob)
+        now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
         rows = ring[at % len(ring)]
         first = int(at[0]) - W + 1 if len(at) else 0
-        window = np.r_[np.zeros(W - 1), rows[:, 0]]
-        latest = np.vstack([rows[:, 1:], np.zeros((W - 1, rows.shape[1] - 1))])
-        told = Told(latest, window, W, bank.change_names, bank.sensor_names)
-        found = [event.moved(first) for event in all_of(told, threshold)]
-        busy = window[-1] > threshold
-        done = [event for event in found if many[REPORTED_TO] <= event.date and event.last < now - W + 1 and not busy]
+        window, used = np.r_[np.zeros(W - 1), rows[:, 0]], np.r_[np.ones(W - 1, bool), rows[:, 1] > 0.0]
+        latest = np.vstack([rows[:, BESIDE:], np.zeros((W - 1, len(self.names)))])
+        told = Told(latest, window, used, W, bank.change_names, bank.sensor_names)
+        found = [replace(event, span=event.span.moved(first)) for event in all_of(told, threshold)]
+        busy, reported = window[-1] > threshold, int(many[REPORTED_TO])
+        done = [event for event in found if reported <= event.span.date and event.span.last < now - W + 1 and not busy]
         if not busy:
-            many[REPORTED_TO] = max(now - W + 1, many[REPORTED_TO])
-        return done
+            many[REPORTED_TO] = max(now - W + 1, reported)
+        return [event.timed(lambda sample: self._time(ring, sample)) for event in done]
+
+    def _time(self, ring: Array, sample: int) -> Any:
+        """When a sample of the ring was; its number where the stream is given no times."""
+        last, lane = self._live._last, self._lane
+        if last is None:
+            return sample
+        back = float(lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        time = self._live._clock.moved(last, np.array([-back]))
+        return sample if time is None else time[0]

@@ -10,10 +10,11 @@ import numpy as np
 from driftfit.eights import WIDTH
 from driftfit.hypotheses import forget, plan
 from driftfit.hypotheses.forecast import FROZEN, VALUE
+from driftfit.hypotheses.gap import SINCE
 from driftfit.hypotheses.leaves import FIRST
 from driftfit.hypotheses.lookahead import NODES
 from driftfit.hypotheses.past import news_of
-from driftfit.hypotheses.table import FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA
+from driftfit.hypotheses.table import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
 from driftfit.kernel import Array
 
 if TYPE_CHECKING:
@@ -55,22 +56,24 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "factors": np.ones(Hd), "theta0": places,
         "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
         "sensors": np.array([sensor.row() for sensor in bank.all_sensors]),
-        "chain": chain, "initial": initial, "given": np.full(H, np.nan),
+        "chain": chain, "initial": initial, "given": np.full(H + Hd * Hd, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, 1 + H)), "Qt": np.zeros((Hd + 1, wide)),
+        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, BESIDE + H)), "Qt": np.zeros((Hd + 1, wide)),
         "samples": np.zeros((int(shape.knobs[plan.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-        "news": news_of(H, Hm, past),
-        "lag_prob": np.zeros((W, H)), "decided": np.full((shape.held, 3), -1.0),
+        "news": news_of(H, Hm, past), "gap": _closed(Hd, wide),
+        "lag_prob": np.zeros((W, H)),
+        "brief": np.zeros((min(W, TOLD), H)), "moving": np.zeros((H, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 
 def packed(
-    arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool, factored: bool
+    arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool, factored: bool, apart: bool
 ) -> dict[str, Any]:  # fmt: skip
     """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
 
-    Where covariances are ``factored`` no forecast comes from that of the mixture.
+    Where covariances are ``factored`` no forecast comes from that of the mixture; where changes are events ``apart``
+    from each other a gap is one floor.
     """
     table = np.zeros((ROWS, 3), int)
     flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
@@ -84,9 +87,16 @@ def packed(
     table[FLAGS] = na, unknown, alike
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[PLAIN] = na == 0 and walks and noises and not factored, walks, 0
+    table[PLAIN] = na == 0 and walks and noises and not factored, walks, apart
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+
+
+def _closed(Hd: int, wide: int) -> Array:
+    """The table of a gap (`driftfit.hypotheses.gap`) where there is none."""
+    table = np.zeros((Hd, wide + WIDTH))
+    table[0, wide + SINCE] = 1.0
+    return table
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:

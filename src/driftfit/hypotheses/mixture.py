@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from driftfit.eights import WIDTH
 from driftfit.hypotheses.factored import product
+from driftfit.hypotheses.gap import SINCE
 from driftfit.hypotheses.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.hypotheses.table import HELD, LEAVES, NEVER, SETTLED
 from driftfit.kernel import Array
@@ -52,6 +54,12 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     else:
         covs = np.zeros((B.shape[1], n, n))
         covs[:, i, j] = covs[:, j, i] = C.T
+    gap = tracker.array(place.model, lane, "gap")
+    since = gap[1:, gap.shape[1] - WIDTH + SINCE]
+    if since.any():  # what else may have happened since the last used sample
+        more = np.zeros((n, n))
+        more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
+        covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
     ages = np.where(B[AGE] < NEVER, B[AGE], np.inf)

@@ -17,8 +17,10 @@ from driftfit.kernel import Array, core, kernel, part
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:
-    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors."""
-    news = np.zeros((H + 2, width))
+    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
+    is what an eight may reach into.
+    """
+    news = np.zeros((H + 3, width))
     news[range(H), range(H)] = 1.0
     news[:Hm, H] = 1.0
     news[H:] = 1.0
@@ -82,11 +84,21 @@ def pick(
 @core
 def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
     """Row ``to`` of T2: the average over the members."""
-    for at in range(T.shape[1]):
-        T2[to, at] = 0.0
-    for k in range(len(members)):
-        for at in range(T.shape[1]):
-            T2[to, at] += share[k] * T[members[k], at]
+    for at in range(0, T.shape[1], WIDTH):
+        total = fill(0.0)
+        for k in range(len(members)):
+            total = plus(total, times(fill(share[k]), load(T, members[k], at)))
+        store(T2, to, at, total)
+
+
+@core
+def summary(lags: Array, brief: Array) -> None:
+    """The newest floors, and the oldest."""
+    last = len(brief) - 1
+    for k in range(len(brief)):
+        row = k if k < last else len(lags) - 1
+        for e in range(lags.shape[1]):
+            brief[k, e] = lags[row, e]
 
 
 @part

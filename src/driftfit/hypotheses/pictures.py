@@ -31,11 +31,11 @@ def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
     for event in told.found(threshold):
         if event.kind == "change":
             for axis in axes[:n]:
-                axis.axvline(run.time[event.date], color=RED, linewidth=1.0, linestyle=":")
+                axis.axvline(event.date, color=RED, linewidth=1.0, linestyle=":")
         else:
             for axis in axes[:n]:
-                last = min(event.last + 1, len(run) - 1)
-                axis.axvspan(run.time[event.first], run.time[last], color=GREY, alpha=0.25, linewidth=0)
+                last = min(event.span.last + 1, len(run) - 1)
+                axis.axvspan(event.first, run.time[last], color=GREY, alpha=0.25, linewidth=0)
     axes[n].set_xlabel(time_label(run))
     date_axis(axes[n], run)
     figure.align_ylabels()

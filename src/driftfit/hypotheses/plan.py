@@ -15,7 +15,7 @@ from driftfit.kernel import Array, core, kernel, part
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
-KIND, LEAVES, DEPTH, TAU, WAIT, LIFE, BEST, CAP, PRIOR = range(9)
+KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR = range(7)
 """Entries of the vector of settings of a reduction."""
 
 
@@ -43,7 +43,7 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
     if reached(V, row, count, np.int64(low).view(np.float64)) <= M:
         return 0.0
     while high - low > 1:
-        middle = (low + high) // 2
+        middle = low + (high - low) // 2  # of numbers above 2 the sum of the bits would overflow
         many = reached(V, row, count, np.int64(middle).view(np.float64))
         low = middle if many >= M else low
         high = high if many >= M else middle
@@ -92,32 +92,9 @@ def clear(V: Array, row: int, count: int) -> None:
 
 
 @part
-def beam(B: Array, L: int, knobs: Array, links: Array, Hm: int, group: Array, X: Array) -> int:
-    """The heaviest leaves; the young are protected, and jumps of all but the best parent may be left out."""
-    w, value, mass = B[WEIGHT], X[0], X[1]
-    parent, event, M = links[0], links[1], int(knobs[LEAVES])
-    if knobs[LIFE] <= 0.0 and knobs[BEST] <= 0.0:
-        return int(heaviest(B, WEIGHT, L, M, group, links[3], X[2:3]))
-    top = 0
-    for l in range(L):
-        value[l] = w[l]
-        top = l if w[l] > w[top] else top
-    if knobs[LIFE] > 0.0:
-        for l in range(L):
-            value[l] += 2.0 if w[l] > 0.0 and B[AGE, l] < knobs[LIFE] else 0.0
-    if knobs[BEST] > 0.0:
-        for l in range(L):
-            mass[l] = 0.0
-        best = 0
-        for l in range(L):
-            mass[parent[l]] += w[l]
-        for l in range(L):
-            best = l if mass[l] > mass[best] else best
-        for l in range(L):
-            value[l] = 0.0 if event[l] >= Hm and parent[l] != best else value[l]
-    value[top] = 4.0
-    clear(X, 0, L)
-    return int(heaviest(X, 0, L, M, group, links[3], X[2:3]))
+def beam(B: Array, L: int, knobs: Array, group: Array, order: Array, X: Array) -> int:
+    """The heaviest leaves."""
+    return int(heaviest(B, WEIGHT, L, int(knobs[LEAVES]), group, order, X[2:3]))
 
 
 @core

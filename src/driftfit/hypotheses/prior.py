@@ -117,6 +117,18 @@ def _initial(owner: str, initial: Any, P: Array) -> Array:
     return np.asarray(p / p.sum())
 
 
+def chains(owner: str, P: Array, T: int, Hd: int) -> Array:
+    """Chains of the changes P[t, from, to], (T, H_d H_d), checked; where one is NaN the bank's own prior holds."""
+    if P.shape != (T, Hd, Hd):
+        raise ValueError(f"{owner}: prob of a chain must be ({T}, {Hd}, {Hd}), P[sample, from, to]; got {P.shape}.")
+    given = ~np.isnan(P).all(axis=(1, 2))
+    wrong = given & ~((P >= 0.0).all(axis=(1, 2)) & (np.abs(P.sum(axis=2) - 1.0) < 1e-8).all(axis=1))
+    if wrong.any():
+        t = int(np.argmax(wrong))
+        raise ValueError(f"{owner}: rows of a chain must be probabilities that sum to 1; at sample {t} it is {P[t]}.")
+    return P.reshape(T, Hd * Hd)
+
+
 def per_sample(owner: str, p: Array, usual: Array, Hd: int) -> Array:
     """Priors (T, H) of joint events from such, or from (T, H_d) of changes; rows of NaN stay.
 

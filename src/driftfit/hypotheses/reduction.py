@@ -16,6 +16,10 @@ from driftfit.hypotheses import plan
 from driftfit.kernel import Array
 from driftfit.settings import Settings, numbers, one_of, plain, whole
 
+REMEMBERED = 24
+"""Floors of the past that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four hundred
+samples, twenty times, 25 of 40 were found with 8 floors, 37 with 16, and 40 with 24.
+"""
 MOST = 4096
 """Leaf updates a sample above which a bank is refused."""
 
@@ -47,7 +51,7 @@ class Reduction(Settings, ABC):
 
 def knobs(kind: int, **values: float) -> Array:
     """The vector of settings."""
-    vector = np.zeros(9)
+    vector = np.zeros(7)
     vector[plan.KIND], vector[plan.TAU], vector[plan.WAIT] = kind, -1.0, -1.0
     for name, value in values.items():
         vector[getattr(plan, name.upper())] = value
@@ -158,29 +162,28 @@ class IMM(Reduction):
 class Beam(Reduction):
     """The heaviest leaves (M-algorithm); ties go to the earlier leaf.
 
-    ``window`` is how many floors of the past are remembered for the probabilities of events. ``life`` protects leaves
-    younger than so many floors since their last change, ``only_best_jumps`` lets only the heaviest parent jump (AFMM);
-    neither gains clearly. The mass that was dropped is missing from the evidence; it is reported. Cost: leaves times H.
+    ``window`` is how many floors of the past are remembered for the probabilities of events: a change that takes more
+    samples to tell is not found. The mass that was dropped is missing from the evidence; it is reported. Cost: leaves
+    times H.
     """
 
     leaves: int = 9
-    window: int = 8
-    life: int = 0
-    only_best_jumps: bool = False
+    window: int = REMEMBERED
 
     def __post_init__(self) -> None:
-        for name, low in (("leaves", 1), ("window", 1), ("life", 0)):
-            self._set(name, whole("Beam", name, getattr(self, name), low))
+        for name in ("leaves", "window"):
+            self._set(name, whole("Beam", name, getattr(self, name), 1))
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         children = tree("Beam", Hd * Hm * self.leaves, 1, "use fewer leaves")
-        vector = knobs(plan.BEAM, leaves=self.leaves, life=self.life, best=float(self.only_best_jumps))
-        return Shape(self.leaves, children, self.window, 1, vector, np.ones(3))
+        return Shape(self.leaves, children, self.window, 1, knobs(plan.BEAM, leaves=self.leaves), np.ones(3))
 
 
 @dataclass(frozen=True)
 class Hybrid(Reduction):
     """Merge leaves that agree in the changes of the window, the last sensor events and their age; then a beam.
+
+    For the probabilities of events ``remembered`` floors are kept, on average over what was merged.
 
     Old sensor events are nuisance and merged early, changes are the product and kept apart. Ages above ``age_cap``
     count as one. Cost: leaves times H.
@@ -190,9 +193,10 @@ class Hybrid(Reduction):
     window: int = 5
     sensor_events: int = 1
     age_cap: int = 40
+    remembered: int = REMEMBERED
 
     def __post_init__(self) -> None:
-        for name, low in (("leaves", 1), ("window", 1), ("sensor_events", 0), ("age_cap", 1)):
+        for name, low in (("leaves", 1), ("window", 1), ("sensor_events", 0), ("age_cap", 1), ("remembered", 1)):
             self._set(name, whole("Hybrid", name, getattr(self, name), low))
 
     def shape(self, Hd: int, Hm: int) -> Shape:
@@ -203,7 +207,12 @@ class Hybrid(Reduction):
                 f"Hybrid: a window of {self.window} with {Hd} changes cannot be told apart; use a smaller one."
             )
         return Shape(
-            self.leaves, children, self.window, 1, knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap), bases
+            self.leaves,
+            children,
+            self.remembered,
+            1,
+            knobs(plan.HYBRID, leaves=self.leaves, cap=self.age_cap),
+            bases,
         )
 
 

@@ -10,7 +10,7 @@ Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered 
 from __future__ import annotations
 
 from driftfit.hypotheses.grow import grow
-from driftfit.hypotheses.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise
+from driftfit.hypotheses.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.kernel import Array, core
 
 Y, NOISE, TIME = 0, 1, 2
@@ -41,7 +41,8 @@ def refilter(
     if not by_prior:
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
-    increments(Q, sizes, c, r, unknown, samples[0, TIME], factors, Qt)
+    increments(Q, sizes, c, r, unknown, samples[0, TIME], samples[0, TIME], factors, Qt)
+    ready(Qt, n)
     widen(root, n, weight, Qt, X[1:])
     for e in range(H):
         prior[e, 0] = 0.0
@@ -63,7 +64,8 @@ def refilter(
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
-        increments(Q, sizes, c, r, unknown, samples[at, TIME], factors, Qt)
+        increments(Q, sizes, c, r, unknown, samples[at, TIME], samples[at, TIME], factors, Qt)
+        ready(Qt, n)
         L = floor(
             A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
             event, X,

@@ -7,6 +7,7 @@ decided, probabilities are conditional on the decisions.
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -53,9 +54,12 @@ class Hypotheses:
     ----------
     names : tuple of str
         Names of the joint events (change, sensor), H of them.
-    lag_prob : (T, W, H)
-        lag_prob[t, k] are the probabilities of the events k floors before t, given the data up to t; NaN before the
-        first event.
+    lags : tuple of int
+        Floors back that are told of: all W that the reduction remembers, or where these are more than eight the
+        newest seven and the oldest.
+    lag_prob : (T, len(lags), H)
+        lag_prob[t, k] are the probabilities of the events lags[k] floors before t, given the data up to t; NaN before
+        the first event.
     window : (T,)
         Probability of at least one change in the newest W floors.
     evidence : (T,)
@@ -71,6 +75,7 @@ class Hypotheses:
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
         self._report = run._written("report")
         self.names = self.tracker.event_names
+        self.lags = self.tracker.floors_told
         self.sensors = len(self.tracker.all_sensors)
         if self.impossible:
             warnings.warn(
@@ -93,11 +98,11 @@ class Hypotheses:
 
         Row t is of the event first visible in sample t; NaN at the end, where the later samples are not there yet.
         """
-        W = self.lag_prob.shape[1]
-        if not 0 <= lag < W:
-            raise ValueError(f"prob: lag must be 0 .. {W - 1} for this reduction; got {lag}.")
+        if lag not in self.lags:
+            said = ", ".join(str(k) for k in self.lags)
+            raise ValueError(f"prob: lag must be one of {said} for this reduction; got {lag}.")
         p = np.full((len(self.run), len(self.names)), np.nan)
-        p[: len(p) - lag] = self.lag_prob[lag:, lag]
+        p[: max(len(p) - lag, 0)] = self.lag_prob[lag:, self.lags.index(lag)]
         return p
 
     @property
@@ -113,9 +118,13 @@ class Hypotheses:
     @cached_property
     def latest(self) -> Array:
         """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
-        T, W, _ = self.lag_prob.shape
-        lag = np.minimum(W - 1, T - 1 - np.arange(T))
-        return np.asarray(self.lag_prob[np.arange(T) + lag, lag])
+        p, oldest = self.prob(self.lags[-1]), self.lags[-1]
+        tile, run = self.run._tile, self.run
+        lane = {name: tile[name][0, ..., run._lane] for name in ("memory", "table")}
+        now = self.tracker.array(run.model, lane, "lag_prob")
+        for k in range(min(oldest, len(p))):
+            p[len(p) - 1 - k] = now[k] if now[k].sum() > 0.5 else np.nan
+        return p
 
     @property
     def window(self) -> Array:
@@ -173,7 +182,7 @@ class Hypotheses:
         """The path of the whole record given the events."""
         from driftfit.hypotheses.smooth import EventSmoothed
 
-        return EventSmoothed(self.run, self.found(threshold))
+        return EventSmoothed(self.run, self.dated(threshold))
 
     def events(self, threshold: float = 0.5) -> list[Event]:
         """Changes and sensor faults whose probability exceeds the threshold, in order of time.
@@ -181,24 +190,56 @@ class Hypotheses:
         How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
         change forgets or resets there is nothing to smooth, and it is not said.
         """
-        found = self.found(threshold)
+        found = self.dated(threshold)
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
-        smoothed = self.smooth(threshold)
-        return [event.measured(smoothed) if event.kind == "change" and event.date else event for event in found]
+        from driftfit.hypotheses.smooth import EventSmoothed
+
+        smoothed = EventSmoothed(self.run, found)
+        return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
+
+    def dated(self, threshold: float = 0.5) -> list[Event]:
+        """`found`, with the dates of changes from all samples around them (`driftfit.hypotheses.dates`)."""
+        found = self.found(threshold)
+        if not any(event.kind == "change" for event in found):
+            return found
+        from driftfit.hypotheses.dates import dated
+        from driftfit.hypotheses.smooth import measurements, steps_of
+
+        measured = measurements(self.run, found)
+        jumps = dict(zip(self.tracker.change_names, steps_of(self.run, measured), strict=True))
+        return self._timed(dated(found, measured, jumps))
 
     def found(self, threshold: float = 0.5) -> list[Event]:
-        """`events`, without how far parameters moved, which takes a smoother."""
+        """`events` as they were known when they were found: with the dates that the leaves say, and no shifts."""
         bank = self.tracker
-        told = Told(self.latest, self.window, self.lag_prob.shape[1], bank.change_names, bank.sensor_names)
-        return all_of(told, threshold)
+        told = Told(
+            self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
+        )  # fmt: skip
+        found = [self._early(event, threshold) for event in all_of(told, threshold)]
+        return self._timed(found)
+
+    def _early(self, event: Event, threshold: float) -> Event:
+        """A fault may have been known sooner than when it was remembered for the last time."""
+        if event.kind == "change":
+            return event
+        j, date = self.tracker.sensor_names.index(event.name), event.span.date
+        for k, lag in enumerate(self.lags):
+            if date + lag < len(self.run) and self.lag_prob[date + lag, k, j :: self.sensors].sum() > threshold:
+                return replace(event, span=event.span._replace(known=date + lag))
+        return event
+
+    def _timed(self, events: list[Event]) -> list[Event]:
+        """With times, where the record has some."""
+        time = self.run.time
+        return [event.timed(lambda sample: time[sample]) for event in events]
 
     def table(self, threshold: float = 0.5) -> Any:
         """`events` as a polars table: for every parameter how far it moved, with its standard error."""
         import polars as pl
 
-        names, at = self.run.names, self.run.time
-        rows = [{**event.row(names), "time": at[event.date]} for event in self.events(threshold)]
+        names = self.run.names
+        rows = [{**event.row(names), "sample": event.span.date} for event in self.events(threshold)]
         return pl.DataFrame(rows, infer_schema_length=None)
 
     def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:

@@ -77,27 +77,53 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
             "smooth: a Change that forgets or resets is no random walk, which is what can be smoothed; give its q "
             "instead, or cut the record at the changes with driftfit.smoothers.piecewise.piecewise(run)."
         )
-    seen = replay(run)
-    ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
-    T, n = phi.shape
-    known = np.broadcast_to(run._known[:, :3], (T, 3))
-    noise = noise_variance(bank, run)
-    squares = np.mean(phi[ok] ** 2, axis=0) if ok.any() else np.ones(n)
-    unit = np.where(squares > 0.0, noise / np.where(squares > 0.0, squares, 1.0), noise)
-    relative = noise if bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None else 1.0
-    steps = []
-    for change in bank.all_changes:
-        Q, sizes = change.increments(n)
-        steps.append(Q * relative + np.diag(sizes * unit))
-    which = np.zeros(T, int)
+    measured = measurements(run, events)
+    n = measured.phi.shape[1]
+    which = np.zeros(len(run), int)
     for event in events:
         if event.kind == "change":
-            which[event.date] = bank.change_names.index(event.name)
-    time = seen["dt"][:, 0] * known[:, 2]
-    r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
-    C0 = np.diag(WIDE * unit) if bank.p0 is None else np.asarray(_full(bank, n)) * relative
+            which[event.span.date] = bank.change_names.index(event.name)
+    drift = measured.drift * np.where(which > 0, 1.0, measured.dt)  # what happens once does not last
+    steps = np.array(steps_of(run, measured))[which] * drift[:, None, None]
+    C0 = np.diag(WIDE * measured.unit) if bank.p0 is None else np.asarray(_full(bank, n)) * measured.relative
     m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
-    return Problem(phi, seen["y"][:, 0].copy(), r, np.array(steps)[which] * time[:, None, None], m0, C0)
+    return Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
+
+
+class Measured(NamedTuple):
+    """What a run was told by its samples, and the units of what its bank was told."""
+
+    phi: Array
+    y: Array
+    r: Array
+    """(T,): noise variance; inf for samples that are not used."""
+    dt: Array
+    drift: Array
+    unit: Array
+    """(n,): what one sample tells of each parameter."""
+    relative: float
+    """What q and p0 are in units of."""
+
+
+def measurements(run: Track, events: list[Event]) -> Measured:
+    """The samples of a run; those of sensor faults count little or not."""
+    bank: Any = run.tracker
+    seen = replay(run)
+    ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
+    known = np.broadcast_to(run._known[:, :3], (len(phi), 3))
+    noise = noise_variance(bank, run)
+    squares = np.mean(phi[ok] ** 2, axis=0) if ok.any() else np.ones(phi.shape[1])
+    unit = np.where(squares > 0.0, noise / np.where(squares > 0.0, squares, 1.0), noise)
+    relative = noise if bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None else 1.0
+    r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
+    return Measured(phi, seen["y"][:, 0].copy(), r, seen["dt"][:, 0].copy(), known[:, 2].copy(), unit, relative)
+
+
+def steps_of(run: Track, measured: Measured) -> list[Array]:
+    """The covariance (n, n) of every change."""
+    bank: Any = run.tracker
+    moves = [change.increments(measured.phi.shape[1]) for change in bank.all_changes]
+    return [Q * measured.relative + np.diag(sizes * measured.unit) for Q, sizes in moves]
 
 
 def noise_variance(bank: Bank, run: Track) -> float:
@@ -124,8 +150,9 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
         if event.kind == "sensor":
             sensor = sensors[event.name]
             away = sensor.kind in ("additive", "frozen")
-            last = event.last + 1 + (reach if away else 0)
-            factor[event.first : last] = np.inf if away else np.maximum(factor[event.first : last], sensor.factor)
+            last = event.span.last + 1 + (reach if away else 0)
+            first = event.span.first
+            factor[first:last] = np.inf if away else np.maximum(factor[first:last], sensor.factor)
     return factor
 
 

@@ -21,17 +21,14 @@ from driftfit.hypotheses.factored_changes import average, blur, develop_eight, w
 from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
 from driftfit.kernel import Array, Outside, core, exchanged, part
 
-covariance_increments, covariance_begin = leaves.increments, start.begin
+covariance_begin = start.begin
 
 
 @part
-def increments(
-    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, factors: Array, out: Array
-) -> None:
-    """`leaves.increments`, factorised."""
-    covariance_increments(Q, sizes, c, r, unknown, time, factors, out)
+def ready(Q: Array, n: int) -> None:
+    """`leaves.ready`: factorised."""
     for i in range(len(Q)):
-        factorise(out[i], len(c), 0.0)
+        factorise(Q[i], n, 0.0)
 
 
 @core
@@ -201,7 +198,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 def made() -> tuple[Outside, TrackerSteps]:
     """The machine and the steps that run it."""
     others = {
-        leaves.increments: increments, leaves.mixture: mixture, start.begin: begin,
+        leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
         forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
         refilter.widen: widen, lookahead.width: width,
     }  # fmt: skip

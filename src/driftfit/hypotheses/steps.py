@@ -161,6 +161,7 @@ def correct(s: State, l: int) -> None:
         tell(s, l)
         run(s, l)
         s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
+        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]  # a fault code counts as missing, in lags too
         learn_scales(s, l)
     else:
         only_drift(s, l)
@@ -183,7 +184,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     if counts:
         learn_start(s, l)
     tell(s, l)
-    s.now[Y_HAT, l] = s.y_hat[l]
+    s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
     s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
     ready = s.root[l] == 0 and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
     s.many[SETTLED, l] = READY if ready else WAITING
@@ -207,14 +208,14 @@ def keep(o: State, s: State, l: int) -> None:
 
 @kernel
 def told(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, then factors of the drift of every change."""
+    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
     row = t if known.shape[0] > 1 else 0
     given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
-    H, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
-    for e in range(H):
-        s.memory[given + e, l] = known[row, 3 + e, l]
+    count, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for k in range(count):
+        s.memory[given + k, l] = known[row, 3 + k, l]
     for i in range(Hd):
-        s.memory[factors + i, l] = known[row, 3 + H + i, l]
+        s.memory[factors + i, l] = known[row, 3 + count + i, l]
 
 
 STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, MACHINES)

@@ -1,65 +1,43 @@
-"""What the alarms of `driftfit.detect` look at, and the limits that theory gives.
-
-Every function returns a `Watched`.
-"""
+"""What the alarms of `driftfit.detect` look at in a run, the limits that theory gives, and the chance of an extreme."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import special
 
+from driftfit.judges.alarm_rule import CHANGE, AlarmRule, check_fits, power_and_mean
 from driftfit.judges.onsets import chance, mean_limit, mean_rate, normal_limit, normal_rate, power_limit, power_rate
+from driftfit.judges.reference import burn, stretch
 from driftfit.kernel import Array
 from driftfit.result import Track
-from driftfit.settings import near, whole
 
-Reference = Mapping[str, tuple[float, float]] | int | None
+Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
-
-class Watched(NamedTuple):
-    """What an alarm looks at."""
-
-    statistic: Array
-    """(T, c)"""
-    limits: Array
-    """(c,)"""
-    names: tuple[str, ...]
-    start: int
-    """First sample that is judged."""
-    chance: Callable[[Array, int], float] | None
-    """Chance that a record without a fault reaches these highest values (c,) in so many samples; None: no theory."""
+Chance = Callable[[Array, int], float]
+"""Chance that a record without a fault reaches these highest values (c,) in so many samples."""
 
 
-def _band(run: Track, every: float, reference: Reference, window: int) -> Watched:
-    """How many standard deviations parameters are outside their bands."""
-    if not run.tracker.covariance:
-        raise ValueError(f"detect: {type(run.tracker).__name__} carries no covariance, so no band can be judged.")
-    start = _burn(run)
+def rule_of(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """A rule with its names, reference and limits, and the first sample of the run that it judges."""
+    return RULES[rule.kind](run, rule, reference)
+
+
+def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """Bands that were given, or the range of the parameters in the reference."""
     if isinstance(reference, Mapping):
-        unknown = [name for name in reference if name not in run.names]
-        if unknown:
-            raise ValueError(f"detect: there is no parameter {unknown[0]!r}; {near(str(unknown[0]), run.names)}")
-        names = tuple(reference)
-        low, high = _edges(reference)
+        names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
     else:
-        stop = _reference(run, reference, start)
-        names, part = run.names, run.theta[start:stop]
-        low, high, start = part.min(axis=0), part.max(axis=0), stop
-    columns = [run.names.index(name) for name in names]
-    theta, std = run.theta[:, columns], run.std[:, columns]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        outside = np.maximum(theta - high, low - theta) / std
-    rhos = _alike(theta[_burn(run) :], std[_burn(run) :])
-    limits = np.array([normal_limit(rho, every * len(names)) for rho in rhos])
-
-    def likely(highest: Array, J: int) -> float:
-        each = [chance(normal_rate(rho), z, special.ndtr(-z), J) for rho, z in zip(rhos, highest, strict=True)]
-        return min(1.0, len(each) * min(each))
-
-    return Watched(np.where(np.isfinite(std), outside, np.nan), limits, names, start, likely)
+        first, start = stretch(run, reference)
+        names, known = run.names, slice(first, start)
+        low, high = run.theta[known].min(axis=0), run.theta[known].max(axis=0)
+    rule = replace(rule, names=names, low=tuple(low.tolist()), high=tuple(high.tolist()))
+    check_fits(rule, run.tracker, run.names)
+    alike = _alike(run, rule, known)
+    return replace(rule, limits=tuple(normal_limit(rho, rule.every * len(names)) for rho in alike)), start
 
 
 def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
@@ -75,70 +53,54 @@ def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
     return edges
 
 
-def _alike(theta: Array, std: Array) -> Array:
-    """(c,): correlation of successive errors of estimates theta (T, c)."""
+def _alike(run: Track, rule: AlarmRule, part: slice) -> Array:
+    """(c,): correlation of successive errors of the watched estimates, from a part of the run."""
+    columns = rule.columns(run.names)
+    theta, std = run.theta[part, columns], run.std[part, columns]
     with np.errstate(invalid="ignore", divide="ignore"):
         step = np.diff(theta, axis=0) ** 2 / std[1:] ** 2
     d = np.array([np.mean(column[np.isfinite(column)]) if np.isfinite(column).any() else 1.0 for column in step.T])
     return np.asarray(1.0 / (1.0 + d))
 
 
-def _reference(run: Track, reference: Any, start: int) -> int:
-    """The end of the reference."""
-    if reference is None:
-        raise ValueError(
-            'detect: say where the parameters belong, reference={"b1": (0.9, 1.1)}, or how many of the first samples '
-            "are normal, reference=500."
-        )
-    stop = whole("detect", "reference", reference, 1)
-    if not start + 20 <= stop < len(run):
-        raise ValueError(
-            f"detect: reference={stop} leaves too little: the run starts until sample {start}, and has {len(run)}."
-        )
-    return stop
-
-
-def _burn(run: Track) -> int:
-    return max(50, 5 * run.model.n)
-
-
-def _innovation(run: Track, every: float, reference: Reference, window: int) -> Watched:
-    """Windowed sums of squares and of innovations, over the samples that were used."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        g = run.innovation / run.innovation_std
-    g, start, slack = np.where(np.isfinite(g), g, np.nan), _burn(run), 1.0
+def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """What is normal: standard normal, or as the innovations of the reference are distributed."""
+    rule, start = replace(rule, names=("power", "mean")), burn(run)
+    check_fits(rule, run.tracker, run.names)
     if isinstance(reference, Mapping):
-        raise ValueError('detect: the reference of "innovation" is a number of samples, such as reference=500.')
+        raise ValueError(
+            'detect: the reference of "innovation" is a number of samples, such as reference=500, or (from, to).'
+        )
     if reference is not None:
-        stop = _reference(run, reference, start)
-        known = np.sort(np.abs(g[start:stop][np.isfinite(g[start:stop])]))
-        g, start = normal_scores(g, known), stop
-        slack = np.sqrt(1.0 + window / max(len(known), 1))  # what is normal is itself an estimate
+        first, start = stretch(run, reference)
+        g = rule.scores(run.innovation[first:start], run.innovation_std[first:start])
+        rule = replace(rule, normal=tuple(np.sort(np.abs(g[np.isfinite(g)])).tolist()))
+    power, mean = power_limit(rule.window, 2.0 * rule.every), mean_limit(rule.window, 2.0 * rule.every)
+    limits = (rule.window + (power - rule.window) * rule.slack, mean * rule.slack)
+    return replace(rule, limits=limits), start
+
+
+def _probability(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """No theory gives a limit: it is found by simulation."""
+    rule = replace(rule, names=("probability",), limits=(1.0,))
+    check_fits(rule, run.tracker, run.names)
+    return rule, burn(run)
+
+
+def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
+    """What the rule compares, (T, c), NaN where there is nothing to judge."""
+    if rule.kind == "band":
+        columns = rule.columns(run.names)
+        return rule.outside(run.theta[:, columns], run.std[:, columns])
+    if rule.kind == "probability":
+        bank: Any = run
+        p = bank._written(CHANGE) if CHANGE in run.tracker.outputs else bank.hypotheses.window
+        return np.asarray(np.reshape(p, (len(run), -1))[:, :1])
+    g = rule.scores(run.innovation, run.innovation_std)
     used = np.flatnonzero(np.isfinite(g) & (np.arange(len(g)) >= start))
     statistic = np.full((len(run), 2), np.nan)
-    for column, values in enumerate((g[used] ** 2, g[used])):
-        total = np.concatenate([[0.0], np.cumsum(values)])
-        if len(used) >= window:
-            statistic[used[window - 1 :], column] = total[window:] - total[:-window]
-    statistic[:, 1] = np.abs(statistic[:, 1])
-    power, mean = power_limit(window, 2.0 * every), mean_limit(window, 2.0 * every)
-    limits = np.array([window + (power - window) * slack, mean * slack])
-
-    def likely(highest: Array, J: int) -> float:
-        loud, aside = window + (highest[0] - window) / slack, highest[1] / slack
-        each = (
-            chance(power_rate(window), loud, special.chdtrc(window, max(loud, 0.0)), J),
-            chance(mean_rate(window), aside, 2.0 * special.ndtr(-aside / np.sqrt(window)), J),
-        )
-        return min(1.0, 2.0 * min(each))
-
-    return Watched(_carried(statistic), limits, ("power", "mean"), start, likely)
-
-
-def normal_scores(g: Array, known: Array) -> Array:
-    """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
-    share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
-    return np.where(np.isfinite(g), -special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
+    statistic[used[rule.window - 1 :]] = power_and_mean(g[used], rule.window)
+    return _carried(statistic)
 
 
 def _carried(statistic: Array) -> Array:
@@ -147,22 +109,29 @@ def _carried(statistic: Array) -> Array:
     return np.where((place >= 0)[:, None], statistic[place], np.nan)
 
 
-def _probability(run: Track, every: float, reference: Reference, window: int) -> Watched:
-    """The probability of a change in the tracker's window."""
-    if CHANGE in run.tracker.outputs:
-        p = run._written(CHANGE)
-    elif REPORT in run.tracker.outputs:
-        bank: Any = getattr(run, HYPOTHESES)
-        p = bank.window
-    else:
-        raise ValueError(
-            f"detect: {type(run.tracker).__name__} carries no probability of a change; track with Bank, or use "
-            'kind="band" or kind="innovation".'
+def chance_of(run: Track, rule: AlarmRule) -> Chance:
+    """The chance of an extreme by theory; of probabilities and simulated limits there is none, and it is NaN."""
+    if rule.simulated or rule.kind == "probability":
+        return lambda highest, J: float("nan")
+    if rule.kind == "band":
+        rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
+
+        def of_band(highest: Array, J: int) -> float:
+            each = [chance(rate, z, special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
+            return min(1.0, len(each) * min(each))
+
+        return of_band
+
+    def of_sums(highest: Array, J: int) -> float:
+        W, slack = rule.window, rule.slack
+        loud, aside = W + (highest[0] - W) / slack, highest[1] / slack
+        each = (
+            chance(power_rate(W), loud, special.chdtrc(W, max(loud, 0.0)), J),
+            chance(mean_rate(W), aside, 2.0 * special.ndtr(-aside / np.sqrt(W)), J),
         )
-    return Watched(np.reshape(p, (len(run), -1))[:, :1], np.ones(1), ("probability",), _burn(run), None)
+        return min(1.0, 2.0 * min(each))
+
+    return of_sums
 
 
-CHANGE, REPORT, HYPOTHESES = "window", "report", "hypotheses"
-"""Where the probability of a change is: a field that a tracker stores, or ``run.hypotheses.window`` of a `Bank`."""
-
-STATISTICS = {"band": _band, "innovation": _innovation, "probability": _probability}
+RULES = {"band": _band, "innovation": _innovation, "probability": _probability}

@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from io import StringIO
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -24,7 +23,7 @@ from rich.text import Text
 
 from driftfit.diagnose import Diagnosis, diagnose
 from driftfit.kernel import Array
-from driftfit.summary import WIDTH, key_text, table_of
+from driftfit.summary import Printed, key_text, table_of
 from driftfit.verdict import Verdict, p_text, verdict
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class ManyVerdicts:
+class ManyVerdicts(Printed):
     """Verdicts of many runs; printing it shows the twenty that move most clearly.
 
     Attributes
@@ -155,12 +154,9 @@ class ManyVerdicts:
         if len(self.rows) > SHOWN:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
 
-    def __str__(self) -> str:
-        return printed(self)
-
 
 @dataclass(frozen=True)
-class ManyDiagnoses:
+class ManyDiagnoses(Printed):
     """Diagnoses of many runs; printing it shows how often each number is out of bounds, and the worst runs.
 
     Attributes
@@ -213,16 +209,6 @@ class ManyDiagnoses:
         for key in [key for key in self.worst if not self.of[key].ok][:SHOWN]:
             table.add_row(Text(key_text(key)), Text(", ".join(c.name for c in self.of[key].checks if not c.ok)))
         yield table
-
-    def __str__(self) -> str:
-        return printed(self)
-
-
-def printed(what: Any) -> str:
-    """What a console shows, as text."""
-    text = StringIO()
-    Console(file=text, width=WIDTH, color_system=None).print(what)
-    return text.getvalue()
 
 
 def verdicts(runs: Mapping[Hashable, Track], level: float, lags: int | None) -> ManyVerdicts:

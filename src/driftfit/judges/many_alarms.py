@@ -29,9 +29,9 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.detect import Alarms, detect
-from driftfit.judges.many import SHOWN, discoveries, printed
+from driftfit.judges.many import SHOWN, discoveries
 from driftfit.settings import numbers
-from driftfit.summary import facts, key_text, table_of
+from driftfit.summary import Printed, facts, key_text, table_of
 from driftfit.verdict import p_text
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Watch:
 
 
 @dataclass(frozen=True)
-class ManyAlarms:
+class ManyAlarms(Printed):
     """What `detect` of a fleet returns; printing it shows the twenty most extreme series.
 
     Attributes
@@ -135,9 +135,6 @@ class ManyAlarms:
             yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
         for key, reason in list(self.failed.items())[:SHOWN]:
             yield Text(f" not judged, {key_text(key)}: {reason}")
-
-    def __str__(self) -> str:
-        return printed(self)
 
 
 def alarms(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.crossing import Crossing
     from driftfit.detect import Alarms
     from driftfit.diagnose import Diagnosis
+    from driftfit.judges.alarm_rule import AlarmRule
     from driftfit.judges.many import ManyDiagnoses, ManyVerdicts
     from driftfit.judges.many_alarms import ManyAlarms
     from driftfit.kernel import Array
@@ -54,12 +58,23 @@ class JudgedMany:
 
         return alarms(self._runs(), kind, every=every, level=level, reference=reference, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures."""
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: ManyAlarms | None = None,
+        labels: Mapping[Hashable, Array] | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        """
         from driftfit.report import check_path
         from driftfit.report_many import page_of_many
 
-        check_path(path).write_text(page_of_many(self._runs(), title, getattr(self, "failed", {})), encoding="utf-8")
+        text = page_of_many(self._runs(), title, getattr(self, "failed", {}), alarms, labels)
+        check_path(path).write_text(text, encoding="utf-8")
 
 
 class Judged:
@@ -88,6 +103,21 @@ class Judged:
         from driftfit.simulate import simulate
 
         return simulate(cast("Track", self), u, at, y)
+
+    def crossing(
+        self,
+        what: str,
+        *,
+        below: float | None = None,
+        above: float | None = None,
+        horizon: int | None = None,
+        u: Any = None,
+        level: float = 0.9,
+    ) -> Crossing:
+        """When a parameter or the output crosses a limit after the record, with an interval; `driftfit.crossing`."""
+        from driftfit.crossing import crossing
+
+        return crossing(cast("Track", self), what, below=below, above=above, horizon=horizon, u=u, level=level)
 
     def poles(self, at: Any = None) -> Array:
         """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.system`."""
@@ -137,14 +167,39 @@ class Judged:
 
         return long_run(cast("Track", self), at, level)
 
-    def detect(self, kind: str = "band", **settings: Any) -> Alarms:
-        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`."""
+    def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
+        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.detect`.
+
+        ``kind`` may also be the rule of another run, ``said.rule``.
+        """
         from driftfit.detect import detect
 
         return detect(cast("Track", self), kind, **settings)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`."""
+    def plot_system(self, input: int | str = 0, at: Any = None, **settings: Any) -> Figure:
+        """Step and frequency response over time with bands, poles in the plane, gain; see `driftfit.system_plots`."""
+        from driftfit.system_plots import plot_system
+
+        return plot_system(cast("Track", self), input, at, **settings)
+
+    def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
+        """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
+        from driftfit.system_plots import plot_validation
+
+        return plot_validation(cast("Track", self), y, u, at, level)
+
+    def report(
+        self,
+        path: str | PathLike[str],
+        title: str | None = None,
+        *,
+        alarms: Alarms | None = None,
+        labels: Array | None = None,
+    ) -> None:
+        """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.report`.
+
+        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
+        """
         from driftfit.report import report
 
-        report(cast("Track", self), path, title)
+        report(cast("Track", self), path, title, alarms, labels)

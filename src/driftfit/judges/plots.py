@@ -116,19 +116,22 @@ def _paths(axis: Axes, said: Diagnosis) -> None:
 
 
 def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
-    """The output, and each statistic over its limit, with alarms and labels shaded."""
+    """The output, and each statistic over its limit (a probability as it is), with alarms and labels shaded."""
     run, c = said.run, len(said.names)
     figure = new_figure(9.5, 1.5 * c + 2.0)
     axes = figure.subplots(c + 1, 1, sharex=True)
     axes[0].plot(run.time, run.y, color=BLUE, lw=0.8)
     axes[0].set_ylabel(run.labels.y)
-    for axis, name, column, limit in zip(axes[1:], said.names, said.statistic.T, said.limits, strict=True):
-        axis.plot(run.time, column / limit, color=BLUE, lw=0.9)
-        axis.axhline(1.0, color=RED, lw=0.9, ls="--")
+    for j, (axis, name) in enumerate(zip(axes[1:], said.names, strict=True)):
+        unit = 1.0 if said.kind == "probability" else said.limits[j]
+        column, limit = said.statistic[:, j] / unit, said.limits[j] / unit
+        axis.plot(run.time, column, color=BLUE, lw=0.9)
+        axis.axhline(limit, color=RED, lw=0.9, ls="--", label=f"limit {said.rule.limit_text(j)}")
+        axis.legend(loc="upper left", fontsize=7, frameon=False)
         axis.set_ylabel(name)
-        shown = column[said.start :][np.isfinite(column[said.start :])] / limit
+        shown = column[said.start :][np.isfinite(column[said.start :])]
         if shown.size:
-            axis.set_ylim(min(shown.min(), 0.0) - 0.1, min(max(1.3, 1.1 * shown.max()), 8.0))
+            axis.set_ylim(min(shown.min(), 0.0) - 0.1, min(max(1.3 * limit, 1.1 * shown.max()), 8.0))
     for axis in axes:
         for shaded, colour in ((said.active, RED), (labels, GREY)):
             if shaded is not None:
@@ -138,7 +141,11 @@ def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
         axis.grid(alpha=0.25, lw=0.5)
         if said.start < len(run):
             axis.axvline(run.time[said.start], color=GREY, lw=0.8, ls=":")
-    axes[0].set_title("alarms red, labels grey; statistics over their limits", fontsize=9, loc="left")
+    axes[0].set_title(
+        f"alarms red, labels grey; {'probabilities' if said.kind == 'probability' else 'statistics over their limits'}",
+        fontsize=9,
+        loc="left",
+    )
     axes[-1].set_xlabel(time_label(run))
     date_axis(axes[-1], run)
     return figure

@@ -100,11 +100,7 @@ def predicted(run: Track) -> Predicted:
     """The predictions of a run, and the log-likelihood of each sample."""
     s = run.innovation_std**2
     known = run.ok & np.isfinite(s) & (s > 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        loglik = -0.5 * (np.log(2.0 * np.pi * s) + run.innovation**2 / s)
-    if hasattr(run.model, "log_jacobian") and not getattr(run.tracker, "output_error", False):
-        loglik = loglik + run.model.log_jacobian(run.theta, run.y)
-    return Predicted(run.prediction, np.where(known, s, np.nan), np.where(known, loglik, np.nan))
+    return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
 def pool_of(

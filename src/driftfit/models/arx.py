@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, kernel
+from driftfit.kernel import Array, State, Step, kernel
 from driftfit.models.base import Model
 from driftfit.settings import input_names, one_of, output_names, whole
 
@@ -130,6 +130,10 @@ class ARX(Model):
         return self._count
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.inputs if isinstance(self.inputs, tuple) else ()
+
+    @property
     def lags(self) -> tuple[tuple[int, int], ...]:
         """(nb, nk) of every input."""
         nb = self.nb if isinstance(self.nb, tuple) else (self.nb,) * self.m
@@ -165,6 +169,10 @@ class ARX(Model):
     @property
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
+
+    @property
+    def apply(self) -> Step | None:
+        return take_input if all(nk > 0 for _, nk in self.lags) else None
 
     @property
     def output_lags(self) -> int:
@@ -212,6 +220,13 @@ class ARX(Model):
             B.append(np.concatenate([delay, theta[..., at : at + nb]], axis=-1))
             at += nb
         return A, B
+
+
+@kernel
+def take_input(s: State, l: int) -> None:
+    """The present input stands first among its lags."""
+    for j in range(s.u_lag.shape[0]):
+        s.u_lag[j, 0, l] = s.u[j, l]
 
 
 @lru_cache

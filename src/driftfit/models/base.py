@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import ModelSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.settings import Settings
 
 
@@ -33,6 +33,11 @@ class Model(Settings, ABC):
     @abstractmethod
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the order of theta."""
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs in their order, by which signals with names are matched; empty where they have none."""
+        return ()
 
     @property
     def dimensions(self) -> tuple[tuple[int, int | None], ...] | None:
@@ -69,6 +74,15 @@ class Model(Settings, ABC):
     @abstractmethod
     def steps(self) -> ModelSteps:
         """The compiled ``regress`` and ``push``."""
+
+    @property
+    def apply(self) -> Step | None:
+        """The compiled step that puts the input of a sample, ``s.u``, in its place after the sample has been taken in.
+
+        It must leave the record as if the input had come with the output. None where an output needs the input of its
+        own sample: then there is nothing to predict it from before.
+        """
+        return None
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that do not suit the model; `track` calls it with the whole record, y (T,), u (T, m)."""

@@ -5,7 +5,9 @@
     Chebyshev(degree, range)     T_1(s), T_2(s), ..
     PiecewiseLinear(knots)       x, then for each knot k: max(0, x - k) if k >= 0, min(0, x - k) if k < 0
     BSpline(degree, knots)       B_k(x) - B_k(anchor), k = 2 .. K, clamped at the ends
+    Sigmoid(centres, width)      tanh((x - m_k) / width) + tanh(m_k / width)
     DeadZone(u_max)              ([u>=p1] + [u<=p2]) u, -[u>=p1], -[u<=p2],  coefficients (1, p1, p2)
+    Saturation(u_max)            [p2<u<p1] u, [u>=p1], [u<=p2],  coefficients (1, p1, p2)
     Functions(values, slopes, n) any two compilable functions of your own
 
 None has a constant: constants of the input and of the output block cannot be told apart, and a model has one
@@ -20,6 +22,7 @@ Every basis gives `value(x)`, `derivative(x)`, n and names (`driftfit.models.cur
 from __future__ import annotations
 
 import warnings
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, cast
@@ -29,7 +32,7 @@ import numpy as np
 from driftfit.kernel import Array
 from driftfit.models import curve_kernels
 from driftfit.models.curves import Basis, Functions
-from driftfit.models.splines import BSpline, PiecewiseLinear
+from driftfit.models.splines import BSpline, PiecewiseLinear, knots_of
 from driftfit.settings import numbers, one_of, whole
 
 __all__ = [
@@ -41,6 +44,8 @@ __all__ = [
     "Legendre",
     "PiecewiseLinear",
     "Polynomial",
+    "Saturation",
+    "Sigmoid",
     "basis_of",
 ]
 
@@ -57,14 +62,15 @@ def basis_of(value: Any) -> Basis | None:
         raise ValueError(
             f"a block takes one of {', '.join(_kinds())}, or None for the identity; on the command line "
             "polynomial/DEGREE, legendre/DEGREE/LOW/HIGH, chebyshev/DEGREE/LOW/HIGH, piecewise-linear/KNOT/.., "
-            f"bspline/DEGREE/KNOT/.. or dead-zone/U_MAX; got {value!r}."
+            "bspline/DEGREE/KNOT/.., sigmoid/WIDTH/CENTRE/.., saturation/U_MAX or dead-zone/U_MAX; got "
+            f"{value!r}."
         )
     return kind.from_words(words[1:])
 
 
 def _kinds() -> dict[str, type[Basis]]:
-    return {kind.__name__: kind for kind in (Polynomial, Legendre, Chebyshev, PiecewiseLinear, BSpline, DeadZone,
-                                             Functions)}  # fmt: skip
+    return {kind.__name__: kind for kind in (Polynomial, Legendre, Chebyshev, PiecewiseLinear, BSpline, Sigmoid,
+                                             DeadZone, Saturation, Functions)}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -149,12 +155,57 @@ class Chebyshev(_Orthogonal):
 
 
 @dataclass(frozen=True)
-class DeadZone(Basis):
+class Thresholds(Basis):
+    """What dead zone and saturation share: two thresholds p2 <= 0 <= p1 among the coefficients (1, p1, p2).
+
+    The functions of an input take the thresholds from the estimates of the sample before it, held within 0 .. 0.97
+    u_max and -0.97 u_max .. 0: a Gauss-Newton step in p. What is learnt while they are wrong is wrong, so the tracker
+    must forget: with q = 0 they approach the truth as slowly as the share of those samples falls.
+    """
+
+    u_max: float
+    start: Any = None
+    fed: str = "least-squares"
+
+    adaptive: ClassVar[bool] = True
+    begins: ClassVar[float]
+    """Where the thresholds begin, as a share of u_max, unless that is said."""
+    machine: ClassVar[tuple[Any, Any]]
+
+    def __post_init__(self) -> None:
+        owner = type(self).__name__
+        self._set("u_max", numbers(owner, "u_max", self.u_max, ndim=0, low=0.0, strict=True))
+        start = self.begins * self.u_max if self.start is None else self.start
+        self._set("start", numbers(owner, "start", start, ndim=0, low=0.0))
+        one_of(owner, "fed", self.fed, ("least-squares", "average"))
+
+    @property
+    def n(self) -> int:
+        return 3
+
+    @property
+    def own_numbers(self) -> Array:
+        return np.array([self.start, -self.start, self.u_max, float(self.fed == "average")])
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        return (-self.u_max, self.u_max)
+
+    @abstractmethod
+    def split(self, u: Array, above: Array, below: Array) -> Array:
+        """The functions (.., 3) where it is known which inputs lie above and below the thresholds."""
+
+    def known(self, p1: float, p2: float) -> Functions:
+        """The basis with thresholds that are known, for simulations."""
+        return Functions(*self.machine, 3, (p1, p2, self.u_max), self.names)
+
+
+@dataclass(frozen=True)
+class DeadZone(Thresholds):
     """A dead zone between p2 < 0 < p1: v = u - p1 above it, u - p2 below, 0 inside; an input block only.
 
     In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u outside the dead zone, f_2 = -1 above it and
-    f_3 = -1 below it, 0 elsewhere. Where it begins the functions of an input take from the estimates of p1 and p2 of
-    the sample before it, held within 0 .. 0.97 u_max and -0.97 u_max .. 0: a Gauss-Newton step in p.
+    f_3 = -1 below it, 0 elsewhere.
 
     Parameters
     ----------
@@ -173,34 +224,75 @@ class DeadZone(Basis):
         For a u_max that is not above 0, a start below 0, or another ``fed``.
     """
 
-    u_max: float
-    start: float = 0.01
-    fed: str = "least-squares"
+    start: Any = 0.01
 
     code: ClassVar[int] = curve_kernels.DEAD_ZONE
-    adaptive: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        self._set("u_max", numbers("DeadZone", "u_max", self.u_max, ndim=0, low=0.0, strict=True))
-        self._set("start", numbers("DeadZone", "start", self.start, ndim=0, low=0.0))
-        one_of("DeadZone", "fed", self.fed, ("least-squares", "average"))
-
-    @property
-    def n(self) -> int:
-        return 3
-
-    @property
-    def own_numbers(self) -> Array:
-        return np.array([self.start, -self.start, self.u_max, float(self.fed == "average")])
-
-    @property
-    def expected(self) -> tuple[float, float]:
-        return (-self.u_max, self.u_max)
+    begins: ClassVar[float] = 0.0
+    machine: ClassVar[tuple[Any, Any]] = (curve_kernels.dead_zone, curve_kernels.dead_zone_slopes)
 
     @property
     def names(self) -> tuple[str, ...]:
         return ("outside", "p1", "p2")
 
-    def known(self, p1: float, p2: float) -> Functions:
-        """The basis with thresholds that are known, for simulations."""
-        return Functions(curve_kernels.dead_zone, curve_kernels.dead_zone_slopes, 3, (p1, p2, self.u_max), self.names)
+    def split(self, u: Array, above: Array, below: Array) -> Array:
+        known = np.where(np.isfinite(u), 0.0, np.nan)
+        return np.stack([np.where(above | below, u, known), -1.0 * above, -1.0 * below], axis=-1)
+
+
+@dataclass(frozen=True)
+class Saturation(Thresholds):
+    """A saturation at p2 < 0 < p1: v = u between them, p1 above, p2 below; an input block only.
+
+    In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u inside, f_2 = 1 above p1 and f_3 = 1 below p2, 0
+    elsewhere. Parameters as for `DeadZone`; the thresholds begin at half of u_max unless ``start`` says otherwise. A
+    threshold that no input reaches settles near the largest input.
+    """
+
+    code: ClassVar[int] = curve_kernels.SATURATION
+    begins: ClassVar[float] = 0.5
+    machine: ClassVar[tuple[Any, Any]] = (curve_kernels.saturation, curve_kernels.saturation_slopes)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("inside", "p1", "p2")
+
+    def split(self, u: Array, above: Array, below: Array) -> Array:
+        known = np.where(np.isfinite(u), 0.0, np.nan)
+        return np.stack([np.where(above | below, known, u), 1.0 * above, 1.0 * below], axis=-1)
+
+
+@dataclass(frozen=True)
+class Sigmoid(Basis):
+    """Sigmoids tanh((x - m_k) / width) + tanh(m_k / width) at increasing ``centres`` m_k: 0 at 0, level far away.
+
+    A sum of them with positive coefficients rises everywhere and levels off at both ends, as valves and sensors do.
+    """
+
+    centres: Any
+    width: float
+
+    code: ClassVar[int] = curve_kernels.SIGMOIDS
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        return cls(words[1:], words[0])
+
+    def __post_init__(self) -> None:
+        self._set("centres", knots_of("Sigmoid", self.centres, 1, "centres"))
+        self._set("width", numbers("Sigmoid", "width", self.width, ndim=0, low=0.0, strict=True))
+
+    @property
+    def n(self) -> int:
+        return len(self.centres)
+
+    @property
+    def own_numbers(self) -> Array:
+        return np.array([*self.centres, self.width])
+
+    @property
+    def rise_between(self) -> tuple[float, float]:
+        return 0.0, max(self.centres[-1], 0.0) + self.width
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"sigmoid at {m:g}" for m in self.centres)

@@ -13,15 +13,21 @@ from driftfit.drivers import LARGEST
 from driftfit.kernel import Array, core, part
 from driftfit.models.block_memory import (
     D_NOW,
+    EACH,
     F_PAST,
     G_PAST,
     H_PAST,
+    INPUTS,
     N_IN,
     N_OUT,
     NA,
     NB,
-    NK,
     NOW,
+    OWN,
+    OWN_F,
+    OWN_N_IN,
+    OWN_NB,
+    OWN_NK,
     SPARE,
     VARIANCE,
     N,
@@ -108,12 +114,19 @@ def forget(m: Array, p: Places) -> None:
 @part
 def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
     """phi but for the columns of the present output, from the lags as they stood ``ago`` samples before it."""
-    na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
-    f, g, at = p[F_PAST] + (p[NK] - ago) * n_in, p[G_PAST] + (1 - ago) * n_out, to + na
-    for k in range(n_in):
+    na, n_out, g = p[NA], p[N_OUT], p[G_PAST] + (1 - ago) * p[N_OUT]
+    first, at = to + na, to + na + p[NB] + n_out - 1
+    for i in range(p[INPUTS]):
+        own = OWN + EACH * i
+        nb, n_in = p[own + OWN_NB], p[own + OWN_N_IN]
+        f = p[own + OWN_F] + (p[own + OWN_NK] - ago) * n_in
         for j in range(nb):
-            m[at + j, 0] = -m[f + j * n_in + k, 0]
-        at = at + nb + n_out - 1 if k == 0 else at + nb
+            m[first + j, 0] = -m[f + j * n_in, 0]
+        first += nb
+        for k in range(1, n_in):
+            for j in range(nb):
+                m[at + j, 0] = -m[f + j * n_in + k, 0]
+            at += nb
     for k in range(n_out):
         start = to if k == 0 else at + (k - 1) * na
         for i in range(na):

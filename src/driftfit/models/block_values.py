@@ -13,10 +13,13 @@ from driftfit.kernel import Array, part
 from driftfit.models.block_memory import (
     CURVE,
     D_NOW,
-    INTO,
-    N_IN,
+    EACH,
     N_OUT,
     OUT,
+    OWN,
+    OWN_END,
+    OWN_INTO,
+    OWN_N_IN,
     TRIAL,
     TRIAL_BEND,
     Places,
@@ -64,9 +67,10 @@ def values_of(kind: Kind, numbers: int, following: int, count: int, bends: bool 
     return part({POWERS: powers, LEGENDRE: legendre}.get(code, values))
 
 
-def input_values(kind: Kind) -> Any:
-    """Those of the input block, whose slopes nobody needs."""
-    return values_of(kind, INTO, OUT, N_IN, bends=False)
+def input_values(kind: Kind, i: int) -> Any:
+    """Those of the curve of input i, whose slopes nobody needs."""
+    own = OWN + EACH * i
+    return values_of(kind, own + OWN_INTO, own + OWN_END, own + OWN_N_IN, bends=False)
 
 
 def output_values(kind: Kind, bends: bool = True) -> Any:

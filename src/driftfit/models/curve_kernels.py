@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array, floats, kernel, outside
+from driftfit.drivers import LARGEST
+from driftfit.kernel import Array, exp, floats, kernel, outside
 
-POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE = range(6)
+POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE, SATURATION, SIGMOIDS = range(8)
 
 
 @kernel
@@ -89,6 +90,44 @@ def dead_zone_slopes(x: float, p: Array, out: Array) -> None:
     out[0] = 1.0 if x >= p[0] or x <= p[1] else 0.0
     out[1] = 0.0
     out[2] = 0.0
+
+
+@kernel
+def saturation(x: float, p: Array, out: Array) -> None:
+    above, below = x >= p[0], x <= p[1]
+    out[0] = 0.0 if (above or below) and abs(x) < LARGEST else x
+    out[1] = 1.0 if above else 0.0
+    out[2] = 1.0 if below else 0.0
+
+
+@kernel
+def saturation_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 0.0 if x >= p[0] or x <= p[1] else 1.0
+    out[1] = 0.0
+    out[2] = 0.0
+
+
+@kernel
+def tanh(z: float) -> float:
+    """The library's own, with the same bits everywhere."""
+    e = exp(-2.0 * abs(z))
+    size = (1.0 - e) / (1.0 + e)
+    return size if z >= 0.0 else -size if z < 0.0 else z
+
+
+@kernel
+def sigmoids(x: float, p: Array, out: Array) -> None:
+    n = out.shape[0]
+    for k in range(n):
+        out[k] = tanh((x - p[k]) / p[n]) + tanh(p[k] / p[n]) if abs(x) < LARGEST else np.nan
+
+
+@kernel
+def sigmoid_slopes(x: float, p: Array, out: Array) -> None:
+    n = out.shape[0]
+    for k in range(n):
+        level = tanh((x - p[k]) / p[n])
+        out[k] = (1.0 - level * level) / p[n]
 
 
 @kernel
@@ -180,6 +219,12 @@ def every(x: float, p: Array, out: Array, slopes: Array) -> None:
     elif code == SPLINES:
         splines(x, own, out)
         spline_slopes(x, own, slopes)
+    elif code == SATURATION:
+        saturation(x, own, out)
+        saturation_slopes(x, own, slopes)
+    elif code == SIGMOIDS:
+        sigmoids(x, own, out)
+        sigmoid_slopes(x, own, slopes)
     else:
         dead_zone(x, own, out)
         dead_zone_slopes(x, own, slopes)

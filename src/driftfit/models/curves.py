@@ -86,6 +86,24 @@ class Basis(Settings, ABC):
         return (-np.inf, np.inf)
 
     @property
+    def rise_between(self) -> tuple[float, float]:
+        """Two inputs: a curve that is higher at the second than at the first counts as rising.
+
+        0, or what is nearest to it in the range, and the upper end; so an even curve has a sign as well.
+        """
+        low, high = self.expected
+        if not (np.isfinite(low) and np.isfinite(high)):
+            return 0.0, 1.0
+        middle = min(max(0.0, low), high)
+        return (middle if middle < high else low), high
+
+    @property
+    def rise(self) -> Array:
+        """r (n,) with r'c > 0 for the coefficients of curves that rise."""
+        low, high = self.value(np.array(self.rise_between))
+        return np.asarray(high - low)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """What the functions are, in the order of the coefficients."""
         return tuple(f"f{k + 1}" for k in range(self.n))

@@ -1,8 +1,10 @@
 """Hammerstein-Wiener: a static curve, a linear system, and another static curve, all of which may drift.
 
-    v_t = sum_k c_k f_k(u_t),  c_1 = 1                                input block
+    v_t = sum_k c_k f_k(u_t)                                          input block
     w_t = -sum_{i=1..na} a_i w_{t-i} + sum_{j=1..nb} b_j v_{t-nk-j+1}  linear block
     sum_k d_k g_k(y_t) = w_t,  d_1 = 1                                inverse of the output block, increasing
+
+With several inputs each has a curve v_i and coefficients b_i of its own, and their sum drives the linear block.
 
 In terms of what is measured this is a regression on products of the parameters (`driftfit.models.block_products`):
 
@@ -36,13 +38,13 @@ from typing import Any, Self
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.models.basis import Basis, Polynomial, basis_of
 from driftfit.models.block_memory import memory, places_of
 from driftfit.models.block_products import Structure
 from driftfit.models.block_rows import FLOOR
-from driftfit.models.hammerstein_wiener_steps import build
+from driftfit.models.hammerstein_wiener_steps import applying, build
 from driftfit.settings import numbers, whole
 
 IDENTITY = Polynomial(1)
@@ -52,9 +54,26 @@ UNIT = 10.0
 """Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
 
 
+def several(value: Any) -> bool:
+    """Whether a setting has an entry for each input; the words of one basis begin with its name."""
+    return isinstance(value, (tuple, list)) and not (len(value) > 0 and isinstance(value[0], str))
+
+
+def _blocks(value: Any) -> Any:
+    """A basis, or one for each input."""
+    return tuple(basis_of(each) for each in value) if several(value) else basis_of(value)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as plain data."""
+    if isinstance(value, tuple):
+        return tuple(_plain(each) for each in value)
+    return value.plain() if isinstance(value, Basis) else value
+
+
 @dataclass(frozen=True)
 class HammersteinWiener(Model):
-    """Hammerstein-Wiener model with one input and one output.
+    """Hammerstein-Wiener model with one output.
 
     Parameters
     ----------
@@ -64,64 +83,100 @@ class HammersteinWiener(Model):
         Delay of the input in samples; 0 uses the present input.
     input, output : Basis or None
         Functions of the input block, and of the inverse of the output block. None is the identity, so that
-        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model.
+        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model. A list of bases makes a model with so many
+        inputs, each with a curve of its own; ``nb`` and ``nk`` then may be lists as well.
     intercept : bool
         Add one constant; those of the two blocks cannot be told apart.
     output_noise : number or None
         Standard deviation of white noise on y. The noise variance of the equation then is r times
         sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
-    name : str or None
-        Name of the input.
+    name : str, tuple of str or None
+        Name of the input, or of each.
 
     Raises
     ------
     ValueError
-        For orders that are not whole, a dead zone in the output block, or several inputs.
+        For orders that are not whole, lists of different lengths, or a dead zone or saturation in the output block.
     """
 
     na: int
-    nb: int
-    nk: int = 1
+    nb: Any
+    nk: Any = 1
     input: Any = None
     output: Any = None
     intercept: bool = False
     output_noise: float | None = None
-    name: str | None = None
+    name: Any = None
 
     def __post_init__(self) -> None:
-        for name, low in (("na", 0), ("nb", 1), ("nk", 0)):
-            self._set(name, whole("HammersteinWiener", name, getattr(self, name), low))
-        for name in ("input", "output"):
-            self._set(name, basis_of(getattr(self, name)))
+        self._set("na", whole("HammersteinWiener", "na", self.na, 0))
+        counts = {name: len(value) for name in ("input", "nb", "nk") if several(value := getattr(self, name))}
+        if len(set(counts.values())) > 1 or 0 in counts.values():
+            raise ValueError(f"HammersteinWiener: lists have one entry for each input; got {counts}.")
+        for name, low in (("nb", 1), ("nk", 0)):
+            given = getattr(self, name)
+            checked = [whole("HammersteinWiener", name, x, low) for x in (given if several(given) else (given,))]
+            self._set(name, tuple(checked) if several(given) else checked[0])
+        if counts and max(counts.values()) == 1:
+            for name in counts:
+                self._set(name, getattr(self, name)[0])
+        self._set("input", _blocks(self.input))
+        self._set("output", basis_of(self.output))
         if self.output is not None and self.output.adaptive:
-            raise ValueError("HammersteinWiener: a dead zone is not one-to-one, so it can only be the input block.")
+            raise ValueError(
+                f"HammersteinWiener: {type(self.output).__name__} is not one-to-one, so it can only be an input block."
+            )
         if self.output_noise is not None:
             sigma = numbers("HammersteinWiener", "output_noise", self.output_noise, ndim=0, low=0.0, strict=True)
             self._set("output_noise", sigma)
 
     def settings(self) -> dict[str, Any]:
-        given = super().settings()
-        return given | {k: v.plain() for k, v in given.items() if isinstance(v, Basis)}
+        return {name: _plain(value) for name, value in super().settings().items()}
 
     @classmethod
     def from_settings(cls, settings: dict[str, Any]) -> Self:
-        bases = {name: basis_of(settings.get(name)) for name in ("input", "output")}
+        bases = {"input": _blocks(settings.get("input")), "output": basis_of(settings.get("output"))}
         return super().from_settings(settings | bases)
 
     def bind(self, inputs: int | Sequence[str]) -> HammersteinWiener:
         count = inputs if isinstance(inputs, int) else len(inputs)
-        if count != 1:
-            raise ValueError(f"HammersteinWiener: the model has 1 input, but u has {count} columns.")
-        return self if isinstance(inputs, int) or self.name is not None else replace(self, name=inputs[0])
+        if count != self.m:
+            raise ValueError(
+                f"HammersteinWiener: the model has {self.m} input{'s' if self.m > 1 else ''}, but u has {count} "
+                "columns; give input= a list with a basis, or None, for each."
+            )
+        if isinstance(inputs, int) or self.name is not None:
+            return self
+        return replace(self, name=inputs[0] if count == 1 else tuple(inputs))
 
     @property
     def m(self) -> int:
-        return 1
+        return max(len(x) if several(x) else 1 for x in (self.input, self.nb, self.nk))
+
+    @property
+    def bases(self) -> tuple[Basis, ...]:
+        """Functions of the curve of each input."""
+        return tuple(IDENTITY if basis is None else basis for basis in self._each(self.input))
+
+    @property
+    def delays(self) -> tuple[int, ...]:
+        """nk of each input."""
+        return self._each(self.nk)
+
+    def _each(self, value: Any) -> tuple[Any, ...]:
+        """A setting, for each input."""
+        return value if several(value) else (value,) * self.m
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return () if self.name is None else (self.name,) if isinstance(self.name, str) else tuple(self.name)
 
     @property
     def into(self) -> Basis:
-        """Functions of the input block."""
-        return self.input if isinstance(self.input, Basis) else IDENTITY
+        """Functions of the input block; ValueError where there are several inputs."""
+        if self.m > 1:
+            raise ValueError("HammersteinWiener: what was asked for needs a model with one input.")
+        return self.bases[0]
 
     @property
     def out(self) -> Basis:
@@ -131,11 +186,22 @@ class HammersteinWiener(Model):
     @property
     def structure(self) -> Structure:
         """The orders, and where the parameters stand in theta."""
-        return Structure(self.na, self.nb, self.into.n, self.out.n, self.intercept)
+        return Structure(self.na, self._each(self.nb), tuple(b.n for b in self.bases), self.out.n, self.intercept)
 
     @property
     def names(self) -> tuple[str, ...]:
-        return self.structure.names
+        return self.called(self.structure.names)
+
+    def called(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of coefficients, with those of the inputs for [u1], [u2] .. where they have names."""
+        for i, name in enumerate(self.name if isinstance(self.name, tuple) else ()):
+            names = [each.replace(f"[u{i + 1}]", f"[{name}]") for each in names]
+        return tuple(names)
+
+    @property
+    def rise(self) -> Array:
+        """r with r'c > 0 for the curves that rise, of each input (sum of n_in,); 0 where c_1 = 1 by definition."""
+        return _rise(self)
 
     @property
     def linear(self) -> bool:
@@ -155,8 +221,12 @@ class HammersteinWiener(Model):
         return _steps(self)
 
     @property
+    def apply(self) -> Step | None:
+        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
+
+    @property
     def reach(self) -> int:
-        return max(self.na, self.nb + self.nk - 1)
+        return max(self.na, *(nb + nk - 1 for nb, nk in zip(self.structure.nb, self.delays, strict=True)))
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         from driftfit.models.hammerstein_wiener_forward import play
@@ -167,13 +237,14 @@ class HammersteinWiener(Model):
         """The samples that cannot be used when "y" or "u" is missing at t."""
         if signal == "y":
             return range(t, t + self.na + 1)
-        return range(t + self.nk, t + self.nk + self.nb)
+        ends = [nb + nk for nb, nk in zip(self.structure.nb, self.delays, strict=True)]
+        return range(t + min(self.delays), t + max(ends))
 
     def output_weights(self, theta: Array) -> Array:
         """d (..., n_out) with d_1 = 1 from theta (..., n), or from the minimal xi (..., n_x)."""
         at = self.structure.starts[0]
         if theta.shape[-1] != self.n:
-            at += self.into.n - 1
+            at += sum(self.structure.n_in) - self.m
         d = theta[..., at : at + self.out.n - 1]
         return np.concatenate([np.ones((*theta.shape[:-1], 1)), d], axis=-1)
 
@@ -197,7 +268,7 @@ class HammersteinWiener(Model):
         response: Array = np.eye(1, h)[0]
         for t in range(1, h):
             lags = response[max(t - self.na, 0) : t][::-1]
-            response[t] = -theta[: len(lags)] @ lags
+            response[t] = np.clip(-theta[: len(lags)] @ lags, -LARGEST, LARGEST)  # unstable estimates grow for ever
         return response
 
     def output_slope(self, theta: Array, y: Array) -> Array:
@@ -217,7 +288,9 @@ class HammersteinWiener(Model):
 
     def inspect(self, y: Array, u: Array) -> None:
         """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
-        for what, basis, data in (("u", self.into, u[:, 0]), ("y", self.out, y)):
+        given = self.name if isinstance(self.name, tuple) else None
+        names = given or (["u"] if self.m == 1 else [f"u{i + 1}" for i in range(self.m)])
+        for what, basis, data in (*zip(names, self.bases, u.T, strict=True), ("y", self.out, y)):
             if basis.n == 1 and not np.isfinite(basis.expected).any():
                 continue
             with np.errstate(invalid="ignore", over="ignore"):
@@ -245,16 +318,22 @@ class HammersteinWiener(Model):
 
 @lru_cache
 def _places(model: HammersteinWiener) -> tuple[int, ...]:
-    bases = model.into.parameters, model.out.parameters
-    return places_of(model.structure, model.nk, *bases, model.linear, model.into.adaptive)
+    into = tuple(basis.parameters for basis in model.bases)
+    adaptive = tuple(basis.adaptive for basis in model.bases)
+    return places_of(model.structure, model.delays, into, model.out.parameters, model.linear, adaptive)
 
 
 @lru_cache
 def _memory(model: HammersteinWiener) -> Array:
-    bases = model.into.parameters, model.out.parameters
-    return memory(model.structure, model.nk, *bases, model.out.limits, model.output_noise)
+    into = tuple(basis.parameters for basis in model.bases)
+    return memory(model.structure, model.delays, into, model.out.parameters, model.out.limits, model.output_noise)
+
+
+@lru_cache
+def _rise(model: HammersteinWiener) -> Array:
+    return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in model.bases])
 
 
 @lru_cache
 def _steps(model: HammersteinWiener) -> ModelSteps:
-    return build(model.into.kind, model.out.kind, model.places)
+    return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)

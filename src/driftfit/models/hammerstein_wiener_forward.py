@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.kernel import Array
+from driftfit.models.basis import Basis, Thresholds
 
 if TYPE_CHECKING:
     from driftfit.models.hammerstein_wiener import HammersteinWiener
@@ -27,22 +28,25 @@ INSIDE = 0.97
 
 def play(model: HammersteinWiener, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
     """Outputs (D, h); arguments as for `driftfit.models.base.Model.play`."""
-    na, nb, n_in, n_out, intercept = model.structure
-    _, at_bc, at_ad = model.structure.starts
+    na, nbs, n_ins, n_out, intercept = model.structure
+    at_b, (_, at_bc, at_ad) = na, model.structure.starts
     D, p, h = len(theta), y.shape[1], noise.shape[1]
-    b, a = theta[:, na : na + nb], theta[:, :na]
-    B = np.stack([b, *(theta[:, at_bc + k * nb : at_bc + (k + 1) * nb] for k in range(n_in - 1))], axis=2)
+    a, driven = theta[:, :na], np.zeros((D, p + h))
     A = np.stack([a, *(theta[:, at_ad + k * na : at_ad + (k + 1) * na] for k in range(n_out - 1))], axis=2)
-    f = _inputs(model, B, u[:, :, 0])
+    for i, (nb, n_in, nk, basis) in enumerate(zip(nbs, n_ins, model.delays, model.bases, strict=True)):
+        b = theta[:, at_b : at_b + nb]
+        B = np.stack([b, *(theta[:, at_bc + k * nb : at_bc + (k + 1) * nb] for k in range(n_in - 1))], axis=2)
+        f = _inputs(basis, B, u[:, :, i])
+        at_b, at_bc = at_b + nb, at_bc + nb * (n_in - 1)
+        for j in range(nb):
+            driven[:, p:] += np.sum(B[:, None, j] * f[:, p - nk - j : p + h - nk - j], axis=2)
     g = np.full((D, p + h, n_out), np.nan)
     g[:, :p] = model.out.value(y)
     out = np.empty((D, h))
     inverse = None if model.linear else Inverse(model, model.output_weights(theta), span)
     for k in range(h):
         t = p + k
-        right = -noise[:, k] - (theta[:, -1] if intercept else 0.0)
-        for j in range(nb):
-            right = right + np.sum(B[:, j] * f[:, t - model.nk - j], axis=1)
+        right = driven[:, t] - noise[:, k] - (theta[:, -1] if intercept else 0.0)
         for i in range(na):
             right = right - np.sum(A[:, i] * g[:, t - 1 - i], axis=1)
         out[:, k] = right if inverse is None else inverse(right)
@@ -50,19 +54,18 @@ def play(model: HammersteinWiener, theta: Array, y: Array, u: Array, noise: Arra
     return out
 
 
-def _inputs(model: HammersteinWiener, B: Array, u: Array) -> Array:
-    """Functions of the inputs, (D or 1, T, n_in)."""
-    if not model.into.adaptive:
-        return model.into.value(u)
+def _inputs(basis: Basis, B: Array, u: Array) -> Array:
+    """Functions of an input, (D or 1, T, n_in)."""
+    if not isinstance(basis, Thresholds):
+        return basis.value(u)
     b = B[:, :, 0]
-    if model.into.settings()["fed"] == "average":
+    if basis.fed == "average":
         upper, lower = (np.mean(B[:, :, k] / b, axis=1) for k in (1, 2))
     else:
         upper, lower = (np.sum(b * B[:, :, k], axis=1) / np.sum(b * b, axis=1) for k in (1, 2))
-    most = INSIDE * float(model.into.settings()["u_max"])
+    most = INSIDE * basis.u_max
     above, below = u >= np.clip(upper, 0.0, most)[:, None], u <= np.clip(lower, -most, 0.0)[:, None]
-    known = np.where(np.isfinite(u), 0.0, np.nan)
-    return np.stack([np.where(above | below, u, known), -1.0 * above, -1.0 * below], axis=2)
+    return basis.split(u, above, below)
 
 
 class Inverse:

@@ -19,23 +19,22 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, core, floats, kernel, outside, part
+from driftfit.kernel import Array, State, Step, core, floats, kernel, outside, part
 from driftfit.models.arx import GAP
 from driftfit.models.block_curve import believe, inverting, laying, locating, refining
 from driftfit.models.block_memory import (
     ADAPTIVE,
     DT,
-    F_PAST,
+    EACH,
     FACTOR,
     G_PAST,
     GIVEN,
     H_PAST,
     IDENTITY,
-    INTO,
+    INPUTS,
     LATE,
     MINIMAL,
     MOVED,
-    N_IN,
     N_OUT,
     NA,
     NB,
@@ -43,15 +42,22 @@ from driftfit.models.block_memory import (
     NK,
     NOW,
     OK,
+    OWN,
+    OWN_ADAPTIVE,
+    OWN_F,
+    OWN_INTO,
+    OWN_N_IN,
+    OWN_NB,
+    OWN_NK,
     PREDICTED,
     RAW,
     SEEN,
     SPARE,
     STARTED,
+    US,
     VARIANCE,
     N,
     Places,
-    U,
     Y,
 )
 from driftfit.models.block_rows import complete, fill, forget, minimal_past, noise_factor, past, shift
@@ -64,29 +70,53 @@ INSIDE = 0.97
 @core
 def thresholds(m: Array, p: Places, theta: Array) -> None:
     """The coefficients of a dead zone, fed back: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
-    na, nb = p[NA], p[NB]
-    x_c, at_bc, into = na + nb, na + nb + p[N_OUT] - 1, p[INTO]
-    for k in range(2):
-        total, size = 0.0, 0.0
-        for j in range(nb if m[MINIMAL, 0] == 0.0 else 0):
-            gain, product = theta[na + j, 0], theta[at_bc + k * nb + j, 0]
-            size += 1.0 if m[into + 4, 0] > 0.0 else gain * gain
-            total += product / gain if m[into + 4, 0] > 0.0 else product * gain
-        threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[x_c + k, 0]
-        if abs(threshold) < LARGEST:
-            top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
-            m[into + 1 + k, 0] = min(max(threshold, bottom), top)
+    at_b, at_bc = p[NA], p[NA] + p[NB] + p[N_OUT] - 1
+    for i in range(p[INPUTS]):
+        own = OWN + EACH * i
+        nb, into = p[own + OWN_NB], p[own + OWN_INTO]
+        for k in range(2 if p[own + OWN_ADAPTIVE] > 0 else 0):
+            total, size = 0.0, 0.0
+            for j in range(nb if m[MINIMAL, 0] == 0.0 else 0):
+                gain, product = theta[at_b + j, 0], theta[at_bc + k * nb + j, 0]
+                size += 1.0 if m[into + 4, 0] > 0.0 else gain * gain
+                total += product / gain if m[into + 4, 0] > 0.0 else product * gain
+            threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[at_b + nb + k, 0]
+            if abs(threshold) < LARGEST:
+                top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
+                m[into + 1 + k, 0] = min(max(threshold, bottom), top)
+        at_b, at_bc = at_b + nb, at_bc + nb * (p[own + OWN_N_IN] - 1)
 
 
 @lru_cache
-def _regress_work(into: Kind, out: Kind, lanes: bool) -> Any:
-    """What ``regress`` does, for the functions of both bases."""
-    input_at, output_at, bare_output_at = input_values(into), output_values(out), output_values(out, bends=False)
+def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
+    """A part (m, p) that takes the inputs of this sample, from input i on, into their lags, or replaces the newest."""
+    input_at, own = input_values(into[i], i), OWN + EACH * i
+
+    def one(m: Array, p: Places) -> None:
+        if moves:
+            shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
+        input_at(m, p, m[p[US] + i, 0], p[own + OWN_F], p[SPARE])
+
+    enter = part(one)
+    if i + 1 == len(into):
+        return enter
+    others = _entering(into, i + 1, moves)
+
+    def all_from(m: Array, p: Places) -> None:
+        enter(m, p)
+        others(m, p)
+
+    return part(all_from)
+
+
+@lru_cache
+def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
+    """What ``regress`` does, for the functions of all bases."""
+    enter, output_at, bare_output_at = _entering(into), output_values(out), output_values(out, bends=False)
     lay, locate, invert = laying(output_at), locating(lanes), inverting(out)
 
     def regress_work(m: Array, p: Places, theta: Array) -> None:
-        n_in, n_out, depth, rows = p[N_IN], p[N_OUT], p[NB] + p[NK], 1 + max(p[NA], 1)
-        f, g, h, spare = p[F_PAST], p[G_PAST], p[H_PAST], p[SPARE]
+        n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
         if not m[SEEN, 0] > 0.0:  # the sample before
             for k in range(n_out):
                 m[g + k, 0] = np.nan
@@ -99,8 +129,7 @@ def _regress_work(into: Kind, out: Kind, lanes: bool) -> Any:
             forget(m, p)
         if p[ADAPTIVE] > 0 and m[OK, 0] > 0.0:
             thresholds(m, p, theta)
-        shift(m, f, n_in, depth)
-        input_at(m, p, m[U, 0], f, spare)
+        enter(m, p)
         if p[NK] == 0 or m[DT, 0] > GAP:
             fill(m, p, p[NOW], 0, True)
         if m[STARTED, 0] == 0.0 and complete(m, p):
@@ -137,7 +166,7 @@ def _regress_work(into: Kind, out: Kind, lanes: bool) -> Any:
 
 
 @lru_cache
-def _regress(into: Kind, out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
+def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The machine of ``regress``."""
     work, orders = _regress_work(into, out, lanes), np.array(p)
 
@@ -162,17 +191,20 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
 
 
 @lru_cache
-def build(into: Kind, out: Kind, p: tuple[int, ...]) -> ModelSteps:
-    """The steps for the machines of two bases."""
+def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
+    """The steps for the machines of the bases of the inputs and of the output."""
     regress_one, regress_lane = _regress(into, out, p, False), _regress(into, out, p, True)
     push_one, push_lane = _push(out, p, False), _push(out, p, True)
     curved = not p[IDENTITY]
 
     now, following, n, present, at_d, more = p[NOW], p[NEXT], p[N], p[G_PAST] + 1, p[NA] + p[NB], p[N_OUT] - 1
+    us, inputs = p[US], p[INPUTS]
 
     @kernel
     def regress(s: State, l: int) -> None:
-        s.blocks[GIVEN, l], s.blocks[U, l], s.blocks[Y, l], s.blocks[DT, l] = s.noise[l], s.u[0, l], s.y[l], s.dt[l]
+        s.blocks[GIVEN, l], s.blocks[Y, l], s.blocks[DT, l] = s.noise[l], s.y[l], s.dt[l]
+        for i in range(inputs):
+            s.blocks[us + i, l] = s.u[i, l]
         at, L = 8 * l, s.y.shape[0]
         blocks, theta = s.blocks.ctypes.data + at, s.theta.ctypes.data + at
         if L == 1:
@@ -201,7 +233,30 @@ def build(into: Kind, out: Kind, p: tuple[int, ...]) -> ModelSteps:
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     def ready(L: int) -> None:
-        for machine in (into[0], out[0], *((regress_one, push_one) if L == 1 else (regress_lane, push_lane))):
+        for machine in (
+            *(one[0] for one in into),
+            out[0],
+            *((regress_one, push_one) if L == 1 else (regress_lane, push_lane)),
+        ):
             machine.load()
 
     return ModelSteps(regress, push, ready)
+
+
+@lru_cache
+def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
+    """The step that takes inputs after their sample: their functions, and the row of the next sample laid out again."""
+    place, orders = _entering(into, moves=False), np.array(p)
+    now, following, n, us, inputs = p[NOW], p[NEXT], p[N], p[US], p[INPUTS]
+
+    def apply(s: State, l: int) -> None:
+        for i in range(inputs):
+            s.blocks[us + i, l] = s.u[i, l]
+        m = floats(s.blocks.ctypes.data + 8 * l, 1, s.y.shape[0])
+        place(m, orders)
+        fill(m, orders, following, 1, m[SEEN, 0] > 0.0)
+        for i in range(n):
+            s.blocks[now + i, l] = s.blocks[following + i, l]
+
+    step: Step = kernel(apply)
+    return step

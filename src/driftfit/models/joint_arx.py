@@ -52,17 +52,6 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept, len(self.outputs))
 
-    def noise_response(self, theta: Array, h: int) -> Array:
-        """Responses (h, ny, ny) of the outputs to one noise of each, for theta (ny, n)."""
-        ny, na = len(self.outputs), self.na
-        lags = np.asarray(theta)[:, : ny * na].reshape(ny, ny, na)
-        response = np.zeros((h, ny, ny))
-        response[0] = np.eye(ny)
-        for k in range(1, h):
-            for i in range(min(na, k)):
-                response[k] += lags[:, :, i] @ response[k - 1 - i]
-        return response
-
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
 

@@ -78,6 +78,10 @@ class Regression(Model):
         return self.regressors if isinstance(self.regressors, int) else len(self.regressors)
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.regressors if isinstance(self.regressors, tuple) and not self.shared else ()
+
+    @property
     def names(self) -> tuple[str, ...]:
         given = self.regressors
         own = tuple(f"theta{i + 1}" for i in range(self.m)) if isinstance(given, int) else tuple(given or ())

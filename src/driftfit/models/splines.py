@@ -18,12 +18,12 @@ from driftfit.models.curves import Basis, values_and_slopes
 from driftfit.settings import numbers, whole
 
 
-def knots_of(owner: str, value: Any, least: int) -> tuple[float, ...]:
-    given = numbers(owner, "knots", value)
+def knots_of(owner: str, value: Any, least: int, name: str = "knots") -> tuple[float, ...]:
+    given = numbers(owner, name, value)
     knots = given if isinstance(given, tuple) else (given,)
     if len(knots) < least or any(b <= a for a, b in pairwise(knots)):
         raise ValueError(
-            f"{owner}: knots must be at least {least} increasing numbers, each once (a knot given twice would make two "
+            f"{owner}: {name} must be at least {least} increasing numbers, each once (one given twice would make two "
             f"columns equal); got {value!r}."
         )
     return knots
@@ -43,6 +43,11 @@ class PiecewiseLinear(Basis):
 
     def __post_init__(self) -> None:
         self._set("knots", knots_of("PiecewiseLinear", self.knots, 1))
+
+    @property
+    def rise_between(self) -> tuple[float, float]:
+        """Well beyond the last knot, since a curve may be level between the knots."""
+        return 0.0, max(self.knots[-1], 0.0) + max(map(abs, self.knots))
 
     @property
     def n(self) -> int:

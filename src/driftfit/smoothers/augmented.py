@@ -23,9 +23,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver
 from driftfit.settings import numbers, one_of, vector, whole
 from driftfit.smoothers.exact import smooth
 from driftfit.smoothers.walk import constants, walk_of
@@ -109,7 +108,7 @@ def augmented(
     return AugmentedPath(theta, l, change)
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def sweep(
     theta: Array, before: Array, phi: Array, y: Array, weight: Array, mu: float, w: float, printed: bool
 ) -> float:

@@ -25,9 +25,8 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver
 from driftfit.smoothers.walk import Path, Walk
 
 CORRECTION = 1e-10
@@ -86,7 +85,7 @@ def workspace(n: int) -> Array:
     return np.zeros(1, np.dtype([("U", *square), ("C", *square), *((name, *vector) for name in vectors)]))
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def forwards(
     work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array
 ) -> float:
@@ -125,7 +124,7 @@ def forwards(
     return least
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def backwards(
     work: Array, phi: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
     theta: Array, var: Array, left: Array,
@@ -163,7 +162,7 @@ def backwards(
             s.C[i, i] = own
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def residuals(
     work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
     theta: Array,
@@ -194,7 +193,7 @@ def residuals(
     return cost
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def correct(work: Array, a: Array, b: Array, theta: Array) -> None:
     """The backward pass of the refinement: adds the correction to theta and notes its size and theta's."""
     s = work[0]

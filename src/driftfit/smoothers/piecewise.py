@@ -34,7 +34,7 @@ class Segments:
 
     def __init__(self, run: Track, breaks: Any = None, r: float | None = None) -> None:
         if breaks is None:
-            breaks = [event.date for event in run.hypotheses.events() if event.kind == "change"]
+            breaks = [event.span.date for event in run.hypotheses.events() if event.kind == "change"]
         T = len(run)
         inner = sorted({int(b) for b in breaks})
         if inner and not 0 < inner[0] <= inner[-1] < T:

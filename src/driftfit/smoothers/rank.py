@@ -6,13 +6,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from driftfit.kernel import Array, Driver
 from driftfit.trackers import diffuse
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@Driver
 def column_scale(phi: Array, weight: Array) -> Array:
     """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros."""
     T, n = phi.shape

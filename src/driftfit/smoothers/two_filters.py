@@ -33,6 +33,8 @@ from driftfit.trackers import information
 
 KNOWN_EXACTLY = 1e8
 """How much more is known of what the prior fixes than all samples together could say; its square is beyond rounding."""
+STANDS_STILL = 1e-60
+"""The drift of a direction that does not move, in scaled units: its weight is the square of the inverse."""
 
 
 class Start(NamedTuple):
@@ -113,25 +115,38 @@ def undetermined(hidden: Array) -> Array:
 
 
 def gains(walk: Walk, G: Array, blocks: Array) -> Array:
-    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}, F^-1 (I - g (I + g' U g)^-1 g' U).
+    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}.
 
-    U is the information on F theta_t of the samples up to t, g = E G sqrt(drift_{t+1}); F moves theta along its slope
-    and is 1 where it has none.
+    With M the root of the information of the samples up to t on F theta_t = x, g = E G sqrt(drift_{t+1}) = V s W' and F
+    moving theta along its slope (1 where it has none), x minimises
+
+        |M x|^2 + |s^-1 V' (x - theta_{t+1})|^2
+
+    by Householder reflections with the rows in the order of their size. M'M would lose what the past says where the
+    drift is far above the noise, and the gain as 1 less something would cancel there.
     """
-    phi = walk.phi
-    T, n = phi.shape
-    S = np.zeros((T, n, n))
-    S[:, *np.triu_indices(n)] = np.moveaxis(blocks["S"][:, 0], 1, 2).reshape(-1, n * (n + 1) // 2)[:T]
-    U = S.swapaxes(1, 2) @ S + walk.weight[:, None, None] * phi[:, :, None] * phi[:, None, :]
+    T, n = walk.phi.shape
+    M = np.zeros((T, n + 1, n))
+    rows, columns = np.triu_indices(n)
+    M[:, rows, columns] = np.moveaxis(blocks["S"][:, 0], 1, 2).reshape(-1, len(rows))[:T]
+    M[:, n] = np.sqrt(walk.weight)[:, None] * walk.phi
     g = G * np.sqrt(walk.drift[1:, None, None])
     if len(walk.each):
         g = walk.each[1:, :, None] * g
     back = np.broadcast_to(np.eye(n), (T - 1, n, n))
     if len(walk.trend):
         back = back - np.eye(n, k=n // 2) * walk.trend[1:, None, None]
-    gU = g.swapaxes(1, 2) @ (back.swapaxes(1, 2) @ U[:-1] @ back)
-    gain: Array = back @ (np.eye(n) - g @ np.linalg.solve(np.eye(n) + gU @ g, gU))
-    return gain
+    V, s, _ = np.linalg.svd(g)
+    held = (V / np.maximum(s, STANDS_STILL)[:, None, :]).swapaxes(1, 2)
+    A = np.concatenate([M[:-1] @ back, held], axis=1)
+    b = np.concatenate([np.zeros((T - 1, n + 1, n)), held], axis=1)
+    order = np.argsort(-np.abs(A).max(axis=2), axis=1)[:, :, None]
+    A, b = np.take_along_axis(A, order, axis=1), np.take_along_axis(b, order, axis=1)
+    pivots = np.argsort(-np.abs(A[:, 0]), axis=1)
+    Q, R = np.linalg.qr(np.take_along_axis(A, pivots[:, None, :], axis=2))
+    found, gain = np.linalg.solve(R, Q.swapaxes(1, 2) @ b), np.empty((T - 1, n, n))
+    np.put_along_axis(gain, pivots[:, :, None], found, axis=1)
+    return np.asarray(back @ gain)
 
 
 def block_type(n: int) -> np.dtype[Any]:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.kernel import Array
-from driftfit.models.basis import Basis, DeadZone, Polynomial
+from driftfit.models.basis import Basis, Polynomial, Thresholds
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.systems.drift import Jump, Law, Ramp, RandomWalk, SineIncrement, SineOffset, paths
 from driftfit.systems.inversion import LIMIT, NotMonotoneError, invert
@@ -139,10 +139,8 @@ def simulate(
 
 def input_block(basis: Basis, u: Array, c: Array) -> Array:
     """v (T,) for coefficients c (T, n)."""
-    if isinstance(basis, DeadZone):
-        v: Array = np.where(u >= c[:, 1], u - c[:, 1], np.where(u <= c[:, 2], u - c[:, 2], 0.0))
-        return v
-    return np.asarray(np.sum(basis.value(u) * c, axis=1))
+    f = basis.split(u, u >= c[:, 1], u <= c[:, 2]) if isinstance(basis, Thresholds) else basis.value(u)
+    return np.asarray(np.sum(f * c, axis=1))
 
 
 def _linear(model: HammersteinWiener, a: Array, b: Array, v: Array, error: Array) -> Array:

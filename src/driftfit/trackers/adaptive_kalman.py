@@ -254,6 +254,7 @@ class AdaptiveKalman(Tracker):
     groups: Any = None
 
     width: ClassVar[int] = 1
+    adapts: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.groups is not None:

@@ -42,12 +42,12 @@ from driftfit.hypotheses.change import Change
 from driftfit.hypotheses.factored import factorise, widened
 from driftfit.hypotheses.leaves import FIRST, NU, S
 from driftfit.hypotheses.memory import SINGLE, arrays_of, packed
-from driftfit.hypotheses.prior import events, per_sample
+from driftfit.hypotheses.prior import chains, events, per_sample
 from driftfit.hypotheses.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.hypotheses.sensor import Sensor
 from driftfit.hypotheses.start import GROWTH, begin
 from driftfit.hypotheses.steps import STEPS
-from driftfit.hypotheses.table import COUNT, FADE, HEAD, LAST, LEAVES, PACKED, SIZE, R
+from driftfit.hypotheses.table import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
@@ -55,6 +55,9 @@ from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import ALMOST_ANY, knowing, knowing_nothing
 from driftfit.trackers.information import triangular_root
+
+FAR = 100.0
+"""Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class Bank(Tracker):
 
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("report",)
+    density: ClassVar[str] = "report"
     weighs: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -156,7 +160,7 @@ class Bank(Tracker):
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """The sensors, likewise."""
-        return self.sensors or (Sensor.nominal(),)
+        return self.sensors or (Sensor.nominal(limit=FAR),)
 
     @property
     def reduction(self) -> Reduction:
@@ -179,6 +183,16 @@ class Bank(Tracker):
     def _alike(self) -> bool:
         P = self._events[0]
         return bool((P[0] == P).all())
+
+    @property
+    def _apart(self) -> bool:
+        """Whether changes are events that know nothing of earlier ones, so that a gap is one floor."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
+            return False
+        P = self._events[0].reshape(-1, Hd, Hm)
+        product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
+        return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
     @property
     def change_names(self) -> tuple[str, ...]:
@@ -235,7 +249,7 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         now, many = np.zeros(SIZE), np.zeros(COUNT, int)
-        now[LAST], now[R] = np.nan, 1.0
+        now[LAST], now[R], now[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
         now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
@@ -250,7 +264,7 @@ class Bank(Tracker):
         q0, Q0 = arrays["Q"][0, : n * (n + 1) // 2], np.zeros((n, n))
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
-            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt"),
+            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
@@ -260,20 +274,27 @@ class Bank(Tracker):
         }  # fmt: skip
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Priors of the joint events (T, H), NaN where nothing is given, and factors of the changes (T, H_d)."""
-        Hd, Hm = len(self.all_changes), len(self.all_sensors)
-        columns = np.hstack([np.full((T, Hd * Hm), np.nan), np.ones((T, Hd))])
+        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where nothing is given; then
+        factors of the changes (T, H_d).
+        """
+        Hd, H = len(self.all_changes), self._count
+        columns = np.hstack([np.full((T, H + Hd * Hd), np.nan), np.ones((T, Hd))])
         if prob is not None:
-            given = np.broadcast_to(as_numbers("prob", prob), (T, np.shape(prob)[-1]))
-            columns[:, : Hd * Hm] = per_sample("Bank", given, self._events[1], Hd)
+            given = as_numbers("prob", prob)
+            if given.ndim == 3:
+                columns[:, H : H + Hd * Hd] = chains("Bank", given, T, Hd)
+            else:
+                given = np.broadcast_to(given, (T, given.shape[-1]))
+                columns[:, :H] = per_sample("Bank", given, self._events[1], Hd)
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
                 raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
-            columns[:, Hd * Hm :] = factors.reshape(-1, Hd)
+            columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+        prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
         columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
         for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
             start = lane["table"][PACKED.index(name), 0] // 8
@@ -304,27 +325,39 @@ class Bank(Tracker):
         return B[:, : max(int(lane["many"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (W, H) or decided (held, 3) from reports (.., size)."""
+        """evidence, window, kept, leaves, lag_prob (of the floors `floors_told`, H) or decided (held, 3) from reports
+        (.., size).
+        """
         if name in SINGLE:
             return report[..., SINGLE.index(name)]
         shape = self._shape
-        lags = shape.floors * self._count
-        start, rows, columns = {"lag_prob": (HEAD, shape.floors, self._count), "decided": (HEAD + lags, shape.held, 3)}[
-            name
-        ]
+        floors = len(self.floors_told)
+        start, rows, columns = {
+            "lag_prob": (HEAD, floors, self._count), "decided": (HEAD + floors * self._count, shape.held, 3),
+        }[name]  # fmt: skip
         return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
+
+    @property
+    def floors_told(self) -> tuple[int, ...]:
+        """The floors that a report tells of, counted back from the present: the newest, and the oldest."""
+        W = self._shape.floors
+        return (*range(min(W, TOLD) - 1), W - 1)
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
-        start, rows, columns = self.state_for(model)["table"][PACKED.index(name)]
+        table = lane["table"] if "table" in lane else self.state_for(model)["table"]
+        start, rows, columns = table[PACKED.index(name)]
         part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return part.view(np.int64) if name in ("links", "group", "slots") else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         told = run.hypotheses
         kinds = [event.kind for event in told.found()]
-        faults = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
-        said = [("Events", f"{kinds.count('change')} changes{faults}; see run.hypotheses.events()")]
+        wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
+        said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
+        faults = int(run._tile["many"][0, FAULTS, run._lane])
+        if faults:
+            said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
         return tuple(said)

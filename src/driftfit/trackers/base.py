@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.settings import Settings
 from driftfit.trackers.each import roots
@@ -54,6 +54,12 @@ class Tracker(Settings, ABC):
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
+    adapts: ClassVar[bool] = False
+    """Whether it finds drift and noise as it goes, so that its innovations are normal again soon after a fault."""
+    density: ClassVar[str] = ""
+    """Which of ``outputs`` has the log density of every sample, given those before it, as its first entry; none: that
+    is the Gaussian one of the forecast.
+    """
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
 
@@ -82,9 +88,20 @@ class Tracker(Settings, ABC):
         """The steps for a bound model."""
         return self.steps
 
+    def apply_for(self, model: Model) -> Step | None:
+        """The step that takes in an input after its sample (`Model.apply`), for a bound model."""
+        return model.apply
+
     def names_for(self, model: Model) -> tuple[str, ...]:
         """Names of the entries of theta."""
         return model.names
+
+    def log_density(self, out: Array) -> Array | None:
+        """The log densities (T, L) of the samples in what a driver wrote, from a tracker that has its own."""
+        if not self.density:
+            return None
+        field: Array = out[self.density]
+        return field[:, 0] if field.ndim == 3 else field
 
     def random_walk(self, model: Model) -> RandomWalk:
         """The random walk in Gaussian noise behind this tracker, which smoothers solve exactly."""

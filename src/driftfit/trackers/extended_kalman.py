@@ -46,9 +46,11 @@ def structure_of(owner: str, model: Model) -> Structure:
             f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."
         )
     structure = model.structure
+    if model.m > 1:
+        raise ValueError(f"{owner}: takes a model with one input; follow the products of several with Kalman.")
     if structure.n == structure.n_x and structure.names != structure.minimal_names:
         raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb} products and minimal parameters are as many "
+            f"{owner}: with na = {structure.na} and nb = {structure.nb[0]} products and minimal parameters are as many "
             "and cannot be told apart; follow the products with Kalman and separate them."
         )
     return structure
@@ -64,7 +66,7 @@ def minimal_memory(model: Model) -> Array:
 @lru_cache
 def linearised(structure: Structure) -> Any:
     """A kernel that fills ``s.h_row`` = phi' J(xi) and returns phi' g(xi)."""
-    na, nb, n_in, n_out, intercept = structure
+    na, (nb,), (n_in,), n_out, intercept = structure
     at_d, at_bc, at_ad = structure.starts
     x_c, x_d, n = na + nb, na + nb + n_in - 1, structure.n
 

@@ -25,7 +25,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.drivers import TrackerSteps
-from driftfit.kernel import Array, State, kernel, nothing
+from driftfit.kernel import Array, State, Step, floats, kernel, nothing
 from driftfit.models.base import Model
 from driftfit.models.basis import PiecewiseLinear
 from driftfit.models.block_memory import PREDICTED
@@ -45,6 +45,7 @@ from driftfit.trackers.output_error_machine import (
     VALID,
     E,
     R,
+    follow_power,
     output_error,
 )
 
@@ -63,6 +64,21 @@ def _steps(machine: Any) -> TrackerSteps:
         s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
 
     return TrackerSteps(nothing, correct)
+
+
+@lru_cache
+def _applying(place: Step, p: tuple[int, ...]) -> Step:
+    """The input also counts for the usual power of v."""
+    orders = np.array(p)
+
+    def apply(s: State, l: int) -> None:
+        place(s, l)
+        m, n = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0]
+        theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, SIZE)[0]
+        follow_power(m, orders, theta, own)
+
+    step: Step = kernel(apply)
+    return step
 
 
 @dataclass(frozen=True)
@@ -146,6 +162,10 @@ class OutputError(Tracker):
         for one in (model.out.evaluate, machine):  # the machine calls the other
             one.load()
         return _steps(machine)
+
+    def apply_for(self, model: Model) -> Step | None:
+        assert isinstance(model, HammersteinWiener)
+        return None if model.apply is None else _applying(model.apply, model.places)
 
     def names_for(self, model: Model) -> tuple[str, ...]:
         return structure_of("OutputError", model).minimal_names

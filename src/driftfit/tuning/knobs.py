@@ -8,6 +8,8 @@ from the settings that it was left without:
     q alone      Kalman(r=...)       the same with the given r
     r alone      Kalman(q=...)       r = 10^x v;                                  x from -9 to 3
     forgetting   RLS                 forgetting = 1 - 10^-x, 10^x samples of memory; x from log10 2n to log10 100 T
+    changes      Bank                q or size^2 of every change times 100^x; x from -3 to 3, of the first also zero;
+                                     prior probabilities of the others, where they are given, times 10^x, x from -2
 
 p_i is the mean square of regressor i, s their sum, v the variance that a constant theta leaves. A group shares one
 drift *as it is seen in the output*, so no unit of the data matters. T samples cannot tell a drift below 1 / T^2 from
@@ -24,6 +26,7 @@ import numpy as np
 
 from driftfit.kernel import Array
 from driftfit.settings import missing_settings
+from driftfit.trackers.bank import Bank
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tuning.lanes import Record, score
@@ -50,11 +53,22 @@ class Knobs:
     names: tuple[str, ...]
     owner: Array
     values: Callable[[Array], Array]
+    origin: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> Any:
+        """Functions cannot be sent to another process; what they were made of can."""
+        return find_knobs, self.origin
 
 
 def find_knobs(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     """The knobs of a tracker for a record; ValueError where it has none."""
+    return replace(_find(record, tracker, groups, bounds), origin=(record, tracker, groups, bounds))
+
+
+def _find(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     missing = missing_settings(tracker)
+    if isinstance(tracker, Bank) and groups is None:
+        return _changes(tracker, bounds)
     if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
         raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
     if missing == ["mu"]:
@@ -198,6 +212,39 @@ def _noise(record: Record, tracker: Any, bounds: Bounds) -> Knobs:
 
     one, no = np.zeros(1, int), np.zeros(1, bool)
     return Knobs(np.array([low]), np.array([high]), no, False, build, build, ("r",), one, values)
+
+
+MOST_PROBABLE = 0.5
+"""What the prior probabilities of all changes but the first may add up to."""
+
+
+def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
+    """Scales and prior probabilities of the changes of a bank; bounds are of the factors of the scales."""
+    changes = tracker.all_changes
+    moving = [i for i, one in enumerate(changes) if any(part.any() for part in one.scales())]
+    given = [] if tracker.transition is not None else [i for i, one in enumerate(changes) if i and one.prob]
+    if not moving and not given:
+        raise ValueError("tune: no change of this Bank moves anything, and none has a probability to be found.")
+    low, high = _ends(bounds, -3.0, 3.0)
+    most = [float(np.log10(MOST_PROBABLE / len(given) / (changes[i].prob or 1.0))) for i in given]
+    lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, np.array(most) - 2.0)]
+    highs = np.r_[np.full(len(moving), high), most]
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        made = list(changes)
+        for i, factor in zip(moving, 10.0 ** x[: len(moving)], strict=True):
+            made[i] = made[i].scaled(float(factor))
+        for i, factor in zip(given, 10.0 ** x[len(moving) :], strict=True):
+            made[i] = replace(made[i], prob=float(changes[i].prob * factor))
+        return replace(tracker, changes=tuple(made))
+
+    def values(x: Array) -> Array:
+        return np.asarray(10.0**x * np.r_[np.ones(len(moving)), [changes[i].prob for i in given]])
+
+    names = tuple(f"scale[{tracker.change_names[i]}]" for i in moving)
+    names += tuple(f"prob[{tracker.change_names[i]}]" for i in given)
+    zero = np.array([i == 0 for i in moving] + [False] * len(given))
+    return Knobs(lows, highs, zero, False, build, build, names, np.arange(len(names)), values)
 
 
 def _memory(record: Record, tracker: Any, bounds: Bounds) -> Knobs:

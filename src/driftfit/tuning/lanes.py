@@ -9,12 +9,14 @@ For each setting a run is condensed to what the criteria need, so memory does no
 
 N (`used`) counts the usable samples that did not determine a new direction, F are the diffuse terms of those that did.
 Trackers that estimate their own scale report s = scale s0 with the scale known before the sample; it is divided out.
+Of a tracker that weighs hypotheses the log-likelihood is the sum of the log densities of the mixture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,7 +44,8 @@ class Scores(NamedTuple):
     used: Array
     log_s: Array
     squares: Array
-    jacobian: Array
+    more: Array
+    """What adds to the log-likelihood beside the Gaussian terms: log Jacobians, or densities of a tracker's own."""
     h_step: Array
     power: Array
 
@@ -58,7 +61,7 @@ class Scores(NamedTuple):
                 body = self.used * (np.log(2.0 * np.pi * self.sigma2()) + 1.0)
             else:
                 body = self.used * np.log(2.0 * np.pi) + self.squares
-            value = -0.5 * (body + self.log_s) + self.jacobian
+            value = -0.5 * (body + self.log_s) + self.more
         return np.where(np.isfinite(value), value, -np.inf)
 
 
@@ -68,6 +71,18 @@ def store_inside(o: State, s: State, l: int) -> None:
     o.scale[l] = s.scale[l]
     for i in range(s.phi.shape[0]):
         o.phi[i, l] = s.phi[i, l]
+
+
+@cache
+def storing(store: Any) -> Any:
+    """That, and what a tracker stores by itself."""
+
+    @kernel
+    def store_both(o: State, s: State, l: int) -> None:
+        store_inside(o, s, l)
+        store(o, s, l)
+
+    return store_both
 
 
 def score(record: Record, trackers: Sequence[Tracker], h: int = 1) -> Scores:
@@ -85,9 +100,10 @@ def _score_tile(record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
     model, y, u, known = record
     T, L = len(y), len(trackers)
     tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model) for tracker in trackers])
-    out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi")))
-    run = drivers(model.steps, trackers[0].steps_for(model)._replace(store=store_inside)).run
-    sums = _Sums(record, tile, h)
+    steps, own = trackers[0].steps_for(model), trackers[0].outputs if trackers[0].density else ()
+    out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))
+    run = drivers(model.steps, steps._replace(store=storing(steps.store) if own else store_inside)).run
+    sums = _Sums(record, trackers[0], tile, h)
     for a in range(0, T, BLOCK):
         b = min(a + BLOCK, T)
         factors = known if len(known) == 1 else known[a:b]
@@ -100,11 +116,11 @@ def _score_tile(record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
 class _Sums:
     """Sums over the blocks of a run, each with the lanes on the last axis."""
 
-    def __init__(self, record: Record, tile: Array, h: int) -> None:
+    def __init__(self, record: Record, tracker: Tracker, tile: Array, h: int) -> None:
         n, L = tile["theta"].shape[1:]
-        self.record, self.h = record, h
+        self.record, self.tracker, self.h = record, tracker, h
         self.burn = min(max(50, 5 * n), len(record.y) // 3)
-        self.count, self.log_s, self.squares, self.jacobian = np.zeros((4, L))
+        self.count, self.log_s, self.squares, self.more = np.zeros((4, L))
         self.errors, self.scored, self.used = np.zeros((3, L))
         self.power = np.zeros((record.model.n, L))
         self.scale = np.ones(L) * tile["scale"][0]
@@ -117,7 +133,7 @@ class _Sums:
         self._forecast(a, out, ok, y)
         if hasattr(self.record.model, "log_jacobian"):
             terms = self.record.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
-            self.jacobian += np.sum(np.where(counted, terms, 0.0), axis=0)
+            self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
         self.power += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
         self.used += ok.sum(axis=0)
 
@@ -130,6 +146,10 @@ class _Sums:
             first = ok & np.isnan(before)  # no scale was known before the sample that gave the first one
             s = np.where(first, out["e"] ** 2 / out["scale"], s)
             counted = ok & np.isfinite(s) & (s > 0.0)
+            own = self.tracker.log_density(out)
+            if own is not None:
+                self.more += np.sum(np.where(counted, own, 0.0), axis=0)
+                return np.asarray(counted)
             self.log_s += np.sum(np.where(counted, np.log(s), 0.0), axis=0)
             self.squares += np.sum(np.where(counted, out["e"] ** 2 / s, 0.0), axis=0)
         self.count += counted.sum(axis=0)
@@ -153,4 +173,4 @@ class _Sums:
             self.log_s += np.sum(np.log(tile["F"][0]), axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             h_step, power = self.errors / self.scored, self.power / self.used
-        return Scores(self.count, self.log_s, self.squares, self.jacobian, h_step, power)
+        return Scores(self.count, self.log_s, self.squares, self.more, h_step, power)

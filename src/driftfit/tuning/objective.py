@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,24 +28,28 @@ def along(record: Record, tracker: Tracker, order_by: Any) -> Record:
     return Record(Regression(model.names), walk.y, walk.phi, known)
 
 
-def objective(record: Record, knobs: Knobs, method: str, h: int) -> Callable[[Array], Array]:
+@dataclass(frozen=True)
+class Criterion:
     """Points (S, p) to values (S,), to be minimised: minus the log-likelihood, or the log of a mean square.
 
     In logarithms the unit of y is an offset, so that the tolerances of the search do not depend on it.
     """
 
-    def value(points: Array) -> Array:
-        trackers = [knobs.run(x) for x in points]
-        if method == "ml":
-            return -score(record, trackers).loglik(knobs.profiled)
-        if method == "h-step":
-            squares = score(record, trackers, h).h_step
+    record: Record
+    knobs: Knobs
+    method: str
+    h: int
+
+    def __call__(self, points: Array) -> Array:
+        trackers = [self.knobs.run(x) for x in points]
+        if self.method == "ml":
+            return -score(self.record, trackers).loglik(self.knobs.profiled)
+        if self.method == "h-step":
+            squares = score(self.record, trackers, self.h).h_step
         else:
-            squares = np.array([_smoothed_score(record, tracker, method) for tracker in trackers])
+            squares = np.array([_smoothed_score(self.record, tracker, self.method) for tracker in trackers])
         tiny = np.finfo(float).tiny  # a perfect fit is the best there is, and has a logarithm
         return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
-
-    return value
 
 
 def run_record(record: Record, tracker: Tracker) -> Track:

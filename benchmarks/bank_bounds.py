@@ -1,0 +1,218 @@
+"""Every option of every reduction of a bank, in a machine that is compiled with its bounds checked.
+
+Compiled code does not look whether an index is within its array. Here it does: a process of its own, with a cache of
+its own, compiles the machines with a check at every index, of single numbers and of eights, that writes down where it
+was out of bounds and goes on. Banks are then drawn at random, with every reduction, kind of change, sensor, prior and
+form, and with records that have outages, gaps in time, fault codes and repeated readings; and the tests of banks are
+run in it. Prints every place that was out of bounds, with its line, and every bank that was not finite.
+
+Run: python benchmarks/bank_bounds.py [--quick] [--banks N]. Compiling both machines with checks takes some minutes;
+--quick does one form and size, few banks and no tests. The exit status is 1 where anything was found.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import os
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def watch() -> tuple[Any, list[str]]:
+    """Put checks into whatever is compiled from now on; returns what they write to, and the lines of the sites."""
+    from llvmlite import ir
+    from numba.core import cgutils
+
+    from driftfit import eights
+
+    noted, sites = (ctypes.c_int64 * 4096)(), []
+    i64 = ir.IntType(64)
+
+    def note(builder: Any, bad: Any, index: Any, size: Any) -> None:
+        place = len(sites)
+        sites.append(line())
+        with cgutils.if_unlikely(builder, bad):
+            first = builder.inttoptr(ir.Constant(i64, ctypes.addressof(noted)), i64.as_pointer())
+            at = 3 * min(place, len(noted) // 3 - 1)
+            for k, value in enumerate((ir.Constant(i64, 1), index, size)):
+                builder.store(value, builder.gep(first, [ir.Constant(i64, at + k)]))
+
+    def line() -> str:
+        frame = sys._getframe(2)
+        while frame is not None:
+            where = getattr(frame.f_locals.get("self"), "loc", None)
+            if where is not None and "driftfit" in str(where.filename):
+                return f"{Path(where.filename).name}:{where.line}"
+            frame = frame.f_back
+        return "?"
+
+    def checked(context: Any, builder: Any, index: Any, size: Any, axis: Any = None) -> None:
+        wide = builder.sext(index, i64) if index.type.width < 64 else index
+        bad = builder.icmp_unsigned(">=", wide, size)
+        note(builder, bad, wide, size)
+
+    def place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
+        inside = context.make_array(kind)(context, builder, array)
+        rows, columns = (builder.extract_value(inside.shape, k) for k in (0, 1))
+        at = builder.add(builder.mul(row, columns), column)
+        size = builder.mul(rows, columns)
+        last = builder.add(at, ir.Constant(i64, eights.WIDTH - 1))
+        beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
+        note(builder, beyond, last, size)
+        return builder.bitcast(builder.gep(inside.data, [at]), eights._EIGHT.as_pointer())
+
+    cgutils.do_boundscheck = checked
+    eights._place = place
+    return noted, sites
+
+
+def found(noted: Any, sites: list[str]) -> list[str]:
+    """What was out of bounds since this was asked last."""
+    wrong = []
+    for k in range(min(len(sites), len(noted) // 3)):
+        if noted[3 * k]:
+            wrong.append(f"{sites[k]}: index {noted[3 * k + 1]} of {noted[3 * k + 2]}")
+            noted[3 * k] = 0
+    return wrong
+
+
+def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, dict[str, Any]]:
+    """A model, a bank for it, and a record, at random."""
+    from driftfit import ARX, Regression
+
+    n = 2 if quick else int(rng.choice([1, 2, 3, 4, 5, 9]))
+    na = int(rng.integers(0, 2 if quick else 3)) if rng.random() < 0.5 else 0
+    model = ARX(na, n, nk=int(rng.integers(0, 2))) if na else Regression(n)
+    bank = bank_of(rng, n + na, form, arx=na > 0)
+    T = int(rng.integers(1, 90))
+    u = rng.standard_normal((T, n if not na else 1))
+    y = u.sum(axis=1) * np.where(np.arange(T) < T // 2, 1.0, 2.5) + 0.3 * rng.standard_normal(T)
+    if rng.random() < 0.5:
+        y[rng.random(T) < 0.2] = np.nan
+        y[T // 3 : T // 2] = np.nan
+    if rng.random() < 0.3:
+        u[rng.random(T) < 0.1] = np.nan
+    if rng.random() < 0.3:
+        y = np.round(y)
+    if rng.random() < 0.2:
+        y[int(rng.integers(T))] = 9999.0
+    more = {"y": y, "u": u}
+    if rng.random() < 0.4:
+        more["time"] = np.cumsum(rng.choice([1.0, 0.5, 2.0, 20.0], T))
+    if rng.random() < 0.2:
+        more["prob"] = np.where(rng.random((T, 1)) < 0.5, np.nan, rng.dirichlet(np.ones(len(bank.all_changes)), T))
+    return model, bank, more
+
+
+def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
+    """A bank for n parameters, at random; what does not go together is drawn again."""
+    from driftfit import Bank, Change, Sensor
+
+    while True:
+        changes = [Change(float(rng.choice([0.0, 1e-4])))]
+        for _ in range(int(rng.integers(0, 3))):
+            kind = int(rng.integers(0, 6))
+            p = float(rng.choice([0.0, 0.01, 0.1]))
+            changes.append([
+                Change(1.0, prob=p), Change(size=3.0, prob=p), Change(1.0, prob=p, which=[int(rng.integers(n))]),
+                Change(forget=0.8, prob=p), Change(forget=0.9, kind="directional", prob=p),
+                Change(2.0, prob=p, reset=True),
+            ][kind])  # fmt: skip
+        nominal = [Sensor.nominal(0.1), Sensor.nominal(), Sensor.nominal(guess=0.1), Sensor.nominal(limit=30.0)]
+        sensors = [nominal[int(rng.integers(4))]]
+        others = [Sensor.outlier(prob=0.05), Sensor.outlier(kind="additive", prob=0.05), Sensor.offset(value=2.0)]
+        others.append(Sensor.frozen(0.01))
+        sensors += [others[k] for k in rng.permutation(4)[: int(rng.integers(0, 3))]]
+        Hd, Hm = len(changes), len(sensors)
+        transition = None
+        if rng.random() < 0.3:
+            transition = [rng.dirichlet(np.ones(k), k) if rng.random() < 0.7 else None for k in (Hd, Hm)]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return Bank(
+                    changes, sensors, None if transition is None else tuple(transition), reduction(rng, Hd * Hm),
+                    p0=None if rng.random() < 0.5 else 2.0, form=form, lag_variance=rng.random() < 0.5,
+                )  # fmt: skip
+        except ValueError:
+            continue
+
+
+def reduction(rng: np.random.Generator, H: int) -> Any:
+    """A reduction, at random."""
+    from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+
+    depth, leaves, window = (
+        int(x) for x in (rng.integers(1, 5), rng.choice([1, 2, 7, 9, 22, 33, 64, 100]), rng.choice([1, 3, 8, 30]))
+    )
+    loss = "map" if rng.random() < 0.5 else rng.random((H, H)) * (1.0 - np.eye(H))
+    wait = None if rng.random() < 0.5 else 0.01
+    kinds = [
+        lambda: Beam(leaves, window), lambda: Hybrid(leaves, min(window, 6), int(rng.integers(0, 3)), 20),
+        lambda: Decide(depth, loss, force=True), lambda: Decide("auto", loss, depth, 0.01, wait, True),
+        lambda: GPB(min(depth, 3)), lambda: IMM(), lambda: FirstFloor(depth, str(rng.choice(["prior", "posterior"]))),
+    ]  # fmt: skip
+    return kinds[int(rng.integers(len(kinds)))]()
+
+
+def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
+    """Run so many banks; returns in how many something was wrong."""
+    from driftfit import track
+
+    bad = 0
+    for seed in range(banks):
+        rng = np.random.default_rng(seed)
+        form = "sqrt" if seed % 2 and not quick else "covariance"
+        model, bank, record = drawn(rng, form, quick)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            run = track(model, bank, **record, **({"dt": 1.0} if "time" in record else {}))
+            run.hypotheses.found()
+        wrong = found(noted, sites)
+        if not (np.isfinite(run.theta).all() and np.isfinite(run.prediction[run.ok]).all()):
+            wrong.append("not finite")
+        if wrong:
+            bad += 1
+            print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)
+    return bad
+
+
+def work(banks: int, quick: bool) -> int:
+    """What the process with the checks does."""
+    noted, sites = watch()
+    bad = fuzz(banks, quick, noted, sites)
+    print(f"{banks} banks, {len(sites)} checks, {bad} banks at fault")
+    if quick:
+        return int(bad > 0)
+    import pytest
+
+    tests = sorted(str(path) for path in (Path(__file__).parents[1] / "tests").glob("test_bank*.py"))
+    failed = pytest.main(["-q", "-n", "0", "-p", "no:cacheprovider", *tests])
+    wrong = found(noted, sites)
+    print(f"tests of banks: exit status {int(failed)}, {len(wrong)} places out of bounds", *wrong, sep="\n    ")
+    return int(bad > 0 or failed != 0 or bool(wrong))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--banks", type=int)
+    given = parser.parse_args()
+    banks = given.banks or (60 if given.quick else 1000)
+    if os.environ.get("NUMBA_BOUNDSCHECK") == "1":
+        sys.exit(work(banks, given.quick))
+    with tempfile.TemporaryDirectory() as cache:
+        checked = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": cache, "NUMBA_OPT": "0"}
+        arguments = ["--banks", str(banks), *(["--quick"] if given.quick else [])]
+        sys.exit(subprocess.run([sys.executable, __file__, *arguments], env=checked, check=False).returncode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Memory that a process holds for each configuration that it compiled: MB, as the number of configurations grows.
+
+ARX(na, nb) of different orders, each a record type of its own, followed by a Kalman filter; first compiled, then found
+on disk, in processes of their own with a cache of their own. "all kept": nothing is forgotten, and llvmlite's pass
+managers are not freed, as it was before there was a bound. Run: python benchmarks/compiled_memory.py [--quick]
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+WAYS = ("all kept", "bounded", "from disk")
+
+
+def worker(way: str, count: int) -> None:
+    """Print megabytes for each configuration after a third, two thirds and all of them."""
+    import gc
+
+    import numpy as np
+    from llvmlite.binding import newpassmanagers as passes
+
+    from driftfit import ARX, Kalman, kernel, linked, track
+
+    if way == "all kept":
+        linked.KEPT = kernel.MOST_ENTRIES = 10**9
+        for manager in (passes.ModulePassManager, passes.FunctionPassManager):
+            manager._dispose = passes.ffi.ObjectRef._dispose
+    y, u = np.random.default_rng(0).normal(size=(2, 60))
+    tracker = Kalman(q=1e-4, r=0.1)
+    track(ARX(1, 0), tracker, y)
+    start = resident()
+    for k in range(count):
+        track(ARX(1 + k % 8, 1 + k // 8), tracker, y, u)
+        if k + 1 in {count // 3, 2 * count // 3, count}:
+            gc.collect()
+            print(f"{(resident() - start) / (k + 1):.2f}", flush=True)
+
+
+def resident() -> float:
+    """Memory of this process, MB."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main(quick: bool) -> None:
+    count = 6 if quick else 12
+    table = Table(box=SIMPLE_HEAD, show_edge=False)
+    for head in ("MB for each of", *(str(n) for n in (count // 3, 2 * count // 3, count)), "configurations"):
+        table.add_column(head, justify="right")
+    with tempfile.TemporaryDirectory() as cache:
+        for way in WAYS:
+            place = cache if way != "all kept" else os.path.join(cache, "apart")
+            environment = {**os.environ, "NUMBA_CACHE_DIR": place}
+            command = [sys.executable, __file__, "--worker", way, str(count)]
+            said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+            table.add_row(way, *said.split(), "")
+    Console(width=96).print(table)
+
+
+if __name__ == "__main__":
+    if "--worker" in sys.argv:
+        worker(sys.argv[-2], int(sys.argv[-1]))
+    else:
+        main("--quick" in sys.argv)

@@ -1,0 +1,223 @@
+"""Size and speed of exported trackers: code, state, instructions on a Cortex-M4F, and time beside C written by hand.
+
+    python benchmarks/embedded.py            about a minute
+    python benchmarks/embedded.py --quick    two sizes, few samples
+
+Instructions are counted by the emulator (qemu with -icount: one instruction, one nanosecond of its clock), where it and
+the cross compiler are there. Beside them stands the filter of filter.c, compiled with the same flags on this computer.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from statistics import median
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, Kalman
+from driftfit.embedded import export_c
+
+HERE = Path(__file__).parent
+CORTEX = HERE.parent / "tests" / "cortex"
+FLAGS = ["-std=c99", "-O3", "-fno-tree-vectorize", "-ffp-contract=off", "-shared", "-fPIC"]
+"""Vectors make both slower: numbers stored one by one are read four at once, before the stores have ended."""
+M4F = ["-std=c99", "-O2", "-ffp-contract=off", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
+
+LOOP = """
+#include "tracker.c"
+typedef struct { double theta[TRACKER_PARAMETERS], var[TRACKER_PARAMETERS], y_hat, e, s, ok; } row;
+static tracker_state state;
+void bench_begin(void) { tracker_init(&state); }
+void bench_run(long T, const double *y, const double *u, row *out) {
+    for (long t = 0; t < T; t++) {
+        tracker_step step = tracker_update(&state, y[t], u + t);
+        for (int i = 0; i < TRACKER_PARAMETERS; i++) {
+            out[t].theta[i] = state.theta[i];
+            out[t].var[i] = state.var[i];
+        }
+        out[t].y_hat = step.y_hat; out[t].e = step.e; out[t].s = step.variance; out[t].ok = step.ok;
+    }
+}
+"""
+
+COUNT = """
+#include <stdint.h>
+#include <stdio.h>
+#ifdef BY_HAND
+#include <math.h>
+#ifdef TRACKER_SINGLE
+#define double float
+#define fabs fabsf
+#endif
+#include "filter.c"
+typedef double tracker_real;
+static filter state;
+static row result;
+#define UPDATE(y, u) run(&state, 1, &(y), (u), &result)
+static void begin(void) {
+    for (int i = 0; i < N; i++) { state.P[i][i] = 1; state.q[i] = (double)1e-4; }
+    state.r = (double)0.01;
+}
+#else
+#include "tracker.h"
+static tracker_state state;
+#define UPDATE(y, u) tracker_update(&state, (y), (u))
+static void begin(void) { tracker_init(&state); }
+#endif
+static volatile uint32_t *const TICK = (uint32_t *)0xE000E010; /* control, reload, current value of the system timer */
+static tracker_real noise(void) {
+    static uint32_t seed = 1;
+    seed = seed * 1664525u + 1013904223u;
+    return (tracker_real)(seed >> 16) / (tracker_real)65536 - (tracker_real)0.5;
+}
+int main(void) {
+    uint32_t before = 0;
+    begin();
+    TICK[1] = 0xFFFFFF; TICK[2] = 0; TICK[0] = 5;
+    for (int t = 0; t < 1100; t++) {
+        tracker_real u[1], y;
+        if (t == 100) before = TICK[2];
+        u[0] = noise();
+        y = noise();
+        UPDATE(y, u);
+    }
+    printf("%lu\\n", (unsigned long)((before - TICK[2]) & 0xFFFFFF));
+    return 0;
+}
+"""
+NANOSECONDS_A_TICK = 40  # the board's timer runs at 25 MHz
+
+
+def emulated(folder: Path, sources: list[str], flags: list[str]) -> int | None:
+    """Instructions an update on the emulated controller; None where there is none."""
+    if shutil.which("arm-none-eabi-gcc") is None or shutil.which("qemu-system-arm") is None:
+        return None
+    (folder / "count.c").write_text(COUNT)
+    start = ["-nostartfiles", "--specs=rdimon.specs", "-T", str(CORTEX / "memory.ld"), str(CORTEX / "start.c")]
+    elf = str(folder / "count.elf")
+    command = ["arm-none-eabi-gcc", *M4F, *flags, *start, "-Wl,--no-warn-rwx-segments", "-o", elf]
+    subprocess.run([*command, *sources, str(folder / "count.c"), "-lm"], check=True)
+    run = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "-icount", "shift=0", "-kernel", elf]
+    done = subprocess.run(run, check=True, capture_output=True, text=True, timeout=120)
+    return int(done.stdout) * NANOSECONDS_A_TICK // 1000
+
+
+def by_hand(folder: Path, n: int, single: bool) -> int | None:
+    """Instructions of filter.c."""
+    size = [f"-DNA={n // 2}", f"-DNB={n - n // 2}", "-DBY_HAND", f"-I{HERE}", "-w"]
+    return emulated(folder, [], [*size, *(["-DTRACKER_SINGLE", "-fsingle-precision-constant"] if single else [])])
+
+
+def exported(folder: Path, single: bool) -> tuple[str, str]:
+    """(bytes of code and constants, instructions an update) of the tracker in a folder."""
+    flags = ["-DTRACKER_SINGLE"] if single else []
+    count = emulated(folder, [str(folder / "tracker.c")], flags)
+    if count is None:
+        return "-", "-"
+    target = str(folder / "tracker.o")
+    command = ["arm-none-eabi-gcc", *M4F, *flags, "-c", "-o", target, str(folder / "tracker.c")]
+    subprocess.run(command, check=True)
+    sizes = subprocess.run(["arm-none-eabi-size", target], check=True, capture_output=True, text=True)
+    return sizes.stdout.splitlines()[1].split()[0], str(count)
+
+
+def beside_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[float, float]:
+    """Nanoseconds an update: exported, and the loop of filter.c; both must give the same numbers."""
+    (folder / "loop.c").write_text(LOOP)
+    ours, other = str(folder / "ours.so"), str(folder / "other.so")
+    subprocess.run(["gcc", *FLAGS, "-o", ours, str(folder / "loop.c"), "-lm"], check=True, cwd=folder)
+    half = [f"-DNA={n // 2}", f"-DNB={n - n // 2}"]
+    subprocess.run(["gcc", *FLAGS, *half, "-o", other, str(HERE / "filter.c"), "-lm"], check=True)
+    rng = np.random.default_rng(1)
+    y, u = rng.normal(size=T), rng.normal(size=T)
+    rows = [np.zeros((T, 2 * n + 4)) for _ in range(2)]
+    tracker, written = ctypes.CDLL(ours), ctypes.CDLL(other)
+    na, nb = n // 2, n - n // 2
+    start = np.concatenate([np.zeros(n), np.eye(n).ravel(), np.full(n, 1e-4), [0.01], np.full(na, np.nan),
+                            np.full(nb, np.nan), [0.0]])  # fmt: skip
+
+    def first() -> None:
+        tracker.bench_begin()
+        tracker.bench_run(ctypes.c_long(T), pointer(y), pointer(u), pointer(rows[0]))
+
+    def second() -> None:
+        state = start.copy()
+        written.run(pointer(state), ctypes.c_long(T), pointer(y), pointer(u), pointer(rows[1]))
+
+    times: list[list[float]] = [[], []]
+    for _ in range(repeats):
+        for job, taken in zip((first, second), times, strict=True):
+            taken.append(timed(job) / T)
+    np.testing.assert_allclose(rows[0][50:, :n], rows[1][50:, :n], atol=0.02)  # the start differs a little
+    return median(times[0]), median(times[1])
+
+
+def pointer(array: np.ndarray[Any, Any]) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def timed(job: Any) -> float:
+    """Nanoseconds."""
+    from time import perf_counter_ns
+
+    begin = perf_counter_ns()
+    job()
+    return float(perf_counter_ns() - begin)
+
+
+def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples.")] = False) -> None:
+    """Print both tables."""
+    out = Console(width=110)
+    sizes = (2, 4) if quick else (2, 4, 6, 8)
+    T, repeats = (2_000, 3) if quick else (20_000, 31)
+    trackers = {
+        "Kalman": Kalman(q=1e-4, r=0.01, p0=1.0),
+        "Kalman, sqrt": Kalman(q=1e-4, r=0.01, p0=1.0, form="sqrt"),
+        "RLS": RLS(0.98),
+        "FLS": FLS(100.0),
+        "AugmentedFLS": AugmentedFLS(10.0),
+        "AdaptiveKalman": AdaptiveKalman(),
+    }
+    table = Table(title="On a Cortex-M4F, -O2", show_edge=False)
+    for head in ("tracker", "n", "state, bytes", "code, bytes", "instructions", "state", "code", "instructions"):
+        table.add_column(head, justify="left" if head == "tracker" else "right")
+    for name, tracker in trackers.items():
+        for n in sizes if name == "Kalman" else (4,):
+            row = [name, str(n)]
+            with tempfile.TemporaryDirectory() as place:
+                folder = Path(place)
+                export_c(ARX(n // 2, n - n // 2), tracker, folder)
+                said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
+                states = [word for word in said.replace(",", "").split() if word.isdigit()]
+                for single in (False, True):
+                    row += [states[single], *exported(folder, single)]
+                if name == "Kalman":
+                    hand = [by_hand(folder, n, single) for single in (False, True)]
+            table.add_row(*row)
+            if name == "Kalman":
+                counts = ["-" if count is None else str(count) for count in hand]
+                table.add_row("filter.c, by hand", str(n), "", "", counts[0], "", "", counts[1], style="dim")
+    out.print(table)
+    out.print("double precision, then single (-DTRACKER_SINGLE), which the processor has in hardware", style="dim")
+    beside = Table(title="\nOn this computer, beside filter.c", show_edge=False)
+    for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
+        beside.add_column(head, justify="right")
+    for n in sizes:
+        with tempfile.TemporaryDirectory() as place:
+            export_c(ARX(n // 2, n - n // 2), trackers["Kalman"], place)
+            ours, other = beside_hand_written(Path(place), n, T, repeats)
+        kept = "yes" if ours <= 1.3 * other else "no"
+        beside.add_row(str(n), f"{ours:.1f}", f"{other:.1f}", f"{ours / other:.2f}", kept)
+    out.print(beside)
+
+
+if __name__ == "__main__":
+    typer.run(main)

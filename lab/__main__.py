@@ -1,0 +1,5 @@
+"""``python -m lab``."""
+
+from lab.program import app
+
+app(prog_name="python -m lab")

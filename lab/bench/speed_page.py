@@ -1,0 +1,126 @@
+"""The page and the picture of the contests of speed, written from their results and from nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.kernel import Array
+from driftfit.plots import BLUE, GREY, new_figure
+from lab.bench.causes import SPEED_CAUSES
+from lab.bench.contest import SAME, Finish, Line
+from lab.bench.machine import machine, markdown, versions
+from lab.bench.speed import SEED, slope
+from lab.bench.speed_process import Start
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Slopes = dict[str, tuple[Array, Array, str]]
+
+INTRODUCTION = f"""Written by `python -m lab bench speed --out docs`; every figure is its output. One thread for linear
+algebra. What is compared takes turns within one process, and figures are medians, so that a busy machine slows all of
+them. *Times ours* above 1 is slower than driftfit, below 1 faster. *Same numbers* is the largest difference of the
+estimates relative to the largest estimate; above {SAME:g} it is said to differ. "Other" is another algorithm, shown for
+its cost only."""
+
+FACTORS = """Seconds of a fresh process, medians, numpy being imported; MB of files, numpy not counted. The first result
+is that of a thousand samples."""
+
+
+def duration(ns: float) -> str:
+    """Nanoseconds in a unit that reads well."""
+    return f"{ns:.1f} ns" if ns < 1e3 else f"{ns / 1e3:.1f} µs" if ns < 1e6 else f"{ns / 1e6:.1f} ms"
+
+
+def agreement(line: Line) -> str:
+    """How the numbers compare."""
+    if np.isnan(line.difference):
+        return "other"
+    return f"{'yes' if line.difference < SAME else 'DIFFER'}, {line.difference:.0e}"
+
+
+def section(finish: Finish) -> str:
+    """One contest."""
+    parts = [f"## {finish.title}"]
+    if finish.note:
+        parts.append(f"{finish.note[0].upper()}{finish.note[1:]}.")
+    if finish.lines:
+        rows = [[x.name, duration(x.ns), f"{x.ratio:.2f}", agreement(x)] for x in finish.lines]
+        rows[0][-1] = ""
+        parts.append(markdown(["", "a step", "times ours", "same numbers"], rows))
+    if finish.absent:
+        parts.append(f"Absent, left out: {', '.join(finish.absent)}.")
+    return "\n\n".join(parts)
+
+
+def losses(finishes: Sequence[Finish]) -> list[str]:
+    """Every line of a peer that is faster than ours, floors and ourselves left out."""
+    return [
+        f"* {finish.title}: {line.name} needs {line.ratio:.2f} of our time."
+        for finish in finishes
+        for line in finish.lines[1:]
+        if line.ratio < 1.0 and not line.name.startswith(("driftfit", "C,", "streaming"))
+    ]
+
+
+def start_table(starts: tuple[Sequence[Start], Sequence[str]]) -> str:
+    """Import, first result and size."""
+    rows = [
+        [s.name, f"{s.seconds_import:.2f}", f"{s.seconds_first:.2f}", f"{s.own:.1f}", f"{s.closure:.0f}"]
+        for s in starts[0]
+    ]
+    text = markdown(["", "import, s", "first result, s", "own, MB", "with all it needs, MB"], rows)
+    return f"{text}\n\nAbsent, left out: {', '.join(starts[1])}." if starts[1] else text
+
+
+def growth_table(slopes: Slopes) -> str:
+    """Exponents."""
+    rows = [
+        [name, what, f"{sizes[0]:,.0f} to {sizes[-1]:,.0f}", f"{slope(sizes, seconds):.2f}"]
+        for name, (sizes, seconds, what) in slopes.items()
+    ]
+    return markdown(["cost against", "of", "sizes", "slope"], rows)
+
+
+def page(finishes: Sequence[Finish], slopes: Slopes, starts: tuple[Sequence[Start], Sequence[str]], quick: bool) -> str:
+    """The whole page as markdown."""
+    lost = losses(finishes)
+    parts = ["# Scoreboard: speed", INTRODUCTION, f"{machine()}. {versions()}. Seed {SEED}."]
+    if quick:
+        parts.append("**Quick form: small sizes, few repeats; not to be quoted.**")
+    parts += ["## Where we lose", "\n".join(lost) or "In no contest was a peer faster.", SPEED_CAUSES]
+    parts += [section(finish) for finish in finishes]
+    parts += ["## Import, first result, size", FACTORS, start_table(starts)]
+    parts += ["## How cost grows", "Slopes on log axes over the larger half of the sizes.", growth_table(slopes)]
+    parts += ["![Cost against size, log axes](figures/scoreboard_speed.png)"]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def draw(slopes: Slopes) -> Figure:
+    """Seconds against every size, with the slope."""
+    figure = new_figure(11.0, 3.4)
+    panels = figure.subplots(1, len(slopes), squeeze=False)[0]
+    for axis, (name, (sizes, seconds, what)) in zip(panels, slopes.items(), strict=True):
+        axis.loglog(sizes, seconds, "o-", color=BLUE, ms=4, lw=1.2)
+        exponent = slope(sizes, seconds)
+        axis.loglog(sizes, seconds[-1] * (sizes / sizes[-1]) ** exponent, "--", color=GREY, lw=0.9)
+        axis.set_title(f"{what}\nslope {exponent:.2f}", fontsize=8)
+        axis.set_xlabel(name)
+        axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
+        axis.minorticks_off()
+        axis.grid(alpha=0.25, lw=0.5)
+    panels[0].set_ylabel("seconds")
+    return figure
+
+
+def write(folder: Path, text: str, slopes: Slopes) -> Path:
+    """Write ``scoreboard_speed.md`` and its picture into a folder; the page's path."""
+    (folder / "figures").mkdir(parents=True, exist_ok=True)
+    draw(slopes).savefig(folder / "figures" / "scoreboard_speed.png", dpi=100)
+    target = folder / "scoreboard_speed.md"
+    target.write_text(text)
+    return target

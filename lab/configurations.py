@@ -1,0 +1,208 @@
+"""Random configurations of the library's public face, each a function that runs one and returns named arrays.
+
+They cover every tracker in every form, the models, the reductions of a bank, several outputs, fleets, grids, uneven
+time, weights, known drift, warm starts, saved and loaded states, streams, and records with holes. Only the public face
+is used, so that they say the same before and after the inside is rebuilt.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftfit import (
+    ARX,
+    FLS,
+    GPB,
+    IMM,
+    RLS,
+    AdaptiveKalman,
+    AugmentedFLS,
+    Bank,
+    Beam,
+    Change,
+    Decide,
+    ExtendedKalman,
+    FirstFloor,
+    HammersteinWiener,
+    Hybrid,
+    Kalman,
+    Live,
+    OutputError,
+    Regression,
+    Sensor,
+    track,
+)
+from driftfit.models.basis import Polynomial
+
+Arrays = dict[str, np.ndarray[Any, Any]]
+Configuration = Callable[[], Arrays]
+
+WRITTEN = ("theta", "std", "prediction", "innovation", "innovation_std", "ok")
+T = 300
+
+CHANGES = [Change(q=0, prob=0.98), Change(q=0.5, prob=0.02)]
+SENSORS = [Sensor.nominal(r=0.01, prob=0.97), Sensor.outlier(prob=0.03)]
+
+SIMPLE: dict[str, Any] = {
+    "Kalman": Kalman(q=1e-3, r=0.01),
+    "Kalman, prior": Kalman(q=1e-3, r=0.01, p0=2.0, theta0=0.1),
+    "Kalman, square root": Kalman(q=1e-3, r=0.01, form="sqrt"),
+    "RLS": RLS(0.98),
+    "RLS, directional": RLS(0.98, kind="directional"),
+    "FLS": FLS(50.0),
+    "FLS, second differences": FLS(50.0, differences=2),
+    "AugmentedFLS": AugmentedFLS.from_fls_mu(50.0, n=2, s=1.0),
+    "AdaptiveKalman": AdaptiveKalman(),
+    "Bank, beam": Bank(CHANGES, [Sensor.nominal(r=0.01)], p0=2.0, reduce=Beam(9)),
+    "Bank, unknown noise": Bank(),
+}
+BANKS: dict[str, Any] = {
+    "GPB(1)": Bank(CHANGES, SENSORS, p0=2.0, reduce=GPB(1)),
+    "GPB(2)": Bank(CHANGES, SENSORS, p0=2.0, reduce=GPB(2)),
+    "IMM": Bank(CHANGES, SENSORS, p0=2.0, reduce=IMM()),
+    "Decide": Bank(CHANGES, SENSORS, p0=2.0, reduce=Decide(2)),
+    "Hybrid": Bank(CHANGES, SENSORS, p0=2.0, reduce=Hybrid(6)),
+    "FirstFloor": Bank(CHANGES, [Sensor.nominal(r=0.01)], p0=2.0, reduce=FirstFloor(2)),
+    "beam, square root": Bank(CHANGES, SENSORS, p0=2.0, reduce=Beam(6), form="sqrt"),
+}
+BLOCKS = HammersteinWiener(na=1, nb=1, input=Polynomial(2), output=Polynomial(2))
+
+
+def signals(seed: int, m: int = 1, ny: int = 1, holes: bool = True) -> tuple[np.ndarray[Any, Any], ...]:
+    """y (T, ny), u (T, m) of a stable system whose gain jumps, with missing values in both."""
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((T, m))
+    gain = np.where(np.arange(T) < T // 2, 1.0, 1.6)
+    y = np.zeros((T, ny))
+    for t in range(1, T):
+        y[t] = 0.6 * y[t - 1] + gain[t] * u[t - 1].sum() + 0.1 * rng.standard_normal(ny)
+    if holes:
+        y[rng.random((T, ny)) < 0.05] = np.nan
+        u[rng.random((T, m)) < 0.02] = np.nan
+        y[120:128] = np.nan
+    return y, u
+
+
+def written(run: Any) -> Arrays:
+    """What a run reports, and its likelihood."""
+    return {name: np.asarray(getattr(run, name)) for name in WRITTEN} | {"loglik": np.asarray(run.loglik)}
+
+
+def smoothed(run: Any) -> Arrays:
+    """What its smoother reports."""
+    path = run.smooth()
+    return {"smoothed theta": np.asarray(path.theta), "smoothed std": np.asarray(path.std)}
+
+
+def of_record(model: Any, tracker: Any, seed: int, smooth: bool = False, **known: Any) -> Configuration:
+    """One record."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=model.m)
+        made = track(model, tracker, y[:, 0], u, **known)
+        return written(made) | (smoothed(made) if smooth else {})
+
+    return run
+
+
+def of_stream(model: Any, tracker: Any, seed: int) -> Configuration:
+    """A stream that is stored, loaded and continued halfway."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=model.m)
+        live = Live(model, tracker)
+        steps = [live.update(y[t, 0], u[t]) for t in range(T // 2)]
+        with tempfile.TemporaryDirectory() as folder:
+            live.save(Path(folder) / "state.npz")
+            live = Live.load(Path(folder) / "state.npz")
+        steps += [live.update(y[t, 0], u[t]) for t in range(T // 2, T)]
+        return {"steps": np.array(steps, dtype=float), "theta": live.theta, "std": live.std}
+
+    return run
+
+
+def of_warm_start(model: Any, tracker: Any, seed: int) -> Configuration:
+    """The second half of a record, begun where the first ended."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=model.m)
+        first = track(model, tracker, y[: T // 2, 0], u[: T // 2])
+        return written(track(model, tracker, y[T // 2 :, 0], u[T // 2 :], warm_start=first))
+
+    return run
+
+
+def of_fleet(model: Any, tracker: Any, seed: int, units: int) -> Configuration:
+    """Series of one fleet, by row."""
+
+    def run() -> Arrays:
+        records = [signals(seed + k, m=model.m) for k in range(units)]
+        fleet = track(
+            model, tracker, np.stack([y[:, 0] for y, _ in records]), np.stack([u for _, u in records]), by="row"
+        )
+        return {f"{key}: {name}": value for key in fleet.keys() for name, value in written(fleet[key]).items()}  # noqa: SIM118
+
+    return run
+
+
+def of_grid(model: Any, trackers: list[Any], seed: int) -> Configuration:
+    """Settings over one record."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=model.m)
+        runs = track(model, trackers, y[:, 0], u)
+        return {f"{key}: {name}": value for key in runs.keys() for name, value in written(runs[key]).items()}  # noqa: SIM118
+
+    return run
+
+
+def of_outputs(model: Any, tracker: Any, seed: int, ny: int) -> Configuration:
+    """Several outputs."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=2, ny=ny)
+        wanted = np.repeat(u[:, None, :], ny, axis=1) if getattr(model, "shared", False) else u
+        made = track(model, tracker, y, wanted)
+        return {name: np.asarray(getattr(made, name)) for name in WRITTEN}
+
+    return run
+
+
+def configurations() -> Iterator[tuple[str, Configuration]]:
+    """Eighty of them, by name; the draws are fixed."""
+    rng = np.random.default_rng(80)
+    models = {"ARX(1, 1)": ARX(1, 1), "Regression(2)": Regression(2), "ARX(1, 1) from zero": ARX(1, 1, start="zero")}
+    uneven = np.cumsum(rng.choice([0.5, 1.0, 1.0, 1.0, 3.0], T))
+    for name, tracker in SIMPLE.items():
+        smooth = not isinstance(tracker, AdaptiveKalman | AugmentedFLS | RLS) and tracker != Bank()
+        for kind, model in models.items():
+            seed = int(rng.integers(1000))
+            yield f"{name} on {kind}", of_record(model, tracker, seed, smooth)
+        seed = int(rng.integers(1000))
+        yield f"{name}, uneven time", of_record(ARX(1, 1), tracker, seed, time=uneven)
+        yield f"{name}, stream", of_stream(ARX(1, 1), tracker, seed)
+        yield f"{name}, warm start", of_warm_start(ARX(1, 1), tracker, seed)
+    for name, tracker in BANKS.items():
+        yield f"Bank, {name}", of_record(ARX(1, 1), tracker, int(rng.integers(1000)))
+    weights, drift = rng.choice([0.0, 0.5, 1.0, 2.0], T), rng.choice([0.0, 1.0, 1.0, 10.0], T)
+    yield "Kalman, weights and drift", of_record(ARX(1, 1), SIMPLE["Kalman"], 5, True, weights=weights, drift=drift)
+    yield "Bank, weights", of_record(ARX(1, 1), SIMPLE["Bank, beam"], 5, weights=weights)
+    each = rng.choice([0.0, 1.0, 4.0], (T, 2))
+    yield "Kalman, a drift for each", of_record(ARX(1, 1), SIMPLE["Kalman"], 6, True, drift=each)
+    yield "FLS, a drift for each", of_record(ARX(1, 1), SIMPLE["FLS"], 6, True, drift=each)
+    for units in (3, 40):
+        for name in ("Kalman", "RLS", "FLS"):
+            yield f"{name}, fleet of {units}", of_fleet(ARX(1, 1), SIMPLE[name], 100, units)
+    yield "AdaptiveKalman, fleet of 3", of_fleet(ARX(1, 1), AdaptiveKalman(), 100, 3)
+    yield "Kalman, grid", of_grid(ARX(1, 1), [Kalman(q=q, r=0.01) for q in np.logspace(-6, 0, 20)], 7)
+    for name in ("Kalman", "RLS"):
+        yield f"{name}, two outputs", of_outputs(ARX(1, 1, inputs=2, ny=2), SIMPLE[name], 8, 2)
+        yield f"{name}, a theta shared", of_outputs(Regression(2, ny=2, shared=True), SIMPLE[name], 9, 2)
+    yield "Hammerstein-Wiener, Kalman", of_record(BLOCKS, Kalman(q=1e-5, r=0.01, p0=1.0), 10)
+    yield "Hammerstein-Wiener, extended", of_record(BLOCKS, ExtendedKalman(q=1e-5, r=0.01), 10)
+    yield "Hammerstein-Wiener, output error", of_record(BLOCKS, OutputError(q=1e-5, r=0.01, q_w=1e-4), 10)

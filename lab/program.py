@@ -1,0 +1,55 @@
+"""The command line of the laboratory: ``python -m lab bench``, ``reproduce`` and ``same-numbers``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from driftfit.settings import near
+from lab import same_numbers
+from lab.bench import commands as bench
+from lab.reproduce import found as reproductions
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    help="What shows that the library is right and fast; run from a checkout.",
+)
+app.add_typer(bench.app, name="bench", help="Compare accuracy and speed with other packages.")
+app.add_typer(
+    same_numbers.app, name="same-numbers", help="Compare random configurations bit for bit, before and after."
+)
+out = Console(highlight=False)
+
+
+@contextmanager
+def helpful() -> Iterator[None]:
+    """Turn what a user can put right into one line and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        typer.echo(f"lab: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(2) from None
+
+
+@app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
+    help=f"Reproduce a paper: {', '.join(reproductions())}. Options: python -m lab reproduce NAME --help.",
+)
+def reproduce(context: typer.Context, name: Annotated[str, typer.Argument(help="Which one.")] = "--help") -> None:
+    """Run one of the reproductions with the options that it has itself."""
+    if name == "--help":
+        out.print(f"python -m lab reproduce {{{','.join(reproductions())}}} [--help]", markup=False)
+        return
+    with helpful():
+        if name not in reproductions():
+            raise ValueError(f"there is no reproduction {name!r}; {near(name, reproductions())}")
+        program = typer.Typer(add_completion=False, rich_markup_mode=None)
+        program.command()(import_module(f"lab.reproduce.{name.replace('-', '_')}").main)
+        program(args=context.args, prog_name=f"python -m lab reproduce {name}", standalone_mode=False)

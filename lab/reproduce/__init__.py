@@ -1,0 +1,28 @@
+"""Reproductions of papers. A folder in this one with a function `main` is ``python -m lab reproduce NAME``.
+
+A `Claim` of a paper is judged by a function of numbers, with a rule that is printed beside its verdict.
+"""
+
+from __future__ import annotations
+
+from pkgutil import iter_modules
+from textwrap import fill, indent
+from typing import NamedTuple
+
+
+class Claim(NamedTuple):
+    """What is claimed, what is made of it, the rule by which, and the numbers that it was applied to."""
+
+    claim: str
+    verdict: str
+    rule: str
+    measured: str
+
+    def told(self, width: int, by: str) -> str:
+        """Numbers and rule, indented."""
+        return "\n".join(indent(fill(text, width), by) for text in (self.measured, f"Rule: {self.rule}"))
+
+
+def found() -> list[str]:
+    """Their names on the command line."""
+    return sorted(module.name.replace("_", "-") for module in iter_modules(__path__))

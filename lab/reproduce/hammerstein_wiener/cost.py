@@ -1,0 +1,68 @@
+"""What separation costs beside the filter (remark 4): nanoseconds a sample by order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from driftfit.blocks.paths import empty
+from driftfit.blocks.separate import METHODS, separate
+from driftfit.kernel import Array
+from driftfit.models.basis import Legendre
+from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.track import track
+from driftfit.trackers.kalman import Kalman
+
+ORDERS = ((2, 2, 3, 3), (3, 3, 3, 4), (4, 4, 5, 5))
+REPEATS = 5
+
+
+def least(function: Callable[[], object], samples: int) -> float:
+    """Nanoseconds a sample, the least of several runs."""
+    function()
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return 1e9 * min(times) / samples
+
+
+def measure(
+    samples: int = 5000, orders: tuple[tuple[int, int, int, int], ...] = ORDERS
+) -> dict[tuple[int, ...], dict[str, float]]:
+    """ns a sample, the least of five, for (na, nb, n_in, n_out); the last order without its filter step."""
+    found: dict[tuple[int, ...], dict[str, float]] = {}
+    rng = np.random.default_rng(0)
+    for order in orders:
+        na, nb, n_in, n_out = order
+        model = HammersteinWiener(na, nb, input=Legendre(n_in, (-4, 4)), output=Legendre(n_out, (-4, 4)))
+        y, u = rng.uniform(-3.0, 3.0, (2, samples))
+        xi = rng.normal(size=(samples, model.structure.n_x))
+        theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
+        *groups, quality = empty(model, samples)
+        parts = (model.structure.sizes, model.rise, tuple(groups), quality)
+        row = {}
+        for place, method in enumerate(METHODS[:3]):
+            row[method] = least(partial(separate, theta, (na, n_out, place), *parts), samples)
+        if model.n < 30:
+            tracker = Kalman(q=1e-3, r=1.0, p0=1e2)
+            row["filter"] = least(partial(track, model, tracker, y, u), samples)
+        found[order] = row
+    return found
+
+
+def table(times: dict[tuple[int, ...], dict[str, float]]) -> Table:
+    """Nanoseconds a sample."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, title="Nanoseconds a sample", title_justify="left")
+    for head in ("na, nb, n_in, n_out", "filter step", *METHODS[:3]):
+        shown.add_column(head, justify="right")
+    for order, row in times.items():
+        step = f"{row['filter']:.0f}" if "filter" in row else "-"
+        shown.add_row(", ".join(map(str, order)), step, *(f"{row[m]:.0f}" for m in METHODS[:3]))
+    return shown

@@ -1,0 +1,107 @@
+"""Figures 2 to 10, 12 and 13 of the paper, drawn from this library's runs of seed 0. Truth is grey."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.kernel import Array
+from driftfit.plots import BLUE, GREY, RED, new_figure
+from driftfit.systems.arc_furnace import furnace
+from driftfit.systems.hammerstein_wiener import Simulated, example
+from driftfit.track import track
+from lab.reproduce.hammerstein_wiener.runs import FAST, PAPER, STARTS, fourth_example, off, separated
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+METHODS = {"average": RED, "svd": BLUE}
+FADED = {"average": 0.5, "svd": 1.0}
+GREEN = "#3a8f4f"
+
+
+def draw(folder: Path) -> None:
+    """Write hammerstein_wiener_02.png .. 10, 12, 13."""
+
+    def save(number: int, figure: Figure) -> None:
+        figure.savefig(folder / f"hammerstein_wiener_{number:02d}.png", dpi=80)
+
+    for first, s in ((2, example(1, 0)), (8, example(3, 0, snr_db=20.0))):
+        run = track(s.model, PAPER, s.y, s.u)
+        paths = {method: separated(run, method) for method in METHODS}
+        title = f"example {1 if first == 2 else '3, 20 dB'}, Q = 10 I, R = 0.01"
+        save(first, errors({m: off(xi, s) for m, xi in paths.items()}, title))
+        save(first + 1, parameters(s, paths, slice(0, 4), title))
+        save(first + 2, parameters(s, paths, slice(4, 8), title))
+    s = example(2, 0, T=600)
+    for number, start in zip((5, 6, 7), STARTS, strict=True):
+        run = track(s.model, replace(PAPER, theta0=start), s.y, s.u)
+        with np.errstate(all="ignore"):
+            ekf = off(track(s.model, replace(FAST, theta0=start), s.y, s.u).theta, s)
+        paths = {"two-stage": off(separated(run, "svd-joint"), s), "extended Kalman": ekf}
+        save(number, errors(paths, f"example 2, theta0 = {start:g}"))
+    f = furnace(0)
+    raw = {f"raw powers, q = {q}": fourth_example(f, q, True, "average") for q in (4, 5, 6)}
+    raw["Legendre, q = 4"] = fourth_example(f, 4, False, "svd")
+    save(12, errors({name: r.a + r.b + r.p for name, r in raw.items()}, "example 4, Er of (67)"))
+    save(13, residuals({name: r.equation for name, r in raw.items()}))
+
+
+def errors(paths: Mapping[str, Array], title: str) -> Figure:
+    """Errors over time, on a logarithmic axis."""
+    figure = new_figure(7.0, 3.4)
+    axis = figure.subplots()
+    colours = (RED, BLUE, GREEN, "black")
+    for (name, path), colour in zip(paths.items(), colours, strict=False):
+        axis.semilogy(path, lw=0.8, color=colour, label=name)
+    settled = np.concatenate([path[50:] for path in paths.values()])
+    settled = settled[np.isfinite(settled) & (settled > 0.0)]
+    low, high = np.quantile(settled, (0.001, 0.999))
+    axis.set_ylim(0.5 * low, 3.0 * max(high, 1.0))
+    axis.set(xlabel="sample", ylabel="error of the parameters")
+    axis.set_title(title, fontsize=9, loc="left")
+    axis.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.0)
+    axis.grid(alpha=0.25, lw=0.5)
+    return figure
+
+
+def parameters(s: Simulated, paths: Mapping[str, Array], part: slice, title: str) -> Figure:
+    """True and estimated parameters."""
+    figure = new_figure(7.0, 6.0)
+    names = s.model.structure.minimal_names[part]
+    axes = figure.subplots(len(names), 1, sharex=True)
+    for axis, name, i in zip(axes, names, range(part.start, part.stop), strict=True):
+        axis.plot(s.xi[:, i], lw=2.6, color=GREY, alpha=0.7, label="true")
+        for method, xi in paths.items():
+            axis.plot(xi[:, i], lw=0.6, color=METHODS[method], alpha=FADED[method], label=method)
+        shown = np.concatenate([s.xi[:, i], paths["svd"][500:, i]])
+        low, high = np.quantile(shown, (0.005, 0.995))
+        axis.set_ylim(low - 0.3 * (high - low), high + 0.3 * (high - low))
+        axis.set_ylabel(name)
+        axis.grid(alpha=0.25, lw=0.5)
+    figure.suptitle(title, fontsize=9)
+    axes[0].legend(fontsize=8, frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    axes[-1].set_xlabel("sample")
+    return figure
+
+
+def residuals(paths: Mapping[str, Array]) -> Figure:
+    """Errors of the equation, a panel each."""
+    figure = new_figure(7.0, 6.0)
+    axes = figure.subplots(len(paths), 1, sharex=True)
+    for axis, (name, path) in zip(axes, paths.items(), strict=True):
+        axis.plot(path, lw=0.6, color=BLUE)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reach = float(np.nanquantile(np.abs(path[500:]), 0.999))
+        axis.set_ylim(-3.0 * reach, 3.0 * reach)
+        axis.set_title(name, fontsize=9)
+        axis.grid(alpha=0.25, lw=0.5)
+    axes[-1].set_xlabel("sample")
+    figure.supylabel("error of the equation", fontsize=10)
+    return figure

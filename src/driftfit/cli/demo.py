@@ -1,0 +1,21 @@
+"""``driftfit demo``: the first picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftfit.cli.program import app, helpful, out, progress
+
+
+@app.command()
+def demo(
+    plot: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("driftfit-demo.png"),
+) -> None:
+    """Follow the US demand for money from 1959 to 2009."""
+    from driftfit.demo import show
+
+    with helpful():
+        show(out, progress, plot)

@@ -1,0 +1,113 @@
+"""``driftfit detect``: alarms at a set rate of false alarms, scored against labels where there are some."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+import typer
+from rich.text import Text
+
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, say
+from driftfit.cli.reading import moment, stretch
+from driftfit.cli.track import Plot, Report
+from driftfit.detect import Alarms
+from driftfit.report import check_path
+from driftfit.result import Track
+
+
+@app.command()
+@reads
+def detect(
+    given: Given,
+    kind: Annotated[str, typer.Option(help="band, innovation or probability.")] = "band",
+    every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0,
+    reference: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What is normal: so many first samples, FROM..TO in times, or name=low:high; repeat the last."
+        ),
+    ] = None,
+    window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50,
+    hold: Annotated[int, typer.Option(help="An alarm stays on for so many samples after its cause.")] = 0,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False,
+    labels: Annotated[
+        str | None, typer.Option(help="Column of labels, 0 or 1: where something was wrong; the alarms are scored.")
+    ] = None,
+    write_to: Annotated[Path | None, typer.Option("--out", help="Write the alarms to .csv or .parquet.")] = None,
+    plot: Plot = None,
+    report: Report = None,
+) -> None:
+    """Find alarms, with one false alarm in so many samples; with labels, score them."""
+    if labels is not None and (given.by or len(given.outputs) > 1):
+        raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
+    if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {write_to}: alarms are written to .csv or .parquet.")
+    if report is not None:
+        check_path(report)
+    rows = given.read(labels) if labels is not None else None
+    run = given.run(rows)
+    settings = {"every": every, "window": window, "hold": hold, "calibrate": calibrate}
+    said = run.detect(kind, reference=parse_reference(reference, run), **settings)
+    say(said)
+    wrong = None
+    if rows is not None and labels is not None:
+        wrong = np.nan_to_num(rows.numbers[labels][rows.order()]) > 0.5
+        score = said.score(wrong)
+        late = "" if np.isnan(score.delay) else f", {score.delay:g} samples after they began (median)"
+        found = f" Labels: {score.found} of {score.events} found{late};"
+        say(Text(f"{found} {score.false} false alarms in {score.normal} normal samples."), soft_wrap=True)
+    if write_to is not None:
+        _write(said, write_to)
+    if plot is not None:
+        if not isinstance(run, Track):
+            raise ValueError("--plot: alarms are drawn for one series; --report has those of a fleet.")
+        said.plot(wrong).savefig(plot, dpi=150)
+    if report is not None:
+        run.report(report, alarms=said, **({} if wrong is None else {"labels": wrong}))
+
+
+def parse_reference(given: list[str] | None, run: Any) -> Any:
+    """``300``, ``2024-03-01..2024-03-04`` or ``gain=0.9:1.1`` as `Track.detect` takes it."""
+    if not given:
+        return None
+    if all("=" in entry for entry in given):
+        return dict(_band(entry) for entry in given)
+    if len(given) > 1:
+        raise ValueError("--reference: several are only for bands, such as --reference gain=0.9:1.1.")
+    if given[0].strip().isdigit():
+        return int(given[0])
+    first, last = stretch(given[0], "--reference")
+    axis, zone = (run.time, run.labels.zone) if isinstance(run, Track) else (np.arange(1), None)
+    return moment(first, axis, zone), moment(last, axis, zone, end=True)
+
+
+def _band(entry: str) -> tuple[str, tuple[float, float]]:
+    name, _, bounds = entry.partition("=")
+    low, _, high = bounds.partition(":")
+    try:
+        return name.strip(), (float(low or "-inf"), float(high or "inf"))
+    except ValueError:
+        raise ValueError(f"--reference {entry}: a band is given as name=low:high.") from None
+
+
+def _write(said: Any, path: Path) -> None:
+    table = _table(said) if isinstance(said, Alarms) else said.table
+    table.write_csv(path) if path.suffix.lower() == ".csv" else table.write_parquet(path)
+
+
+def _table(said: Alarms) -> pl.DataFrame:
+    """One row an alarm."""
+    places = [int(t) for t in said.onsets]
+    names = [said.names.index(said.cause(t)) for t in places]
+    spans = [said.span(t) for t in places]
+    columns = {
+        "from": [first for first, _ in spans], "to": [last for _, last in spans],
+        "cause": [said.names[j] for j in names],
+        "statistic": [float(said.statistic[t, j]) for t, j in zip(places, names, strict=True)],
+        "limit": [float(said.limits[j]) for j in names],
+    }  # fmt: skip
+    return pl.DataFrame(columns, schema_overrides=dict.fromkeys(("from", "to", "cause"), pl.String))

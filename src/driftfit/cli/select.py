@@ -1,0 +1,34 @@
+"""``driftfit select``: which structure predicts best."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from driftfit.cli.arguments import listed
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, progress, say
+from driftfit.cli.track import Plot
+
+
+@app.command()
+@reads
+def select(
+    given: Given,
+    keep: Annotated[list[str] | None, typer.Option(help="Regressor that every subset has; repeat it.")] = None,
+    most: Annotated[int | None, typer.Option(help="Most regressors in a subset.")] = None,
+    plot: Plot = None,
+) -> None:
+    """Compare models (repeat --model), or the regressors of one, by how well they predict."""
+    from driftfit.select import select as compare
+
+    models = given.models()
+    with progress.status("comparing"):
+        said = compare(
+            models if len(models) > 1 else models[0], tracker=given.chosen_tracker(), keep=tuple(listed(keep)),
+            most=most, **given.arrays(),
+        )  # fmt: skip
+    say(said)
+    if plot is not None:
+        said.plot().savefig(plot, dpi=150)

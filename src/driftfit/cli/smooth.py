@@ -1,0 +1,56 @@
+"""``driftfit smooth``: every parameter from the whole record, past and future."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import polars as pl
+import typer
+from rich.text import Text
+
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, progress, say
+from driftfit.cli.track import Plot
+from driftfit.settings import missing_settings
+from driftfit.summary import facts, table_of
+from driftfit.tune import tune
+
+PLACES = 5
+"""Samples that are printed."""
+
+
+@app.command()
+@reads
+def smooth(
+    given: Given,
+    write_to: Annotated[Path | None, typer.Option("--out", help="Write the path to .csv or .parquet.")] = None,
+    plot: Plot = None,
+) -> None:
+    """Estimate the parameters at every sample from the whole record; settings that are left out are tuned first."""
+    if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"--out {write_to}: a path is written to .csv or .parquet.")
+    if given.by or len(given.outputs) > 1:
+        raise ValueError("smooth: one series of one output at a time; leave out --by and further --y.")
+    tracker = given.chosen_tracker()
+    if missing_settings(tracker):
+        with progress.status("tuning"):
+            tracker = tune(given.models()[0], tracker, **given.arrays()).tracker
+    run = given.run(tracker=tracker)
+    said = run.smooth()
+    say(facts(("Model", repr(run.model)), ("Tracker", repr(run.tracker)), ("Samples", str(len(run)))))
+    table = table_of("Parameters from the whole record", "at", *run.names)
+    for t in np.unique(np.linspace(0, len(run) - 1, PLACES).astype(int)):
+        cells = (f"{v:.4g} +- {s:.2g}" for v, s in zip(said.theta[t], said.std[t], strict=True))
+        table.add_row(Text(run.time_text(int(t))), *cells)
+    say(table)
+    say(Text(" +- one standard deviation", "dim"))
+    if write_to is not None:
+        columns: dict[str, Any] = {run.labels.time or "sample": run.time}
+        columns |= {f"theta_{name}": said.theta[:, i] for i, name in enumerate(run.names)}
+        columns |= {f"std_{name}": said.std[:, i] for i, name in enumerate(run.names)}
+        frame = pl.DataFrame(columns)
+        frame.write_csv(write_to) if write_to.suffix.lower() == ".csv" else frame.write_parquet(write_to)
+    if plot is not None:
+        said.plot().savefig(plot, dpi=150)

@@ -1,0 +1,59 @@
+"""``driftfit track``: follow the parameters of a model through a record, or through a fleet of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, say
+from driftfit.export import check_ending, write
+from driftfit.result import Track
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (one run).")]
+Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
+Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
+
+
+@app.command()
+@reads
+def track(
+    given: Given,
+    write_to: Out = None,
+    plot: Plot = None,
+    system: Annotated[
+        Path | None, typer.Option(help="Save a picture of responses, poles and gain over time (ARX, one output).")
+    ] = None,
+    report: Report = None,
+) -> None:
+    """Follow the parameters of a model through a record, or through a fleet of them."""
+    if write_to is not None and check_ending(write_to) == ".npz" and given.by:
+        raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
+    if report is not None:
+        from driftfit.report import check_path
+
+        check_path(report)
+    if plot is not None and given.by and len(given.outputs) > 1:
+        raise ValueError("--plot: there is no picture of many records with several outputs; --report has some.")
+    run = given.run()
+    say(run.summary())
+    if write_to is not None:
+        write(run, write_to)
+    if plot is not None:
+        run.plot().savefig(plot, dpi=150)
+    if system is not None:
+        plot_system(run).savefig(system, dpi=150)
+    if report is not None:
+        run.report(report)
+
+
+def plot_system(run: Any) -> Figure:
+    """The picture of the system, of runs that have one."""
+    if not isinstance(run, Track):
+        raise ValueError("--system: the picture is of one series with one output; leave out --by and further --y.")
+    return run.plot_system()

@@ -1,0 +1,70 @@
+"""``driftfit tune``: settings of a tracker from a record."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.text import Text
+
+from driftfit.cli.arguments import given_fields
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, progress, say
+from driftfit.cli.track import Plot
+from driftfit.summary import facts, shortened, table_of
+
+
+@app.command()
+@reads
+def tune(
+    given: Given,
+    method: Annotated[str, typer.Option(help="ml, h-step, loo or gcv.")] = "ml",
+    ahead: Annotated[int, typer.Option("--ahead", help="Samples ahead, for h-step.")] = 1,
+    groups: Annotated[
+        str | None, typer.Option(help="each: a drift for each parameter; or a label for each, a,a,b.")
+    ] = None,
+    level: Annotated[float, typer.Option(help="Of the intervals.")] = 0.95,
+    plot: Plot = None,
+) -> None:
+    """Find the settings that a tracker was left without: --tracker kalman finds q and r."""
+    from driftfit.tune import tune as find
+
+    models, shared = given.models(), groups.split(",") if groups and groups != "each" else groups
+    with progress.status("tuning"):
+        tuned = find(
+            models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
+        )
+    told = [
+        ("Model", repr(models[0])),
+        ("Tracker", shortened(repr(tuned.tracker))),
+        ("Log-likelihood", f"{tuned.loglik:.6g}"),
+    ]
+    say(facts(*told))
+    table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
+    for name, value in tuned.chosen.items():
+        low, high = tuned.interval.get(name, (np.nan, np.nan))
+        table.add_row(Text(name), *("" if np.isnan(x) else f"{x:.4g}" for x in (value, low, high)))
+    say(table)
+    if tuned.at_bound:
+        say(Text(f" at a bound of the search: {', '.join(tuned.at_bound)}", "dim"))
+    say(Text(f" To use them: {_flags(given, tuned.tracker)}", "dim"), soft_wrap=True)
+    if plot is not None:
+        tuned.plot().savefig(plot, dpi=150)
+
+
+def _flags(given: Given, tracker: Any) -> str:
+    """The tracker as options of the command line."""
+    values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}
+    parts = [f"-p {name}={_typed(value)}" for name, (value, default) in values.items() if not _same(value, default)]
+    return " ".join([f"--tracker {given.tracker}", *parts])
+
+
+def _same(value: Any, default: Any) -> bool:
+    return np.shape(value) == np.shape(default) and bool(np.all(value == default))
+
+
+def _typed(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(f"{x:.6g}" for x in np.ravel(value)) if np.ndim(value) or isinstance(value, float) else str(value)

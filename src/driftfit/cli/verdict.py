@@ -1,0 +1,28 @@
+"""``driftfit verdict``: is the time variation real, which parameters move, and does following them pay?"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from driftfit.cli.given import Given, reads
+from driftfit.cli.program import app, say
+from driftfit.cli.track import Report
+
+
+@app.command()
+@reads
+def verdict(
+    given: Given,
+    level: Annotated[
+        float, typer.Option(help="Error rate of what is said to move; of a fleet, false discoveries.")
+    ] = 0.05,
+    lags: Annotated[int | None, typer.Option(help="Lags of correlation of the noise to allow for.")] = None,
+    report: Report = None,
+) -> None:
+    """Say whether the parameters move, which, when, and whether following them pays."""
+    run = given.run()
+    say(run.verdict(level=level, lags=lags))
+    if report is not None:
+        run.report(report)

@@ -1,0 +1,73 @@
+"""A tracker as standalone C99, for controllers that run no Python.
+
+The source is translated from the steps that run live, on records and in fleets (`driftfit.embedded.statements`), so a
+new tracker can be exported by being there, and the double build gives the same bits. States travel both ways as bytes.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from driftfit.embedded.project import files_of, record_bytes, write
+from driftfit.live import Live
+from driftfit.models.base import Model
+from driftfit.signals import check_ready
+from driftfit.trackers.base import Tracker
+from driftfit.warm import fresh_tile
+
+
+def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
+    """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``.
+
+    Parameters
+    ----------
+    model, tracker : Model, Tracker
+        As for `Live`: a model with several inputs must say so. All trackers but `Bank`.
+    path : path
+        The folder; it is made where it is not there, and files of these names are replaced.
+
+    Raises
+    ------
+    ValueError
+        For a `Bank`, whose machine works in vectors of eight numbers that have no place on a controller; for several
+        outputs; for incomplete settings; for a step of one's own that uses what has no translation.
+    """
+    if tracker.weighs:
+        raise ValueError(
+            f"export_c: {type(tracker).__name__} has no C form: its compiled routine works in vectors of eight numbers "
+            "and on many leaves; export AdaptiveKalman, or a Kalman with settings from a Bank's run."
+        )
+    if len(model.outputs) > 1:
+        raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
+    bound = model.bind(model.m)
+    tile = fresh_tile(bound, check_ready(tracker))
+    write(Path(path), files_of(bound, tracker, tile, f"{bound!r}, {tracker!r}"))
+
+
+def to_struct(live: Live) -> bytes:
+    """The state of a stream as the bytes of ``tracker_state`` (double build, the byte order of this computer)."""
+    return record_bytes(fresh_tile(live.model, live.tracker, live.lane()))
+
+
+def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
+    """A stream that goes on from the bytes of a ``tracker_state`` of the double build.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many bytes as this model and tracker need.
+    """
+    live = Live(model, tracker)
+    lane = live.lane()
+    needed = sum(8 * lane[name].size for name in lane)
+    if len(state) != needed:
+        raise ValueError(f"from_struct: this model and tracker have a state of {needed} bytes; got {len(state)}.")
+    at = 0
+    for field in lane.values():
+        values = np.frombuffer(state, field.dtype, field.size, at)
+        field[...] = values.reshape(field.shape)
+        at += 8 * field.size
+    return live

@@ -1,0 +1,317 @@
+"""Expressions of steps in C: names, numbers, places of arrays, arithmetic, and the few functions that steps call."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import math
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from driftfit import eights, kernel
+from driftfit.embedded.unit import TranslationError, Unit
+from driftfit.embedded.values import RANK, Value, begin_of, field, joined, lifted, number, view
+
+ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
+BITS = {ast.BitAnd: "&", ast.BitOr: "|"}
+COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+FOUR = {eights.fill_four: "four_of", eights.load_four: "four_at", eights.plus: "four_plus", eights.times: "four_times"}
+
+
+class Expressions:
+    """The part of a translator that turns expressions into values; `driftfit.embedded.statements` has the rest."""
+
+    stored: Counter[str]
+    ops: list[Counter[str]]
+    locals: dict[str, Value]
+
+    def __init__(self, unit: Unit, source: Any) -> None:
+        self.unit, self.source = unit, source
+        names, cells = source.__code__.co_freevars, source.__closure__ or ()
+        self.closure = {name: cell.cell_contents for name, cell in zip(names, cells, strict=True)}
+        self.lazy = 0
+
+    @contextmanager
+    def lazily(self) -> Iterator[None]:
+        """Within this an expression may not be computed before its statement, since it may not be computed at all."""
+        self.lazy += 1
+        yield
+        self.lazy -= 1
+
+    def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
+        raise NotImplementedError
+
+    def refuse(self, node: ast.AST) -> Any:
+        raise TranslationError(f"{self.source.__qualname__}: no translation of `{ast.unparse(node)}`.")
+
+    def value(self, node: ast.expr, statement: bool = False) -> Value:
+        """Translate an expression."""
+        if isinstance(node, ast.Call):
+            return self.call(node, statement)
+        handler = getattr(self, f"of_{type(node).__name__.lower()}", None)
+        made: Value = handler(node) if handler else self.refuse(node)
+        return made
+
+    def of_constant(self, node: ast.Constant) -> Value:
+        return number(node.value) if isinstance(node.value, bool | int | float) else self.refuse(node)
+
+    def of_name(self, node: ast.Name) -> Value:
+        if node.id in self.locals:
+            return self.locals[node.id]
+        for names in (self.closure, self.source.__globals__, vars(builtins)):
+            if node.id in names:
+                return lifted(names[node.id])
+        return self.refuse(node)  # type: ignore[no-any-return]
+
+    def of_tuple(self, node: ast.Tuple) -> Value:
+        return Value("items", constant=[self.value(one) for one in node.elts])
+
+    def of_attribute(self, node: ast.Attribute) -> Value:
+        if node.attr == "data" and isinstance(node.value, ast.Attribute) and node.value.attr == "ctypes":
+            array = self.value(node.value.value)
+            return Value("address", begin_of(array))
+        owner = self.value(node.value)
+        if owner.kind == "record":
+            return field(node.attr, self.unit.record[node.attr][0])
+        if owner.kind == "array" and node.attr == "shape":
+            return Value("items", constant=[number(size) for size in owner.shape])
+        if owner.kind == "python" and owner.constant in (np, math):
+            return lifted(getattr(owner.constant, node.attr))
+        return self.refuse(node)  # type: ignore[no-any-return]
+
+    def of_subscript(self, node: ast.Subscript) -> Value:
+        owner = self.value(node.value)
+        parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        if owner.kind == "tile":
+            return Value("record", "s")
+        if owner.kind == "items":
+            item: Value = owner.constant[int(self.value(parts[0]).constant)]
+            return item
+        if owner.kind == "table":
+            return self._entry(owner, [self.value(one) for one in parts])
+        if owner.kind != "array":
+            return self.refuse(node)  # type: ignore[no-any-return]
+        parts += [ast.Slice()] * (len(owner.shape) - len(parts))
+        self.ops[-1]["load"] += 1
+        index = [
+            self._part(one, size) if isinstance(one, ast.Slice) else self.value(one)
+            for one, size in zip(parts, owner.shape, strict=True)
+        ]
+        return view(owner, index)
+
+    def _part(self, node: ast.Slice, size: int) -> range:
+        """The part of an axis that a slice keeps."""
+        bounds = (node.lower, node.upper)
+        ends = [None if one is None else self.value(one).constant for one in bounds]
+        unknown = any(one is not None and end is None for one, end in zip(bounds, ends, strict=True))
+        if node.step is not None or unknown:
+            self.refuse(node)
+        return range(size)[slice(*ends)]
+
+    def _entry(self, table: Value, index: list[Value]) -> Value:
+        """An entry of a table: a constant where its place is known."""
+        if all(one.known for one in index):
+            inner = table.constant
+            for one in index:
+                inner = inner[one.constant]
+            return lifted(inner)
+        name, kind = self.unit.table(table.constant)
+        strides = [int(np.prod(np.shape(table.constant)[axis + 1 :])) for axis in range(len(index))]
+        at = " + ".join(f"{one.text} * {stride}" for one, stride in zip(index, strides, strict=True))
+        most = int(np.max(table.constant)) if kind == "int" else None
+        return Value(kind, f"{name}[{at}]", most=most)
+
+    # arithmetic
+
+    def of_unaryop(self, node: ast.UnaryOp) -> Value:
+        value = self.value(node.operand)
+        if isinstance(node.op, ast.Not):
+            return number(not value.constant) if value.known else Value("bool", f"(!{value.text})")
+        if isinstance(node.op, ast.USub):
+            return number(-value.constant) if value.known else Value(value.kind, f"(-{value.text})")
+        return self.refuse(node)  # type: ignore[no-any-return]
+
+    def of_binop(self, node: ast.BinOp) -> Value:
+        one = self.value(node.left)
+        return self.binary(node.op, one, self.value(node.right))
+
+    def binary(self, operator: ast.operator, one: Value, other: Value) -> Value:
+        """One operation of two numbers."""
+        kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
+        if one.known and other.known and kind in RANK:
+            return number(_folded(operator, one.constant, other.constant))
+        if one.kind == "address":  # in bytes
+            moved = str(other.constant // 8) if other.known else f"{other.text} / 8"
+            return one if other.constant == 0 else Value("address", f"({one.text} + {moved})")
+        if isinstance(operator, ast.Pow):
+            return self._square(one, other)
+        if isinstance(operator, ast.LShift | ast.RShift):
+            return _shifted(operator, one, other)
+        if type(operator) in BITS:
+            return Value(kind, f"({one.text} {BITS[type(operator)]} {other.text})")
+        sign = ARITHMETIC[type(operator)]
+        if kind != "real":
+            kind = "real" if isinstance(operator, ast.Div) else joined(kind, "int")
+            if isinstance(operator, ast.Div):
+                return Value("real", f"((real){one.text} / (real){other.text})")
+            return Value(kind, f"({one.text} {sign} {other.text})", most=_most(sign, one, other))
+        self.ops[-1][{"+": "add", "-": "add", "*": "multiply", "/": "divide"}[sign]] += 1
+        return Value("real", f"({_real(one)} {sign} {_real(other)})")
+
+    def _square(self, one: Value, other: Value) -> Value:
+        if other.constant != 2:
+            raise TranslationError(f"{self.source.__name__}: powers other than squares have no translation.")
+        self.ops[-1]["multiply"] += 1
+        return Value(one.kind, f"real_square({one.text})" if one.kind == "real" else f"({one.text} * {one.text})")
+
+    def of_compare(self, node: ast.Compare) -> Value:
+        values = [self.value(one) for one in (node.left, *node.comparators)]
+        if all(one.known for one in values):
+            truths = [
+                _compared(operator, one.constant, other.constant)
+                for operator, one, other in zip(node.ops, values, values[1:], strict=False)
+            ]
+            return number(all(truths))
+        tests = [
+            f"{one.text} {COMPARISONS[type(operator)]} {other.text}"
+            for operator, one, other in zip(node.ops, values, values[1:], strict=False)
+        ]
+        self.ops[-1]["compare"] += len(tests)
+        text = f"({tests[0]})" if len(tests) == 1 else "(" + " && ".join(f"({test})" for test in tests) + ")"
+        return Value("bool", text)
+
+    def of_boolop(self, node: ast.BoolOp) -> Value:
+        both = isinstance(node.op, ast.And)
+        values = [self.value(node.values[0])]
+        with self.lazily():
+            values += [self.value(one) for one in node.values[1:]]
+        if any(one.known and bool(one.constant) != both for one in values):
+            return number(not both)
+        open_ones = [one for one in values if not one.known]
+        if not open_ones:
+            return number(both)
+        return Value("bool", "(" + (" && " if both else " || ").join(one.text for one in open_ones) + ")")
+
+    def of_ifexp(self, node: ast.IfExp) -> Value:
+        test = self.value(node.test)
+        if test.known:
+            return self.value(node.body if test.constant else node.orelse)
+        with self.lazily():
+            one, other = self.value(node.body), self.value(node.orelse)
+        kind = joined(one.kind, other.kind)
+        return Value(kind, f"({test.text} ? {one.text} : {other.text})")
+
+    # functions
+
+    def call(self, node: ast.Call, statement: bool) -> Value:
+        """A call of another step, or of one of the functions that every step may use."""
+        if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
+            return self._reinterpreted(node)
+        function = self.value(node.func).constant
+        arguments = [self.value(one) for one in node.args]
+        if function in (kernel.floats, kernel.wholes):
+            rows, width = arguments[1].constant, int(arguments[2].constant)
+            shape = (self.unit.largest if rows is None else rows, width)
+            return Value("array", arguments[0].text, shape=shape, strides=(width, 1))
+        if function in FOUR or function is eights.reached:
+            return self._of_four(function, arguments)
+        if hasattr(function, "py_func"):
+            return self.called(function.py_func, arguments, statement)
+        return self._builtin(node, function, arguments)
+
+    def _builtin(self, node: ast.Call, function: Any, arguments: list[Value]) -> Value:
+        if function in (min, max):
+            made = arguments[0]
+            for one in arguments[1:]:
+                made = self._extreme(function, made, one)
+            return made
+        (one,) = arguments
+        if function is len:
+            return number(len(one.constant) if one.kind == "table" else one.shape[0])
+        if one.known and one.kind in RANK:
+            return number(function(one.constant))
+        if function is abs:
+            self.ops[-1]["add"] += 1
+            return (
+                Value("real", f"R_ABS({one.text})") if one.kind == "real" else Value(one.kind, f"whole_abs({one.text})")
+            )
+        if function in (np.sqrt, math.sqrt):
+            self.ops[-1]["square root"] += 1
+            return Value("real", f"R_SQRT({one.text})")
+        if function in (np.int64, int):
+            return Value("long", f"((int64_t){one.text})")
+        if function in (np.float64, float):
+            return Value("real", f"((real){one.text})")
+        if function is bool:
+            return Value("bool", f"({one.text} != 0)")
+        return self.refuse(node)  # type: ignore[no-any-return]
+
+    def _extreme(self, function: Any, one: Value, other: Value) -> Value:
+        """Python's rule: the second only where it is beyond the first, so that NaN and signed zeros fall alike."""
+        if one.known and other.known:
+            return number(function(one.constant, other.constant))
+        kind = joined(one.kind, other.kind)
+        bounds = [value.most for value in (one, other)]
+        known = [bound for bound in bounds if bound is not None]
+        most = min(known) if function is min and known else max(known) if len(known) == 2 else None
+        self.ops[-1]["compare"] += 1
+        prefix = "real_" if kind == "real" else "whole_"
+        return Value(kind, f"{prefix}{function.__name__}imum({one.text}, {other.text})", most=most)
+
+    def _reinterpreted(self, node: ast.Call) -> Value:
+        """The bits of a number as another kind."""
+        assert isinstance(node.func, ast.Attribute)
+        inner, to = self.value(node.func.value), self.value(node.args[0]).constant
+        return (
+            Value("real", f"from_bits({inner.text})") if to is np.float64 else Value("long", f"bits_of({inner.text})")
+        )
+
+    def _of_four(self, function: Any, arguments: list[Value]) -> Value:
+        """Four numbers at once are a structure of four."""
+        self.ops[-1]["multiply" if function is eights.times else "add"] += 4
+        if function is eights.reached:
+            one, other = arguments
+            return Value("long", f"four_reached({one.text}, {other.text})", most=4)
+        if function is eights.load_four:
+            array, row, _ = arguments
+            return Value("four", f"four_at({view(array, [row, range(4)]).text})")
+        return Value("four", f"{FOUR[function]}({', '.join(one.text for one in arguments)})")
+
+
+def _real(value: Value) -> str:
+    return value.text if value.kind == "real" or value.known else f"(real){value.text}"
+
+
+def _most(sign: str, one: Value, other: Value) -> int | None:
+    """A bound of a sum or product of whole numbers that are not negative."""
+    if one.most is None:
+        return None
+    if sign == "-":
+        return one.most - int(other.constant) if other.known else one.most
+    if sign == "/":
+        return one.most // int(other.constant) if other.known else one.most
+    if other.most is None:
+        return None
+    return one.most + other.most if sign == "+" else one.most * other.most if sign == "*" else None
+
+
+def _shifted(operator: ast.operator, one: Value, other: Value) -> Value:
+    if isinstance(operator, ast.LShift):
+        return Value("long", f"((int64_t)((uint64_t){one.text} << {other.text}))")
+    return Value("long", f"({one.text} >> {other.text})")
+
+
+def _folded(operator: ast.operator, one: Any, other: Any) -> Any:
+    node = ast.fix_missing_locations(
+        ast.Expression(ast.BinOp(ast.Name("a", ast.Load()), operator, ast.Name("b", ast.Load())))
+    )
+    return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+
+
+def _compared(operator: ast.cmpop, one: Any, other: Any) -> bool:
+    node = ast.Expression(ast.Compare(ast.Name("a", ast.Load()), [operator], [ast.Name("b", ast.Load())]))
+    return bool(eval(compile(ast.fix_missing_locations(node), "constant", "eval"), {"a": one, "b": other}))

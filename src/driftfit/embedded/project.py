@@ -1,0 +1,255 @@
+"""The files of an exported tracker: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftfit.drivers import drivers
+from driftfit.embedded.selftest import selftest
+from driftfit.embedded.statements import translate
+from driftfit.embedded.unit import Function, Unit
+from driftfit.embedded.values import Value, number
+from driftfit.kernel import Array
+from driftfit.models.base import Model
+from driftfit.storage import fields
+from driftfit.trackers.base import Tracker
+
+HEADER = """\
+/* {what}
+
+   Written by driftfit {version}: standalone C99 without heap and without global state. Compile with -ffp-contract=off:
+   the double build then gives the same bits as driftfit. -DTRACKER_SINGLE computes in single precision. */
+#ifndef DRIFTFIT_TRACKER_H
+#define DRIFTFIT_TRACKER_H
+
+#include <stdint.h>
+
+#ifdef TRACKER_SINGLE
+typedef float tracker_real;
+#else
+typedef double tracker_real;
+#endif
+
+#define TRACKER_PARAMETERS {n}
+#define TRACKER_INPUTS {m}
+/* theta: {names} */
+
+/* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
+   data have not told apart yet). Known of the next samples, and kept until changed: interval (nominal intervals since
+   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
+   drift). */
+typedef struct {{
+{fields}
+}} tracker_state;
+
+typedef struct {{
+    tracker_real y_hat;    /* prediction of y before it came; NAN where there is none */
+    tracker_real e;        /* innovation y - y_hat; NAN where the sample was not used */
+    tracker_real variance; /* of the innovation */
+    int ok;                /* 1 where the sample was used */
+}} tracker_step;
+
+/* The state before the first sample. */
+void tracker_init(tracker_state *s);
+
+/* Take in one sample: y (NAN where it is missing) and TRACKER_INPUTS inputs. */
+tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u);
+
+/* What tracker_update would predict for these inputs; only *scratch is changed. */
+tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u);
+
+/* Forget what is known of theta and keep the past signals, as after maintenance. */
+void tracker_reset(tracker_state *s);
+
+#endif
+"""
+
+SOURCE = """\
+/* {what}; see tracker.h. */
+#include "tracker.h"
+
+#include <math.h>
+
+typedef tracker_real real;
+
+#define R(x) ((real)(x))
+#ifdef TRACKER_SINGLE
+#define WIDE(wide, narrow) ((real)(narrow))
+#define R_SQRT(x) sqrtf(x)
+#define R_ABS(x) fabsf(x)
+#else
+#define WIDE(wide, narrow) ((real)(wide))
+#define R_SQRT(x) sqrt(x)
+#define R_ABS(x) fabs(x)
+#endif
+
+"""
+
+SUPPORT = {
+    "real_minimum": "static real real_minimum(real a, real b) { return b < a ? b : a; }",
+    "real_maximum": "static real real_maximum(real a, real b) { return b > a ? b : a; }",
+    "whole_minimum": "static int64_t whole_minimum(int64_t a, int64_t b) { return b < a ? b : a; }",
+    "whole_maximum": "static int64_t whole_maximum(int64_t a, int64_t b) { return b > a ? b : a; }",
+    "whole_abs": "static int64_t whole_abs(int64_t a) { return a < 0 ? -a : a; }",
+    "real_square": "static real real_square(real a) { return a * a; }",
+    "from_bits": """#ifndef TRACKER_SINGLE
+static double from_bits(int64_t bits) {
+    union { int64_t whole; double number; } both;
+    both.whole = bits;
+    return both.number;
+}
+#endif""",
+    "bits_of": """#ifndef TRACKER_SINGLE
+static int64_t bits_of(double number) {
+    union { int64_t whole; double number; } both;
+    both.number = number;
+    return both.whole;
+}
+#endif""",
+    "four": "typedef struct { real at[4]; } four;",
+    "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
+    "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
+    "four_plus": """static four four_plus(four a, four b) {
+    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] + b.at[i];
+    return a;
+}""",
+    "four_times": """static four four_times(four a, four b) {
+    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] * b.at[i];
+    return a;
+}""",
+    "four_reached": """static int64_t four_reached(four a, four b) {
+    int64_t count = 0;
+    for (int i = 0; i < 4; i++) count += a.at[i] >= b.at[i];
+    return count;
+}""",
+}
+"""What the translated steps may call."""
+
+README = """\
+# {what}
+
+`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give.
+
+    cc -std=c99 -O2 -ffp-contract=off -o selftest tracker.c selftest.c -lm && ./selftest
+
+* Parameters: {names}.
+* State: {doubles} bytes in double precision, {singles} with `-DTRACKER_SINGLE`. No heap, no global state, no recursion.
+* An update takes at most {ops}.
+  Loops are counted at their longest, and of two branches the dearer. After the start a sample takes at most
+  {ordinary}.
+* From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
+* `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
+
+```c
+tracker_state state;
+tracker_init(&state);
+for (;;) {{
+    tracker_step step = tracker_update(&state, y, u); /* then use state.theta, state.var, step.e */
+}}
+```
+
+`driftfit.embedded.from_struct(model, tracker, bytes)` opens a state of the double build in Python, and
+`to_struct(live)` gives the bytes back.
+"""
+
+
+def files_of(model: Model, tracker: Tracker, tile: Array, what: str) -> dict[str, str]:
+    """The text of every file, by its name."""
+    from driftfit import __version__
+
+    unit = Unit(tile)
+    u = Value("array", "u", shape=(model.m,), strides=(1,))
+    update = drivers(model.steps, tracker.steps_for(model)).update.function
+    entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
+    names = ", ".join(tracker.names_for(model))
+    header = HEADER.format(
+        what=what, version=__version__, n=len(tile["theta"][0]), m=model.m, names=names, fields=_fields(tile)
+    )
+    source = SOURCE.format(what=what) + _source(unit, entry, tile, set(model.memory()))
+    size = sum(tile[name][0].size for name in fields(tile))
+    wholes = sum(tile[name][0].size for name in fields(tile) if tile.dtype[name].base.kind == "i")
+    readme = README.format(
+        what=what, names=names, doubles=8 * size, singles=4 * size + 4 * wholes, ops=_said(entry.operations),
+        ordinary=_said(_ordinary(unit)),
+    )  # fmt: skip
+    return {"tracker.h": header, "tracker.c": source, "selftest.c": selftest(model, tracker), "README.md": readme}
+
+
+def _fields(tile: Array) -> str:
+    lines = []
+    for name in fields(tile):
+        array = tile[name][0]
+        kind = "int64_t" if array.dtype.kind == "i" else "tracker_real"
+        lines.append(f"    {kind} {name}{'' if array.size == 1 else f'[{array.size}]'};")
+    return "\n".join(lines)
+
+
+def _source(unit: Unit, entry: Function, tile: Array, memory: set[str]) -> str:
+    """Tables, functions and the public face."""
+    steps = "\n\n".join(function.text for function in unit.functions.values())
+    support = [text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)]
+    start = f"static const tracker_state START = {{\n{_initial(tile)}\n}};"
+    tables = [body % name for body, name in unit.tables.items()]
+    return "\n\n".join([*support, *tables, start, steps, _face(entry, tile, memory)]) + "\n"
+
+
+def _initial(tile: Array) -> str:
+    lines = []
+    for name in fields(tile):
+        values = ", ".join(number(one).text for one in tile[name][0].ravel().tolist())
+        lines.append(f"    {values}," if tile[name][0].size == 1 else f"    {{{values}}},")
+    return "\n".join(lines)
+
+
+def _face(entry: Function, tile: Array, memory: set[str]) -> str:
+    own = [name for name in fields(tile) if name not in memory]
+    copies = []
+    for name in own:
+        size = tile[name][0].size
+        line = f"s->{name} = START.{name};" if size == 1 else (
+            f"for (int i = 0; i < {size}; i++) s->{name}[i] = START.{name}[i];"
+        )  # fmt: skip
+        copies.append(f"    {line}")
+    return "\n".join([
+        "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
+        "tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
+        "    tracker_step step;",
+        f"    {entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
+        "    return step;", "}", "",
+        "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
+        "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
+        "void tracker_reset(tracker_state *s) {", *copies, "}",
+    ])  # fmt: skip
+
+
+def _ordinary(unit: Unit) -> Counter[str]:
+    """Operations of a sample after the start: without what only the start calls."""
+    operations = {function.name: function.operations for function in unit.functions.values()}
+    if "advance" not in operations:
+        return operations["sample"]
+    parts = (operations.get(name, Counter()) for name in ("regress", "clean", "advance", "push"))
+    return sum(parts, Counter[str]())
+
+
+def _said(ops: Counter[str]) -> str:
+    """Operations as words."""
+    kinds = {"multiply": "multiplication", "add": "addition", "divide": "division", "square root": "square root"}
+    said = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
+    return ", ".join(said[:-1]) + f" and {said[-1]}" if len(said) > 1 else "".join(said)
+
+
+def write(path: Path, texts: dict[str, Any]) -> None:
+    """Write the files into a folder, which is made where it is not there."""
+    path.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (path / name).write_text(text, encoding="utf-8")
+
+
+def record_bytes(tile: Array) -> bytes:
+    """The state as the double build's structure holds it."""
+    return b"".join(np.ascontiguousarray(tile[name][0]).tobytes() for name in fields(tile))

@@ -1,0 +1,317 @@
+"""Steps as C: the Python source of a compiled function, and of all that it calls, for the shapes of one record.
+
+The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
+Whole numbers, tables and functions that are known become constants of the text; branches that a constant closes are
+left out; a function is written once for each set of shapes that it is called with. What a step may use is what
+`driftfit.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so that the
+double build gives the same bits as the compiled steps where the C compiler neither contracts nor reorders them.
+
+The number of operations is counted along the way: loops at their longest, the dearer of two branches.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections import Counter
+from typing import Any
+
+from driftfit.embedded.expressions import Expressions
+from driftfit.embedded.unit import TYPES, Function, TranslationError, Unit
+from driftfit.embedded.values import RANK, Value, bare, begin_of, joined, lifted, renamed
+
+RESERVED = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if int long register return
+    short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
+    exp log sqrt
+    """.split()  # noqa: SIM905
+)
+"""Words that may not name a variable or function."""
+
+
+def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
+    """The C function of a Python function for these arguments, translated where it has not been yet."""
+    captured = tuple(id(cell.cell_contents) for cell in source.__closure__ or ())
+    key = (source.__code__, captured, tuple(one.key() for one in arguments))
+    if key not in unit.functions:
+        unit.names[source.__name__] += 1
+        count = unit.names[source.__name__]
+        name = f"{source.__name__.lstrip('_')}{'' if count == 1 else f'_{count}'}"
+        unit.functions[key] = Body(unit, source, arguments).function(f"{name}_" if name in RESERVED else name)
+    return unit.functions[key]
+
+
+class Body(Expressions):
+    """One function on its way into C."""
+
+    def __init__(self, unit: Unit, source: Any, arguments: list[Value]) -> None:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(source))).body[0]
+        if not isinstance(tree, ast.FunctionDef):
+            raise TranslationError(f"{source.__name__} is not a function of its own.")
+        super().__init__(unit, source)
+        self.tree = tree
+        self.parameters: list[str] = []
+        self.kinds: dict[str, str] = {}
+        self.returns: tuple[str, ...] = ()
+        stores = (node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+        self.stored = Counter(stores)
+        self.given = self._parameters(arguments)
+
+    def _parameters(self, arguments: list[Value]) -> dict[str, Value]:
+        """The arguments under their names; those that are known take no place in the signature."""
+        named = {}
+        for argument, one in zip(self.tree.args.args, arguments, strict=True):
+            name = self.safe(argument.arg)
+            if one.kind in ("record", "tile"):
+                self.parameters.append("tracker_state *s")
+                named[argument.arg] = Value("record", "s") if one.kind == "record" else one
+            elif one.kind == "array":
+                constant = "const " if one.text == "u" else ""
+                self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
+                named[argument.arg] = renamed(one, name)
+            elif one.kind == "address":
+                self.parameters.append(f"real *{name}")
+                named[argument.arg] = renamed(one, name)
+            elif one.known and one.kind != "real":
+                named[argument.arg] = one
+            elif one.kind in RANK:
+                self.parameters.append(f"{TYPES[one.kind]} {name}")
+                named[argument.arg] = Value(one.kind, name, most=one.most)
+                if argument.arg in self.stored:  # a parameter that is used up
+                    self.kinds[argument.arg] = one.kind
+            else:
+                raise TranslationError(f"{self.source.__name__}: an argument of kind {one.kind}.")
+        return named
+
+    def safe(self, name: str) -> str:
+        """A name that C allows for a variable."""
+        return f"{name}_" if name in RESERVED else name
+
+    def function(self, name: str) -> Function:
+        """Translate until the kinds of variables and of what is returned hold."""
+        while True:
+            before = dict(self.kinds), self.returns
+            self.locals, self.ops, self.temporaries = dict(self.given), [Counter()], 0
+            self.lines: list[str] = []
+            self.block(self.tree.body)
+            if before == (self.kinds, self.returns):
+                return self._written(name)
+
+    def _written(self, name: str) -> Function:
+        outs = [f"{TYPES[kind]} *out{i}" for i, kind in enumerate(self.returns)] if len(self.returns) > 1 else []
+        result = TYPES[self.returns[0]] if len(self.returns) == 1 else "void"
+        signature = f"static {result} {name}({', '.join([*self.parameters, *outs]) or 'void'})"
+        taken = {parameter.split("*")[-1].split()[-1] for parameter in self.parameters}
+        own = {self.safe(one): kind for one, kind in self.kinds.items() if self.safe(one) not in taken}
+        declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
+        unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
+        said = (ast.get_docstring(self.tree) or "").split("\n")[0]
+        comment = [f"/* {said} */"] if said else []
+        text = "\n".join([*comment, f"{signature} {{", *declared, *unread, *self.lines, "}"])
+        if ".view(" in ast.unparse(self.tree):
+            text = self._of_doubles(name, text)
+        return Function(name, self.returns, text, self.ops[0])
+
+    def _of_doubles(self, name: str, text: str) -> str:
+        """A function that works on the bits of doubles; in single precision that of the library, which is quicker."""
+        if self.source.__name__ not in ("exp", "log"):
+            raise TranslationError(f"{self.source.__qualname__}: only exp and log may work on the bits of numbers.")
+        text = re.sub(r"\breal\b", "double", re.sub(r"\bR\(", "(", text))
+        short = f"static real {name}(real x) {{ return {self.source.__name__}f(x); }}"
+        return f"#ifdef TRACKER_SINGLE\n{short}\n#else\n{text}\n#endif"
+
+    def _reads(self, name: str) -> bool:
+        """Whether a variable stands anywhere but on the left of an assignment."""
+        return any(re.search(rf"\b{name}\b", re.sub(rf"^\s*{name} = ", "", line)) for line in self.lines)
+
+    # statements
+
+    def line(self, text: str) -> None:
+        self.lines.append(f"{'    ' * len(self.ops)}{text}")
+
+    def block(self, body: list[ast.stmt]) -> bool:
+        """Translate statements; returns whether nothing after them is reached."""
+        for statement in body:
+            handler = getattr(self, f"on_{type(statement).__name__.lower()}", None)
+            if handler is None:
+                raise TranslationError(f"{self.source.__name__}: no translation of {type(statement).__name__}.")
+            if handler(statement):
+                return True
+        return False
+
+    def nested(self, body: list[ast.stmt]) -> tuple[Counter[str], bool]:
+        """A block of its own; returns its operations, and whether it always returns."""
+        self.ops.append(Counter())
+        ended = self.block(body)
+        return self.ops.pop(), ended
+
+    def on_expr(self, node: ast.Expr) -> None:
+        if isinstance(node.value, ast.Call):
+            value = self.value(node.value, statement=True)
+            if value.text:
+                self.line(f"{value.text};")
+
+    def on_pass(self, node: ast.Pass) -> None:
+        """Nothing."""
+
+    def on_break(self, node: ast.Break) -> bool:
+        self.line("break;")
+        return True
+
+    def on_continue(self, node: ast.Continue) -> bool:
+        self.line("continue;")
+        return True
+
+    def on_annassign(self, node: ast.AnnAssign) -> None:
+        if node.value is not None:
+            self.assign(node.target, self.value(node.value))
+
+    def on_assign(self, node: ast.Assign) -> None:
+        value = self.value(node.value)
+        for target in node.targets:
+            self.assign(target, value)
+
+    def assign(self, target: ast.expr, value: Value) -> None:
+        if isinstance(target, ast.Tuple):
+            items = value.constant if value.kind == "items" else [lifted(one) for one in value.constant]
+            several = len(items) > 1 and not all(one.known for one in items)
+            parts = [self.held(one) if several else one for one in items]
+            for one, part in zip(target.elts, parts, strict=True):
+                self.assign(one, part)
+        elif isinstance(target, ast.Name):
+            self.assign_name(target.id, value)
+        else:
+            self.line(f"{self.value(target).text} = {value.text};")
+            self.ops[-1]["store"] += 1
+
+    def held(self, value: Value) -> Value:
+        """A value in a variable of its own, so that a later assignment does not change it."""
+        if value.known or value.kind not in RANK:
+            return value
+        name = self.temporary(value.kind)
+        self.line(f"{name} = {value.text};")
+        return Value(value.kind, name, most=value.most)
+
+    def assign_name(self, name: str, value: Value) -> None:
+        fixed = self.stored[name] == 1 and name not in self.given
+        if value.kind not in RANK or (fixed and value.known):
+            self.locals[name] = value
+            return
+        self.kinds[name] = joined(value.kind, self.kinds.get(name, "bool"))
+        most = value.most if fixed else None
+        self.locals[name] = Value(self.kinds[name], self.safe(name), most=most)
+        self.line(f"{self.safe(name)} = {value.text};")
+
+    def on_augassign(self, node: ast.AugAssign) -> None:
+        target = self.value(node.target)
+        value = self.binary(node.op, target, self.value(node.value))
+        if isinstance(node.target, ast.Name):
+            self.assign_name(node.target.id, value)
+        else:
+            self.line(f"{target.text} = {value.text};")
+            self.ops[-1]["store"] += 1
+
+    def on_if(self, node: ast.If) -> bool:
+        test = self.value(node.test)
+        if test.known:
+            return self.block(node.body if test.constant else node.orelse)
+        self.line(f"if ({bare(test.text)}) {{")
+        one, ended = self.nested(node.body)
+        other, other_ended = Counter[str](), False
+        if node.orelse:
+            self.line("} else {")
+            other, other_ended = self.nested(node.orelse)
+        self.line("}")
+        self.ops[-1] += one if one.total() >= other.total() else other
+        return ended and other_ended
+
+    def on_for(self, node: ast.For) -> None:
+        if not (isinstance(node.iter, ast.Call) and isinstance(node.target, ast.Name)):
+            raise TranslationError(f"{self.source.__name__}: loops run over range() only.")
+        bounds = [self.value(one) for one in node.iter.args]
+        start, stop = (lifted(0), bounds[0]) if len(bounds) == 1 else (bounds[0], bounds[1])
+        step = int(bounds[2].constant) if len(bounds) == 3 else 1
+        fixed = range(start.constant, stop.constant, step) if start.known and stop.known else None
+        if fixed is not None and len(fixed) <= 1:
+            for turn in fixed:
+                self.locals[node.target.id] = lifted(turn)
+                self.block(node.body)
+            return
+        name = self.safe(node.target.id)
+        high, low = (stop, start) if step > 0 else (start, stop)
+        top = self.largest(high)
+        turns = max(0, top - (low.constant if low.known else 0))
+        turns = -(-turns // abs(step))
+        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
+        sign = "<" if step > 0 else ">"
+        move = f"{name}++" if step == 1 else f"{name}--" if step == -1 else f"{name} += {step}"
+        bound = f"(int)({stop.text})" if stop.kind == "long" else stop.text
+        self.line(f"for (int {name} = {start.text}; {name} {sign} {bound}; {move}) {{")
+        ops, _ = self.nested(node.body)
+        self.line("}")
+        self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
+
+    def largest(self, value: Value) -> int:
+        """A bound of a loop, or the largest extent of the record where it is not known."""
+        return value.most if value.most is not None else self.unit.largest
+
+    def on_while(self, node: ast.While) -> None:
+        with self.lazily():
+            test = self.value(node.test)
+        self.line(f"while ({bare(test.text)}) {{")
+        ops, _ = self.nested(node.body)
+        self.line("}")
+        turns = self.unit.largest
+        self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
+
+    def on_return(self, node: ast.Return) -> bool:
+        if node.value is None:
+            self.line("return;")
+            return True
+        value = self.value(node.value)
+        items = value.constant if value.kind == "items" else [value]
+        kinds = tuple(one.kind for one in items)
+        self.returns = tuple(map(joined, kinds, self.returns)) if self.returns else kinds
+        if len(items) == 1:
+            self.line(f"return {bare(items[0].text)};")
+        else:
+            for i, one in enumerate(items):
+                self.line(f"*out{i} = {one.text};")
+            self.line("return;")
+        return True
+
+    # calls of other steps
+
+    def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
+        """A call; its result is taken into a variable before the statement that uses it."""
+        function = translate(self.unit, source, arguments)
+        self.ops[-1] += function.operations
+        passed = [text for one in arguments if (text := _passed(one))]
+        if len(function.returns) > 1:
+            names = [self.temporary(kind) for kind in function.returns]
+            self.line(f"{function.name}({', '.join([*passed, *(f'&{name}' for name in names)])});")
+            pairs = zip(function.returns, names, strict=True)
+            return Value("items", constant=[Value(kind, name) for kind, name in pairs])
+        text = f"{function.name}({', '.join(passed)})"
+        if not function.returns:
+            return Value("nothing", text)
+        if self.lazy or statement:
+            return Value(function.returns[0], text)
+        return self.held(Value(function.returns[0], text))
+
+    def temporary(self, kind: str) -> str:
+        self.temporaries += 1
+        name = f"t{self.temporaries}"
+        self.kinds[name] = joined(kind, self.kinds.get(name, "bool"))
+        return name
+
+
+def _passed(value: Value) -> str:
+    """What stands for an argument in the call; nothing where it is known."""
+    if value.kind in ("record", "tile"):
+        return "s"
+    if value.kind in ("array", "address"):
+        return begin_of(value)
+    return "" if value.known and value.kind != "real" else value.text

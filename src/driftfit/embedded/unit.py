@@ -1,0 +1,49 @@
+"""One C source file in the making: the functions translated so far, callees first, and tables of constants."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from driftfit.embedded.values import joined, lifted
+from driftfit.kernel import Array
+
+TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "four": "four"}
+"""Kinds of numbers as C writes them."""
+
+
+class TranslationError(ValueError):
+    """A step uses what has no translation."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """One function in C: its text, the kinds of what it returns, and how many operations it takes at most."""
+
+    name: str
+    returns: tuple[str, ...]
+    text: str
+    operations: Counter[str]
+
+
+class Unit:
+    """What the functions of one file share."""
+
+    def __init__(self, record: Array) -> None:
+        self.record = record
+        self.functions: dict[Any, Function] = {}
+        self.tables: dict[str, str] = {}
+        self.names: Counter[str] = Counter()
+        self.largest = max((size for name in record.dtype.names or () for size in record[name].shape), default=1)
+        """The largest extent in the record: how often a loop runs at most of which nothing is known."""
+
+    def table(self, values: Any) -> tuple[str, str]:
+        """(name, kind) of a table of constants."""
+        flat = [lifted(one) for one in np.ravel(values).tolist()]
+        kind = joined(*(one.kind for one in flat))
+        text = ", ".join(one.text for one in flat)
+        body = f"static const {TYPES[kind]} %s[{len(flat)}] = {{{text}}};"
+        return self.tables.setdefault(body, f"table_{len(self.tables) + 1}"), kind

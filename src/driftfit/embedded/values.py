@@ -1,0 +1,143 @@
+"""What an expression of a step is to the translator: its text in C, its kind, and its value where it is a constant.
+
+real    a floating-point number: double, or float where the source is compiled for it
+int     a whole number that a loop or a constant gives; long, one of 64 bits from the record; bool, a truth value
+record  the state; tile, an array of one state
+array   numbers in memory: where they begin, their shape, and the distance between neighbours on every axis
+address where the numbers of an array begin, as a machine takes it
+four    four numbers that are computed together
+table   a tuple or an array of constants; python, a function or module; nothing, no value
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.kernel import Array
+
+RANK = {"bool": 0, "int": 1, "long": 2, "real": 3, "four": 4}
+"""Kinds of numbers, the wider the higher."""
+
+BIGGEST_SINGLE, SMALLEST_SINGLE = 1e18, 1e-30
+"""Constants beyond these become these in single precision, where their squares would overflow or vanish."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """One expression."""
+
+    kind: str
+    text: str = ""
+    constant: Any = None
+    shape: tuple[int, ...] = ()
+    strides: tuple[int, ...] = ()
+    element: str = "real"
+    scalar: bool = False
+    most: int | None = None
+    """The largest value of a whole number, where it is known: how often a loop runs at most."""
+
+    @property
+    def known(self) -> bool:
+        """Whether its value is a constant."""
+        return self.constant is not None
+
+    def key(self) -> tuple[Any, ...]:
+        """What a translated function is specialised on; constants of whole numbers are, those of floats are not."""
+        fixed = self.constant if self.kind in ("bool", "int", "table", "python") else None
+        fixed = id(fixed) if self.kind in ("table", "python") else fixed
+        return self.kind, fixed, self.shape, self.strides, self.element, self.scalar
+
+
+def number(value: Any) -> Value:
+    """A constant number."""
+    if isinstance(value, bool | np.bool_):
+        return Value("bool", "1" if value else "0", bool(value))
+    if isinstance(value, int | np.integer):
+        kind = "int" if abs(int(value)) < 2**31 else "long"
+        return Value(kind, str(int(value)) + ("" if kind == "int" else "LL"), int(value), most=int(value))
+    return Value("real", literal(float(value)), float(value))
+
+
+def literal(x: float) -> str:
+    """A floating-point constant with all its bits, and what takes its place in single precision."""
+    if np.isnan(x):
+        return "NAN"
+    if np.isinf(x):
+        return "INFINITY" if x > 0.0 else "(-INFINITY)"
+    size = abs(x)
+    single = size if size == 0.0 else min(max(size, SMALLEST_SINGLE), BIGGEST_SINGLE)
+    if single == size:
+        return f"R({x!r})"
+    return f"WIDE({x!r}, {float(np.copysign(single, x))!r}f)"
+
+
+def joined(*kinds: str) -> str:
+    """The kind of number that holds all of these."""
+    return max(kinds, key=lambda kind: RANK[kind])
+
+
+def lifted(value: Any) -> Value:
+    """A Python object that a step uses."""
+    if isinstance(value, bool | int | float | np.generic):
+        return number(value)
+    if isinstance(value, tuple | np.ndarray):
+        return Value("table", constant=value)
+    return Value("python", constant=value)
+
+
+def field(name: str, array: Array) -> Value:
+    """A field of the record, whose last axis is the only lane."""
+    element = "long" if array.dtype.kind == "i" else "real"
+    return Value("array", f"s->{name}", shape=array.shape, strides=_strides(array.shape), element=element,
+                 scalar=array.size == 1)  # fmt: skip
+
+
+def _strides(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(int(np.prod(shape[axis + 1 :])) for axis in range(len(shape)))
+
+
+def view(array: Value, index: Sequence[Value | range]) -> Value:
+    """Part of an array, or one number of it; a range keeps that part of an axis."""
+    offset: list[str] = []
+    shape, strides = [], []
+    for axis, one in enumerate(index):
+        stride = array.strides[axis]
+        if isinstance(one, range):
+            shape.append(len(one))
+            strides.append(stride)
+            if one.start:
+                offset.append(str(one.start * stride))
+        elif one.constant != 0:
+            offset.append(one.text if stride == 1 else f"{one.text} * {stride}")
+    at = " + ".join(offset)
+    if shape:
+        begin = f"({begin_of(array)} + {at})" if at else begin_of(array)
+        return Value("array", begin, shape=tuple(shape), strides=tuple(strides), element=array.element)
+    text = array.text if array.scalar else f"{array.text}[{bare(at) or '0'}]"
+    return Value(array.element, text)
+
+
+def begin_of(array: Value) -> str:
+    """The address of an array's first number."""
+    return f"&{array.text}" if array.scalar else array.text
+
+
+def renamed(value: Value, text: str) -> Value:
+    """The same value under the name that a parameter has; a scalar of the record is one number behind an address."""
+    return replace(value, text=text, scalar=False)
+
+
+def bare(text: str) -> str:
+    """An expression without the brackets around all of it."""
+    depth = 0
+    if not (text.startswith("(") and text.endswith(")")):
+        return text
+    for i, letter in enumerate(text):
+        depth += (letter == "(") - (letter == ")")
+        if depth == 0 and i < len(text) - 1:
+            return text
+    return text[1:-1]

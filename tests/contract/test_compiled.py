@@ -1,0 +1,223 @@
+"""Compiled code: two processes at once, layouts, places that cannot be written, memory that is returned, one notice."""
+
+import gc
+import os
+import pty
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from driftfit import disk_cache, kernel, linked, notice
+from driftfit.kernel import Driver
+
+SRC = Path(__file__).parents[2] / "src"
+
+FIRST = """
+import sys, time
+import numpy as np
+from driftfit import disk_cache
+from driftfit.kernel import Driver
+
+def total(y):
+    sum = 0.0
+    for t in range(y.shape[0]):
+        sum += y[t] * (t + 1)
+    return sum
+
+driver = Driver(total)
+y = np.arange(6.0)[:: int(sys.argv[1])]
+write = disk_cache.write
+def slowly(name, content):  # both processes have read what is there before either of them writes
+    open(sys.argv[2] + sys.argv[1], "w").close()
+    for _ in range(600):
+        if all(__import__("os").path.exists(sys.argv[2] + k) for k in "12"):
+            break
+        time.sleep(0.05)
+    write(name, content)
+disk_cache.write = slowly if len(sys.argv) > 3 else write
+print(driver(y))
+"""
+
+
+def start(code, *arguments, **environment):
+    given = {**os.environ, "PYTHONPATH": str(SRC), **environment}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)], env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+
+
+def ended(process):
+    said, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return said.strip(), errors
+
+
+def test_two_processes_that_compile_at_once_do_not_mix_layouts(tmp_path):
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    script = tmp_path / "layouts.py"
+    script.write_text(FIRST)
+    code = f"import runpy; runpy.run_path({str(script)!r}, run_name='layouts')"
+    at_once = [start(code, stride, tmp_path / "ready", "slowly", **cache) for stride in (1, 2)]
+    assert [ended(process)[0] for process in at_once] == ["70.0", "16.0"]
+    later = [start(code, stride, tmp_path / "ready", **cache) for stride in (1, 2)]
+    assert [ended(process)[0] for process in later] == ["70.0", "16.0"]
+
+
+NOWHERE = """
+import warnings
+import numpy as np
+from driftfit import disk_cache
+from driftfit.kernel import Driver
+
+def plus(y):
+    return y[0] + 1.0
+
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    one, other = Driver(plus)(np.zeros(1)), Driver(plus)(np.zeros(2)[::2])
+    print(one, other, len(said), "NUMBA_CACHE_DIR" in str(said[0].message))
+"""
+
+
+def test_where_nothing_can_be_written_code_is_compiled_in_memory_and_said_once(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    script = tmp_path / "nowhere.py"
+    script.write_text(NOWHERE)
+    code = f"import runpy; runpy.run_path({str(script)!r}, run_name='nowhere')"
+    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(blocked / "cache"), HOME=str(blocked)))
+    assert said == "1.0 1.0 1 True"
+
+
+def test_the_package_can_be_imported_where_no_folder_can_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "file" / "a", tmp_path / "file" / "b"))
+    (tmp_path / "file").write_text("no folder")
+    disk_cache.folder.cache_clear()
+    try:
+        assert disk_cache.folder() is None
+        assert disk_cache.read("anything") is None
+        assert disk_cache.contents() == (None, 0, 0, 0)
+        assert disk_cache.prune(0.0) == 0
+    finally:
+        disk_cache.folder.cache_clear()
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "cache",))
+    disk_cache.folder.cache_clear()
+    yield tmp_path / "cache"
+    monkeypatch.undo()
+    disk_cache.folder.cache_clear()
+
+
+def test_a_cache_that_can_only_be_read_is_read(tmp_path, monkeypatch):
+    filled = tmp_path / "image"
+    try:
+        monkeypatch.setattr(disk_cache, "folders", lambda: (filled,))
+        disk_cache.folder.cache_clear()
+        assert Driver(second)(np.ones((2, 2))) == 1.0
+        assert len(list(filled.iterdir())) == 1
+        monkeypatch.setattr(disk_cache, "folder", lambda: None)
+        monkeypatch.setattr(kernel, "compiled", None)  # the compiler is not asked
+        assert Driver(second)(np.ones((2, 2))) == 1.0
+        assert disk_cache.contents()[:2] == (filled, 1)
+    finally:
+        monkeypatch.undo()
+        disk_cache.folder.cache_clear()
+
+
+def second(y):
+    return y[0, 1]
+
+
+def test_layouts_are_told_apart(own_cache):
+    driver = Driver(second)
+    table = np.arange(12.0).reshape(3, 4)
+    assert [driver(a) for a in (table, np.asfortranarray(table), table[:, ::2], table.T)] == [1.0, 1.0, 2.0, 4.0]
+
+
+def test_memory_goes_with_the_last_reference(own_cache, monkeypatch):
+    monkeypatch.setattr(kernel, "MOST_ENTRIES", 2)
+    monkeypatch.setattr(kernel, "_entries", kernel._Entries())
+    driver = Driver(second)
+    arrays = [np.ones((3, 3), kind) for kind in ("f8", "f4", "i8")]
+    held = driver.entry(kernel._type(arrays[0]))
+    entries = [weakref.ref(held)]
+    for array in arrays:
+        driver(array)
+    entries += [weakref.ref(one) for one in set(driver._entries.values()) if one is not held]
+    assert len(set(driver._entries.values())) == 2  # the first was let go
+    assert held(arrays[0]) == 1.0  # who holds it goes on
+    del held
+    gc.collect()
+    assert [entry() is None for entry in entries] == [True, False, False]
+    assert driver(arrays[0]) == 1.0  # back from disk
+
+
+def test_what_only_the_compiler_needs_is_forgotten(own_cache):
+    @kernel.kernel
+    def twice(x):
+        return 2.0 * x
+
+    def user(y):
+        return twice(y[0])
+
+    assert Driver(user)(np.ones(1)) == 2.0
+    assert len(twice.overloads) == 1
+    assert twice(1.0) == 2.0  # from Python it has code of its own
+    kept = list(linked._recent)
+    linked.forget(0)
+    assert len(twice.overloads) == 0
+    assert Driver(user)(np.ones(1, "f4")) == 2.0
+    linked._recent.update(dict.fromkeys(kept))
+
+
+def test_files_are_whole_or_not_used_and_are_pruned(own_cache):
+    assert Driver(second)(np.ones((2, 2))) == 1.0
+    (path,) = own_cache.iterdir()
+    data = path.read_bytes()
+    path.write_bytes(data[:-1])
+    assert disk_cache.read(path.name) is None
+    assert Driver(second)(np.ones((2, 2))) == 1.0
+    assert disk_cache.read(path.name) is not None
+    (own_cache / f"second-00000000-{'0' * 40}.compiled").write_bytes(b"of another version")
+    found = disk_cache.contents()
+    assert (found.files, found.usable) == (2, 1)
+    assert disk_cache.prune(30.0) == 1
+    assert disk_cache.prune(0.0) == 1
+    assert disk_cache.contents().files == 0
+
+
+WAITS = """
+import time
+from driftfit import notice
+notice.PATIENCE = 0.05
+for _ in range(2):
+    with notice.compiling():
+        time.sleep(0.3)
+print("done")
+"""
+
+
+def test_compiling_is_said_once_and_only_where_somebody_looks():
+    process = start(WAITS)
+    assert ended(process) == ("done", "")
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "PYTHONPATH": str(SRC)}
+    command = [sys.executable, "-c", WAITS]
+    process = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=theirs, text=True, check=True)
+    os.close(theirs)
+    assert process.stdout == "done\n"
+    assert os.read(ours, 1000).decode().split("\r\n") == [notice.TEXT, ""]
+    os.close(ours)
+
+
+def test_compilers_are_called_in_three_files_only():
+    used = {path.name for path in (SRC / "driftfit").rglob("*.py") if "njit(" in path.read_text()}
+    assert used == {"kernel.py", "linked.py", "machine_code.py"}

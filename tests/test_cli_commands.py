@@ -1,0 +1,233 @@
+"""Commands beside `track`: each prints what Python gives, for the part of the file that was asked for."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from driftfit import ARX, Kalman, Live, Track, cli, track
+from driftfit.cli.reading import Part, rows_of
+
+K = Kalman(q=1e-4, r=0.01)
+KALMAN = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]
+START = np.datetime64("2024-03-01T08:00", "us")
+MINUTE = np.timedelta64(1, "m")
+
+
+def simulate(T=300, seed=3):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=T).round(4)
+    gain = np.where((np.arange(T) >= 200) & (np.arange(T) < 240), 0.2, 1.0)
+    y = np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.7 * y[t - 1] + gain[t] * u[t - 1] + 0.1 * rng.normal()
+    return y.round(4), u, gain < 1.0
+
+
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    y, u, wrong = simulate()
+    frame = pl.DataFrame(
+        {"when": START + np.arange(len(y)) * MINUTE, "n": np.arange(len(y)), "flow": y, "valve": u, "leak": wrong * 1}
+    )
+    frame.write_csv("pump.csv")
+    return frame
+
+
+def run(*arguments, stdin=None):
+    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def fails(*arguments):
+    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.strip().splitlines()
+    return line
+
+
+SIGNALS = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", *KALMAN]
+DATED = [*SIGNALS, "--time", "when", "--dt", "1min"]
+
+
+def expected(a=0, b=None, y=None):
+    whole, u, _ = simulate()
+    whole = whole if y is None else y
+    return track(ARX(1, 1, inputs=["valve"]), K, whole[a:b], u[a:b])
+
+
+def theta(*arguments, stdin=None):
+    run("track", *arguments, "--out", "out.parquet", stdin=stdin)
+    return pl.read_parquet("out.parquet")["theta_b1[valve]"].to_numpy()
+
+
+def test_parts_of_a_record(table):
+    part = expected(49, 250).theta[:, 1]
+    assert np.array_equal(theta(*SIGNALS, "--rows", "50:250"), part)
+    assert np.array_equal(theta(*SIGNALS, "--time", "n", "--from", "49", "--to", "249"), part)
+    assert np.array_equal(theta(*DATED, "--from", "2024-03-01 08:49", "--to", "2024-03-01 12:09"), part)
+    assert np.array_equal(theta(*DATED, "--to", "2024-03-01"), expected().theta[:, 1])  # a day to its end
+    assert "need --time" in fails("track", *SIGNALS, "--from", "3")
+    assert "no row is between" in fails("track", *DATED, "--from", "2025-01-01")
+    assert "not a date" in fails("track", *DATED, "--from", "soon")
+    assert "not a number" in fails("track", *SIGNALS, "--time", "n", "--from", "2024-01-01")
+    for wrong in ("5", "0:3", "7:3", "a:b"):
+        assert f"--rows {wrong}" in fails("track", *SIGNALS, "--rows", wrong)
+    assert "pump.csv has no row 1000" in fails("track", *SIGNALS, "--rows", "1000:")
+
+
+def test_a_time_of_a_zone_is_typed_in_that_zone(table):
+    table.with_columns(pl.col("when").dt.replace_time_zone("Europe/Vienna")).write_parquet("zoned.parquet")
+    arguments = ["zoned.parquet", *DATED[1:], "--from", "2024-03-01 08:49", "--to", "2024-03-01 12:09"]
+    assert np.array_equal(theta(*arguments), expected(49, 250).theta[:, 1])
+    table = pl.read_parquet("out.parquet")
+    assert str(table["when"][0]) == "2024-03-01 08:49:00+01:00"
+
+
+def test_the_other_ways_to_write_a_table(table):
+    text = table.with_columns(pl.col(pl.Float64).cast(pl.String).str.replace(".", ",", literal=True))
+    arguments = ["--decimal", ",", *SIGNALS[1:]]
+    for sign, name in ((";", ";"), ("\t", "tab"), ("|", "|")):
+        text.write_csv("comma.csv", separator=sign)
+        more = [] if sign == ";" else ["--separator", name]
+        assert np.array_equal(theta("comma.csv", *arguments, *more), expected().theta[:, 1])
+    piped = io.BytesIO()
+    table.write_csv(piped)
+    assert np.array_equal(theta("-", *SIGNALS[1:], stdin=piped.getvalue()), expected().theta[:, 1])
+    assert "one sign" in fails("track", *SIGNALS, "--separator", "::")
+    assert "point or a comma" in fails("track", *SIGNALS, "--decimal", ":")
+
+
+def test_numbers_with_commas_and_groups(tmp_path):
+    (tmp_path / "n.csv").write_text("a;t\n1.234,5;2024-01-31\n-0,25;2024-02-01\n 7 ;2024-02-02\n1,5e3;2024-02-03\n;x\n")
+    read = rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=",", rows=(1, 4)))
+    assert read.numbers["a"].tolist() == [1234.5, -0.25, 7.0, 1500.0]
+    assert str(read.time[0]) == "2024-01-31T00:00:00.000000"
+    with pytest.raises(ValueError, match="row 5 of column 't' holds 'x'"):
+        rows_of([str(tmp_path / "n.csv")], ["a"], "t", [], Part(decimal=","))
+
+
+def test_valid_ranges_and_stretches_left_out(table):
+    y, _, _ = simulate()
+    y[(y < -2.0) | (y > 2.0)] = np.nan
+    assert np.array_equal(theta(*SIGNALS, "--limits", "flow=-2:2"), expected(y=y).theta[:, 1])
+    whole, u, _ = simulate()
+    whole[100:121], u[100:121] = np.nan, np.nan
+    left = track(ARX(1, 1, inputs=["valve"]), K, whole, u).theta[:, 1]
+    assert np.array_equal(theta(*SIGNALS, "--exclude", "101..121"), left)
+    assert np.array_equal(theta(*DATED, "--exclude", "2024-03-01 09:40..2024-03-01 10:00"), left)
+    assert "column=low:high" in fails("track", *SIGNALS, "--limits", "flow=2")
+    assert "did you mean flow" in fails("track", *SIGNALS, "--limits", "flo=1:2")
+    assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
+
+
+def test_a_saved_run_or_stream_goes_on(table):
+    run("track", *SIGNALS, "--rows", ":200", "--out", "first.npz")
+    y, u, _ = simulate()
+    stream = Live(ARX(1, 1, inputs=["valve"]), K)
+    for t in range(200):
+        stream.update(y[t], u[t])
+    stream.save("live.npz")
+    rest = ["pump.csv", "--y", "flow", "--u", "valve", "--rows", "201:", "--start"]
+    for state in ("first.npz", "live.npz"):
+        assert np.array_equal(theta(*rest, state), expected().theta[200:, 1])
+    assert "those of the file" in fails("track", *rest, "first.npz", "--model", "arx:1,1")
+    (table.head(3)).write_csv("no.npz")
+    assert "no.npz is not a driftfit file" in fails("track", *rest, "no.npz")
+
+
+def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
+    said = run("verdict", *DATED)
+    of_run = expected().verdict()
+    assert f"p = {of_run.p:.2g}" in " ".join(said.split()) or "p < 0.0001" in said
+    monkeypatch.setattr(cli.program.out, "width", 80)
+    said = run("verdict", *DATED)
+    assert "…" not in said
+    assert "< 0.0001" in said
+    assert "2024-03-01" in said.split("Parameters")[1]
+
+
+def test_detect_scores_labels_and_writes_alarms(table):
+    options = ["--reference", "150", "--every", "1000", "--labels", "leak"]
+    said = run("detect", *DATED, *options, "--out", "alarms.csv", "--plot", "a.png", "--report", "page.html")
+    alarms = expected().detect("band", reference=150, every=1000)
+    score = alarms.score(simulate()[2])
+    assert score.found == 1
+    assert f"Labels: 1 of 1 found, {score.delay:g} samples after" in said
+    written = pl.read_csv("alarms.csv")
+    assert len(written) == len(alarms.onsets)
+    assert written["from"][0] == str(START + alarms.onsets[0] * MINUTE).replace("T", " ")[:19]
+    page = Path("page.html").read_text()
+    assert "Faults and alarms" in page
+    assert "2024-03-01 11:20:00" in page  # the label begins
+    assert "1 of 1 labelled stretches found" in page
+    said = run("detect", *DATED, "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
+    assert "b1[valve]" in said
+    assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
+    assert "name=low:high" in fails("detect", *DATED, "--reference", "a1=x:y")
+
+
+def test_tune_smooth_and_forecast(table):
+    kalman = ["pump.csv", "--y", "flow", "--u", "valve", "--model", "arx:1,1", "--tracker", "kalman"]
+    said = run("tune", *kalman, "-p", "r=0.01")
+    assert "--tracker kalman -p q=" in said
+    run("smooth", *SIGNALS, "--out", "path.csv")
+    path = pl.read_csv("path.csv")
+    assert np.allclose(path["theta_b1[valve]"], expected().smooth().theta[:, 1], rtol=1e-12)
+    table.tail(4).select("valve").write_csv("plan.csv")
+    said = run("forecast", *SIGNALS, "--future", "plan.csv", "--out", "ahead.csv")
+    made = expected().forecast(4, table["valve"].to_numpy()[-4:])
+    assert np.allclose(pl.read_csv("ahead.csv")["flow"], made.y_hat)
+    assert f"{made.y_hat[0]:.6g}" in said
+    assert "--future FILE" in fails("forecast", *SIGNALS)
+
+
+def test_select_compares_models(table):
+    said = run("select", "pump.csv", "--y", "flow", "--u", "valve", *KALMAN, "--model", "arx:1,1", "--model", "arx:1,0")
+    assert said.index("ARX(na=1, inputs=('valve',))") < said.index("nb=0")
+
+
+def test_warm_and_cache(table):
+    said = run("warm", "--model", "arx:1,1", *KALMAN)
+    assert "Folder" in said
+    said = run("cache")
+    assert "of this version and processor" in said
+    assert "at least 0" in fails("cache", "--prune", "--days", "-1")
+
+
+def test_picture_of_the_system(table):
+    run("track", *SIGNALS, "--system", "system.png", "--out", "run.npz")
+    assert Track.load("run.npz").names == ("a1", "b1[valve]")
+    assert "one series" in fails("track", *SIGNALS, "--by", "leak", "--system", "s.png")
+
+
+def test_alarms_of_a_fleet(table):
+    two = [table.with_columns(pump=pl.lit("a")), table.with_columns(pump=pl.lit("b"), flow=pl.col("flow").shift(0))]
+    pl.concat(two).write_csv("two.csv")
+    options = ["--by", "pump", "--reference", "150", "--every", "1000", "--out", "alarms.csv", "--report", "page.html"]
+    assert "2 series" in run("detect", "two.csv", *DATED[1:], *options)
+    written = pl.read_csv("alarms.csv")
+    assert set(written["key"]) == {"a", "b"}
+    page = Path("page.html").read_text()
+    assert "Faults and alarms" in page
+    assert str(written["from"][0]) in page
+
+
+def test_page_of_a_fleet_marks_labels(table):
+    y, u, wrong = simulate()
+    fleet = track(ARX(1, 1), K, np.stack([y, y]), np.stack([u, u])[..., None], by="row")
+    fleet.report("page.html", labels={0: wrong})
+    page = Path("page.html").read_text()
+    assert "Stretches labelled as wrong" in page
+    assert ">200<" in page
+    with pytest.raises(ValueError, match="which has no result"):
+        fleet.report("page.html", labels={7: wrong})
+    with pytest.raises(ValueError, match="300 samples"):
+        fleet.report("page.html", labels={0: wrong[1:]})

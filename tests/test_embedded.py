@@ -1,0 +1,253 @@
+"""Exported trackers are C99 without warnings, and give the bits of `Live` on this processor and on a controller's."""
+
+import ctypes
+import re
+import runpy
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from contract_table import forms, ready
+
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, Kalman, Live, Regression, trackers
+from driftfit.drivers import TrackerSteps
+from driftfit.embedded import export_c, from_struct, to_struct
+from driftfit.embedded.selftest import record
+from driftfit.embedded.unit import TranslationError
+from driftfit.kernel import kernel
+from driftfit.trackers.base import Tracker
+
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off"]
+ROOT = Path(__file__).parent.parent
+CORTEX = ROOT / "tests" / "cortex"
+M4F = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="there is no gcc to compile the source")
+needs_controller = pytest.mark.skipif(
+    shutil.which("arm-none-eabi-gcc") is None or shutil.which("qemu-system-arm") is None,
+    reason="there is no arm-none-eabi-gcc or no qemu-system-arm",
+)
+
+EVERY = [
+    pytest.param(kind, form, id=f"{kind.__name__}{form or ''}")
+    for kind in trackers.found().values()
+    if not kind.weighs
+    for form in forms(kind)
+]
+OTHERS = {
+    "full q": (Regression(2), Kalman(q=[[1e-3, 1e-4], [1e-4, 1e-3]], r=0.1)),
+    "directional": (ARX(2, 2), RLS(0.98, kind="directional")),
+    "second differences": (ARX(1, 1), FLS(100.0, differences=2)),
+    "two inputs": (ARX(2, [2, 1], nk=[1, 0], intercept=True), Kalman(q=1e-4, r=0.1)),
+    "no input": (ARX(2, 0), Kalman(q=1e-4, r=0.1)),
+}
+
+
+class Step(ctypes.Structure):
+    """tracker_step."""
+
+    _fields_ = [*((name, ctypes.c_double) for name in ("y_hat", "e", "variance")), ("ok", ctypes.c_int)]
+
+
+class Exported:
+    """The tracker in a shared library, with a state of its own."""
+
+    def __init__(self, folder, live):
+        target = folder / "tracker.so"
+        command = ["gcc", *STRICT, "-O2", "-shared", "-fPIC", "-o", str(target), str(folder / "tracker.c"), "-lm"]
+        subprocess.run(command, check=True)
+        self.library = ctypes.CDLL(str(target))
+        for name in ("tracker_update", "tracker_predict"):
+            getattr(self.library, name).restype = Step
+        self.size = len(to_struct(live))
+        self.buffer, self.scratch = ctypes.create_string_buffer(self.size), ctypes.create_string_buffer(self.size)
+        self.library.tracker_init(self.buffer)
+
+    def update(self, y, u):
+        u = np.ascontiguousarray(u, dtype=float)
+        return tuple_of(self.library.tracker_update(self.buffer, ctypes.c_double(y), ctypes.c_void_p(u.ctypes.data)))
+
+    def predict(self, u):
+        u = np.ascontiguousarray(u, dtype=float)
+        return tuple_of(self.library.tracker_predict(self.buffer, self.scratch, ctypes.c_void_p(u.ctypes.data)))
+
+    @property
+    def state(self):
+        return self.buffer.raw
+
+
+def tuple_of(step):
+    return [step.y_hat, step.e, step.variance, float(step.ok)]
+
+
+def bits(values):
+    return np.asarray(values, dtype=float).view(np.int64).tolist()
+
+
+def same_numbers(one, other):
+    """Bit for bit, but for the sign and payload of NaN, which processors choose."""
+    one, other = (np.frombuffer(state, dtype=np.int64) for state in (one, other))
+    nan = np.isnan(one.view(float)) & np.isnan(other.view(float))
+    return bool(np.all((one == other) | nan))
+
+
+def agree(folder, model, tracker, T):
+    """Run both over a record with holes, an outage and inputs that fall silent, and compare every step and state."""
+    export_c(model, tracker, folder)
+    live = Live(model, tracker)
+    ours = Exported(folder, live)
+    assert same_numbers(ours.state, to_struct(live))
+    y, u = record(live.model, T, seed=3)
+    u[2 * T // 5 : 3 * T // 5] = 0.0
+    steps, found = np.empty((T, 4)), np.empty((T, 4))
+    for t in range(T):
+        steps[t] = live.update(float(y[t]), u[t, : live.model.m])
+        found[t] = ours.update(float(y[t]), u[t])
+        assert t % 97 or same_numbers(ours.state, to_struct(live)), t
+    np.testing.assert_array_equal(found, steps)
+    assert 0.5 * T < steps[:, 3].sum() < T
+    return live, ours
+
+
+@needs_gcc
+@pytest.mark.parametrize(("kind", "form"), EVERY)
+def test_every_tracker_gives_the_bits_of_a_stream(tmp_path, kind, form):
+    tracker = ready(kind, **form)
+    model = tracker.own_model(2, 2, 1) or ARX(2, 2)
+    agree(tmp_path, model, tracker, 10_000)
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_models_and_settings_do_too(tmp_path, name):
+    agree(tmp_path, *OTHERS[name], 1_000)
+
+
+@needs_gcc
+def test_states_travel_both_ways(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1), 500)
+    there = from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), ours.state)
+    assert bits(ours.predict([0.3])[::2]) == bits(live.predict(0.3))
+    assert same_numbers(ours.state, to_struct(live))  # a prediction changes nothing
+    assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
+    ctypes.memmove(ours.buffer, to_struct(live), ours.size)
+    assert bits(ours.update(0.4, [0.5])) == bits(live.update(0.4, 0.5))
+    with pytest.raises(ValueError, match="a state of 688 bytes; got 3"):
+        from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), b"abc")
+
+
+@needs_gcc
+def test_reset_forgets_theta_and_keeps_the_lags(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1), 500)
+    lags, fresh = live.lane()["y_lag"].copy(), Live(ARX(2, 2), Kalman(q=1e-3, r=0.1))
+    ours.library.tracker_reset(ours.buffer)
+    after = from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), ours.state)
+    np.testing.assert_array_equal(after.lane()["y_lag"], lags)
+    np.testing.assert_array_equal(after.theta, fresh.theta)
+    np.testing.assert_array_equal(after.std, fresh.std)
+
+
+@needs_gcc
+@pytest.mark.parametrize("flags", [["-O0"], ["-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]])
+@pytest.mark.parametrize("name", ["adaptive", "blocks"])
+def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, flags):
+    selftest(tmp_path, name, ["gcc", *flags], [])
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["adaptive", "blocks"])
+def test_single_precision_is_close(tmp_path, name):
+    said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
+    assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
+
+
+@needs_controller
+@pytest.mark.parametrize("flags", [[], ["-DTRACKER_SINGLE"]])
+@pytest.mark.parametrize("name", ["adaptive", "blocks"])
+def test_the_self_test_passes_on_an_emulated_controller(tmp_path, name, flags):
+    start = ["-nostartfiles", "--specs=rdimon.specs", "-T", str(CORTEX / "memory.ld"), str(CORTEX / "start.c")]
+    run = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "-kernel"]
+    selftest(tmp_path, name, ["arm-none-eabi-gcc", "-O2", *M4F, *flags, *start, "-Wl,--no-warn-rwx-segments"], run)
+
+
+def selftest(folder, name, compiler, run):
+    """Compile the self-test and run it; it must pass and print one line."""
+    tracker = AdaptiveKalman() if name == "adaptive" else ready(ExtendedKalman)
+    export_c(tracker.own_model(2, 2, 1) or ARX(2, 2), tracker, folder)
+    target = str(folder / "selftest")
+    sources = [str(folder / "tracker.c"), str(folder / "selftest.c")]
+    subprocess.run([*compiler, *STRICT, "-o", target, *sources, "-lm"], check=True)
+    done = subprocess.run([*run, target], capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.startswith("passed: 0 of ")
+    return done.stdout
+
+
+@needs_gcc
+def test_a_wrong_bit_fails_the_self_test(tmp_path):
+    export_c(ARX(2, 2), AdaptiveKalman(), tmp_path)
+    source = tmp_path / "tracker.c"
+    source.write_text(source.read_text().replace("R(0.99)", "R(0.99000000000001)"))
+    command = ["gcc", *STRICT, "-o", str(tmp_path / "st"), str(source), str(tmp_path / "selftest.c"), "-lm"]
+    subprocess.run(command, check=True)
+    assert subprocess.run([str(tmp_path / "st")], capture_output=True, check=False).returncode == 1
+
+
+def test_what_cannot_be_exported_is_said(tmp_path):
+    with pytest.raises(ValueError, match="Bank has no C form"):
+        export_c(ARX(1, 1), Bank(), tmp_path)
+    with pytest.raises(ValueError, match="one output at a time"):
+        export_c(ARX(1, 1, ny=2), Kalman(q=1e-3, r=0.1), tmp_path)
+    with pytest.raises(ValueError, match="q"):
+        export_c(ARX(1, 1), Kalman(), tmp_path)
+    with pytest.raises(TranslationError, match=r"correct: no translation of `np.tanh"):
+        export_c(Regression(1), Odd(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@kernel
+def correct(s, l):
+    s.y_hat[l] = s.phi[0, l] * s.theta[0, l]
+    s.e[l] = s.y[l] - s.y_hat[l]
+    s.s[l] = 1.0
+    s.theta[0, l] += s.ok[l] * 0.1 * np.tanh(s.e[l]) * s.phi[0, l]
+
+
+@kernel
+def predict(s, l):
+    s.var[0, l] = 1.0
+
+
+@dataclass(frozen=True)
+class Odd(Tracker):
+    """A tracker of one's own that calls what C has no bits for."""
+
+    def state(self, n):
+        return {"theta": np.zeros(n)}
+
+    @property
+    def steps(self):
+        return TrackerSteps(predict, correct, predict)
+
+
+@needs_gcc
+def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["controller.py"])
+    runpy.run_path(str(ROOT / "examples" / "controller.py"), run_name="__main__")
+    page = (ROOT / "docs" / "embedded.md").read_text()
+    said = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
+    assert capsys.readouterr().out.split() == said.split()
+
+
+def test_readme_and_header_say_what_there_is(tmp_path):
+    export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
+    readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
+    assert "688 bytes in double precision" in readme
+    counted = re.search(r"at most\s+(\d+) multiplications, (\d+) additions and 1 division\.", readme)
+    assert 60 <= int(counted[1]) <= 100  # 2.5 n^2 + 8 n or so
+    assert 60 <= int(counted[2]) <= 100
+    assert "#define TRACKER_PARAMETERS 4" in header
+    assert "malloc" not in (tmp_path / "tracker.c").read_text()

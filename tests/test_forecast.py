@@ -1,0 +1,106 @@
+"""Forecasts beyond the end of a record, against Monte Carlo of the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, RLS, Kalman, Regression, track
+
+H = 15
+
+
+def record(T: int, seed: int, noise: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=T), np.zeros(T)
+    for t in range(2, T):
+        y[t] = 1.2 * y[t - 1] - 0.5 * y[t - 2] + u[t - 1] + noise * rng.normal()
+    return y, u
+
+
+def drawn(run, u: np.ndarray, q: float, r: float, D: int = 20000) -> np.ndarray:
+    """Outputs (D, h) of systems from the posterior, walking and with noise, each fed back among its lags."""
+    rng = np.random.default_rng(5)
+    theta = rng.multivariate_normal(run.theta[-1], run.cov(-1), D)
+    lags, inputs = np.tile(run.y[-2:][::-1], (D, 1)), np.concatenate([run.u[-1:, 0], u])
+    out = np.empty((D, len(u)))
+    for k in range(len(u)):
+        theta = theta + np.sqrt(q) * rng.normal(size=theta.shape)
+        out[:, k] = lags[:, 0] * theta[:, 0] + lags[:, 1] * theta[:, 1] + inputs[k] * theta[:, 2]
+        out[:, k] += np.sqrt(r) * rng.normal(size=D)
+        lags = np.column_stack([out[:, k], lags[:, 0]])
+    return out
+
+
+@pytest.mark.parametrize(("T", "width", "cover"), [(15, 0.14, 0.86), (30, 0.1, 0.91), (100, 0.06, 0.91)])
+@pytest.mark.parametrize("q", [0.0, 1e-4])
+def test_bands_of_arx_are_those_of_a_monte_carlo(T, width, cover, q):
+    """Before, what the parameters' errors do through the lags was left out: at T = 15 bands were 0.6 of these."""
+    covered = []
+    for seed in range(6):
+        y, u = record(T + H, seed)
+        run = track(ARX(2, 1), Kalman(q=q, r=0.09), y[:T], u[:T])
+        found = run.forecast(H, u[T : T + H])
+        outputs = drawn(run, u[T : T + H], q, 0.09)
+        low, high = np.quantile(outputs, [0.16, 0.84], axis=0)
+        assert np.all(np.abs(2.0 * found.y_std / (high - low) / 0.9945 - 1.0) < width), seed
+        covered.append((np.abs(outputs - found.y_hat) < 1.96 * found.y_std).mean(axis=0))
+    assert np.min(covered) > cover
+    assert 0.935 < np.mean(covered) < 0.96
+
+
+def test_a_known_system_has_the_bands_of_its_noise():
+    y, u = record(40, 0)
+    theta0 = [1.2, -0.5, 1.0]
+    run = track(ARX(2, 1), Kalman(q=0.0, r=0.09, theta0=theta0, p0=0.0), y, u)
+    psi = run.model.noise_response(np.array(theta0), H)
+    assert np.allclose(run.forecast(H, np.zeros(H)).y_std ** 2, 0.09 * np.cumsum(psi**2), rtol=1e-12)
+
+
+def test_bands_of_a_tracker_without_a_noise_variance_grow_from_its_own():
+    y, u = record(60, 1)
+    run = track(ARX(2, 1), RLS(0.98), y, u)
+    found = run.forecast(H, np.zeros(H))
+    simple = np.sqrt(found.y_std[0] ** 2 * np.cumsum(run.model.noise_response(run.theta[-1], H) ** 2))
+    assert np.all(np.isfinite(found.y_std))
+    assert np.all(found.y_std > 0.9 * simple)
+
+
+def test_a_regression_has_no_lags_to_carry_errors():
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(50, 2))
+    run = track(Regression(2), Kalman(q=1e-3, r=0.1), u @ [1.0, 2.0], u)
+    found = run.forecast(4, np.ones((4, 2)))
+    P = [run.cov(-1) + (k + 1) * 1e-3 * np.eye(2) for k in range(4)]
+    assert np.allclose(found.y_std**2, [p.sum() + 0.1 for p in P])
+
+
+def test_what_is_not_known_is_not_forecast():
+    y, u = record(40, 0)
+    run = track(ARX(2, 1), Kalman(q=0.0, r=0.09), y[:4], u[:4])  # two samples for three parameters
+    found = run.forecast(3, np.zeros(3))
+    assert np.all(np.isinf(found.y_std[1:]))
+    later = np.zeros(5)
+    later[2] = np.nan
+    found = track(ARX(2, 1), Kalman(q=0.0, r=0.09), y, u).forecast(5, later)
+    assert np.isfinite(found.y_std[:3]).all()
+    assert np.isnan(found.y_std[3:]).all()
+
+
+def test_outputs_that_are_lags_of_each_other():
+    """Two outputs without a coupling, in one run, have the bands of a Monte Carlo; coupled ones too."""
+    rng = np.random.default_rng(2)
+    T, D = 60, 20000
+    A = np.array([[0.7, 0.2], [-0.1, 0.6]])
+    y = np.zeros((T, 2))
+    for t in range(1, T):
+        y[t] = A @ y[t - 1] + 0.3 * rng.normal(size=2)
+    run = track(ARX(1, 0, ny=2), Kalman(q=1e-4, r=0.09), y)
+    found = run.forecast(H)
+    theta = np.stack([rng.multivariate_normal(run.theta[-1, o], run.cov(-1)[o], D) for o in range(2)], axis=1)
+    now = np.tile(y[-1], (D, 1))
+    for k in range(H):
+        theta = theta + 1e-2 * rng.normal(size=theta.shape)
+        now = np.einsum("doi,di->do", theta, now) + 0.3 * rng.normal(size=(D, 2))
+        low, high = np.quantile(now, [0.16, 0.84], axis=0)
+        assert np.all(np.abs(2.0 * found.y_std[k] / (high - low) / 0.9945 - 1.0) < 0.06)

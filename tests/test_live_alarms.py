@@ -1,0 +1,233 @@
+"""Alarms, forecasts and systems on a stream: what `Track` says of the record, bit for bit, also across a file."""
+
+import pickle
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from support import Doubtful, arx_record, damaged, same
+from test_bank import N, R, changes
+from test_bank import record as jumping
+
+from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
+from driftfit.judges.alarm_rule import AlarmRule
+from driftfit.judges.calibrate import null_records
+from driftfit.live_alarm import LiveAlarm
+
+K = Kalman(q=1e-4, r=0.01)
+T, CUT, FAULT = 900, 500, 700
+
+
+@pytest.fixture(scope="module")
+def record():
+    """Outages and bad values all along; the first gain grows from sample 700 on."""
+    path = np.tile([1.2, -0.5, 1.0, 0.4], (T, 1))
+    path[FAULT:, 2] += 0.5
+    return damaged(*arx_record(T, 5, theta=path), share=0.02)
+
+
+@pytest.mark.parametrize(
+    ("tracker", "kind", "settings"),
+    [
+        (K, "band", {"reference": CUT}),
+        (K, "band", {"reference": {"b1": (0.9, 1.1)}, "hold": 7}),
+        (K, "innovation", {"reference": CUT, "window": 20}),
+        (K, "innovation", {"window": 10, "hold": 5}),
+        (K, "innovation", {"window": 10, "calibrate": True}),
+        (Doubtful(q=1e-4, r=0.01), "probability", {"hold": 3}),
+    ],
+    ids=["band", "band given", "innovation", "innovation, no reference", "calibrated", "probability"],
+)
+def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
+    y, u = record
+    before = track(ARX(2, 2), tracker, y[:CUT], u[:CUT])
+    rule = before.detect(kind, every=50.0, **settings).rule
+    whole = track(ARX(2, 2), tracker, y, u)
+    said = whole.detect(rule, start=CUT)
+    if "calibrate" not in settings and kind != "probability" and settings.get("reference") == CUT:
+        own = whole.detect(kind, every=50.0, **settings)
+        assert own.rule == rule  # limits and reference are those of the first samples, whatever comes later
+        assert same(own.active, said.active)
+    assert FAULT - CUT > 100 > len(said.onsets) > 0
+    live = Live(ARX(2, 2), tracker, warm_start=before)
+    alarm = live.detect(rule)
+    begun, told = [], []
+    for t in range(CUT, T):
+        live.update(y[t], u[t], time=float(t))
+        if t % 60 == 0:
+            live = pickle.loads(pickle.dumps(live)) if t % 120 else Live.from_bytes(live.to_bytes())
+            (alarm,) = live.alarms
+        assert alarm.active == said.active[t], t
+        if alarm.active:
+            assert same(alarm.statistic, said.statistic[t]), t
+            assert alarm.cause == said.cause(t)
+        begun += [t] if alarm.begun else []
+        told += alarm.onsets()
+    assert begun == said.onsets.tolist()
+    assert [onset.sample + CUT for onset in told] == begun
+    assert [onset.time for onset in told] == [float(t) for t in begun]
+    assert all(onset.statistic > onset.limit == rule.limits[rule.names.index(onset.cause)] for onset in told)
+    assert alarm.onsets() == []
+
+
+def test_the_probability_of_a_bank():
+    y, u = jumping(150, 5, (40, 90))
+    bank = Bank(changes(), [Sensor.nominal(R)], reduce=Beam(9), p0=2.0)
+    rule = AlarmRule("probability", 100.0, ("probability",), (0.5,))
+    said = track(Regression(N), bank, y, u).detect(rule, start=5)
+    live = Live(Regression(N), bank)
+    alarm = live.detect(rule, wait=5)
+    for t in range(150):
+        live.update(y[t], u[t])
+        assert alarm.active == said.active[t]
+        assert t < 5 or same(alarm.statistic, said.statistic[t])
+    assert [onset.sample for onset in alarm.onsets()] == said.onsets.tolist()
+    assert all(min(abs(t - jump) for t in said.onsets) < 4 for jump in (40, 90))
+
+
+def test_the_start_of_an_estimate_is_no_alarm(record):
+    y, u = record
+    rule = track(ARX(2, 2), K, y[:CUT], u[:CUT]).detect("innovation", every=20.0, window=4).rule
+    said = track(ARX(2, 2), K, y, u).detect(rule)
+    assert said.start == 50
+    live = Live(ARX(2, 2), K)
+    alarm = live.detect(rule)
+    active = []
+    for t in range(T):
+        live.update(y[t], u[t])
+        active.append(alarm.active)
+    assert same(active, said.active)
+    assert 50 < np.flatnonzero(active)[0] < 300
+    assert "on after" in repr(alarm) or "off after" in repr(alarm)
+
+
+def test_alarms_of_several_outputs(record):
+    y, u = record
+    both = np.column_stack([y, 2.0 * y[::-1]])
+    before = track(Regression(1, ny=("level", "flow")), K, both[:CUT], u[:CUT])
+    rules = {name: before[name].detect("innovation", every=30.0, window=8).rule for name in ("level", "flow")}
+    whole = track(Regression(1, ny=("level", "flow")), K, both, u)
+    live = Live(Regression(1, ny=("level", "flow")), K, warm_start=before)
+    live.detect(rules)
+    said = {name: whole[name].detect(rule, start=CUT) for name, rule in rules.items()}
+    for t in range(CUT, CUT + 120):
+        live.update(both[t], u[t])
+        if t == CUT + 60:
+            live = type(live).from_bytes(live.to_bytes())
+        assert {name: alarm.active for name, alarm in live.alarms.items()} == {n: s.active[t] for n, s in said.items()}
+    assert all(len(one.onsets) for one in said.values())
+    ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
+    assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
+    with pytest.raises(ValueError, match=r"theta of their own; got \['speed'\]"):
+        live.detect({"speed": rules["flow"]})
+
+
+def test_forecast_and_system_are_those_of_the_record(record):
+    y, u = record
+    run, live = track(ARX(2, 2), K, y, u), Live(ARX(2, 2), K)
+    for t in range(T):
+        live.update(y[t], u[t])
+    live.hold()  # an order to the next samples, not to the forecast
+    assert all(same(a, b) for a, b in zip(live.forecast(5, u[:5]), run.forecast(5, u[:5]), strict=True))
+    assert np.isnan(live.forecast(2).y_hat[1])
+    with pytest.raises(ValueError, match="2 columns"):
+        live.forecast(3, np.ones((3, 2)))
+    system = live.system
+    assert same(system.poles(), run.poles(-1)[0])
+    for name in ("largest_pole", "dc_gain"):
+        for now, then in zip(getattr(system, name)(), getattr(run, name)(-1), strict=True):
+            assert same(now, then[0]), name
+            assert np.isfinite(now).all()
+    for name in ("step_response", "impulse_response"):
+        assert all(same(a, b[0]) for a, b in zip(getattr(system, name)(6), getattr(run, name)(6), strict=True))
+    now, then = system.frequency_response([0.1, 1.0]), run.frequency_response([0.1, 1.0])
+    assert all(same(a, b if a.shape == b.shape else b[0]) for a, b in zip(now, then, strict=True))
+    assert system.long_run() == run.long_run()
+    assert same(system.to_scipy().den, run.to_scipy().den)
+    with pytest.raises(ValueError, match="belong to runs of ARX"):
+        _ = Live(Regression(1), K).system
+
+
+def test_references_in_times():
+    y, u = arx_record(400, 3)
+    start = datetime(2024, 3, 1)
+    hours = [start + timedelta(hours=t) for t in range(400)]
+    plain = track(ARX(2, 2), K, y, u)
+    dated = track(ARX(2, 2), K, y, u, time=hours, dt=timedelta(hours=1))
+    expected = plain.detect("band", reference=(96, 240))
+    assert expected.start == 240
+    assert expected.rule.low == tuple(plain.theta[96:240].min(axis=0).tolist())
+    assert plain.detect("band", reference=(0, 240)).rule == plain.detect("band", reference=240).rule
+    for given in (
+        ("2024-03-05", "2024-03-11"),
+        (hours[96], hours[240]),
+        (np.datetime64("2024-03-05"), np.datetime64("2024-03-11T00:00")),
+        (hours[96].date(), hours[240].replace(tzinfo=UTC)),
+        (96, 240),
+        [hours[95] + timedelta(minutes=1), hours[239] + timedelta(minutes=1)],
+    ):
+        assert dated.detect("band", reference=given).rule == expected.rule, given
+        assert dated.detect("innovation", reference=given, window=10).start == 240
+    seconds = track(ARX(2, 2), K, y, u, time=10.0 * np.arange(400), dt=10.0)
+    assert seconds.detect("band", reference=(960.0, 2400.0)).rule == expected.rule
+    assert plain.detect("innovation", reference=400).start == 400  # a rule may be made of the whole record
+    for wrong, match in (
+        (("2024-03-05", "2024-03-05 04:00"), "too little"),
+        (("2025-03-05", "2025-04-05"), "too little"),
+        (("in March", "2024-03-05"), "'in March' is no date"),
+        ((1, 2, 3), "from when to when"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            dated.detect("band", reference=wrong)
+    with pytest.raises(ValueError, match="has no dates"):
+        plain.detect("band", reference=("2024-03-05", "2024-03-11"))
+
+
+def test_a_reference_in_local_time():
+    import polars as pl
+
+    y, u = arx_record(300, 3)
+    local = pl.datetime_range(
+        datetime(2024, 1, 1), datetime(2024, 1, 13, 11), "1h", time_zone="Europe/Berlin", eager=True
+    )
+    data = pl.DataFrame({"t": local, "y": y, "u": u})
+    run = track(ARX(2, 2), K, "y", "u", data=data, time="t", dt=timedelta(hours=1))
+    said = run.detect("band", reference=("2024-01-04", "2024-01-08"))
+    assert said.start == 7 * 24
+    assert said.rule.low == tuple(run.theta[3 * 24 : 7 * 24].min(axis=0).tolist())
+
+
+def test_a_tracker_that_adapts_is_warned_of():
+    y, u = arx_record(200, 3)
+    run = track(ARX(2, 2), AdaptiveKalman(), y, u)
+    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault away.*\"band\".*tune"):
+        run.detect("innovation")
+    run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
+
+
+def test_rules_are_plain_settings_and_fit_what_they_watch():
+    y, u = arx_record(300, 3)
+    run = track(ARX(2, 2), K, y, u)
+    rule = run.detect("innovation", reference=200, window=10).rule
+    assert AlarmRule.from_settings(rule.settings()) == rule
+    assert hash(AlarmRule.from_settings(rule.settings())) == hash(rule)
+    assert "one false alarm in 10000 samples, limits power" in repr(rule)
+    live = Live(ARX(2, 2), K)
+    for wrong in (run.detect("innovation"), "band", None):
+        with pytest.raises(TypeError, match=r"detect\('innovation', reference=500\).rule"):
+            live.detect(wrong)
+    with pytest.raises(ValueError, match="wait"):
+        live.detect(rule, wait=-1)
+    band = run.detect("band", reference={"b2": (0.0, 1.0)}).rule
+    with pytest.raises(ValueError, match="no parameter 'b2'"):
+        Live(ARX(1, 1), K).detect(band)
+    blind = track(ARX(2, 2), AugmentedFLS(mu=10.0), y, u)
+    for kind, one, reference in (("innovation", rule, None), ("band", band, {"b2": (0.0, 1.0)})):
+        with pytest.raises(ValueError, match="no covariance"):
+            LiveAlarm(one, AugmentedFLS(1.0), run.names)
+        with pytest.raises(ValueError, match="no covariance"):
+            blind.detect(kind, reference=reference)
+    with pytest.raises(ValueError, match="no probability of a change"):
+        live.detect(AlarmRule("probability", 100.0, ("probability",), (0.5,)))
+    assert live.alarms == ()
+    assert next(null_records(run, 10.0, -1, 0)).detect(rule).limits.tolist() == list(rule.limits)

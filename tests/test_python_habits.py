@@ -1,0 +1,197 @@
+"""What Python users take for granted: text in a notebook, copies, other processes, messages that say what is wrong."""
+
+import builtins
+import copy
+import pickle
+import re
+from multiprocessing import get_context
+
+import numpy as np
+import polars as pl
+import pytest
+from support import arx_record, same
+
+from driftfit import (
+    ARX,
+    FLS,
+    RLS,
+    AdaptiveKalman,
+    HammersteinWiener,
+    Kalman,
+    Live,
+    Regression,
+    grid,
+    select,
+    track,
+    tune,
+)
+from driftfit.detect import detect
+from driftfit.frontier import frontier
+
+K = Kalman(q=1e-3, r=0.01)
+Y, U = arx_record(200, 1)
+TWO = np.column_stack([Y, 0.5 * Y[::-1]])
+
+
+@pytest.fixture(scope="module")
+def run():
+    return track(ARX(2, 2), K, Y, U)
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    return track(ARX(2, 2), K, np.stack([Y] * 12), np.stack([U] * 12), by="row")
+
+
+@pytest.fixture
+def notebook(monkeypatch):
+    """What rich takes for Jupyter."""
+
+    class ZMQInteractiveShell:
+        pass
+
+    monkeypatch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
+
+
+def results(run, fleet):
+    """Everything that rich draws."""
+    yield run.summary()
+    yield run.verdict()
+    yield run.diagnose()
+    yield run.detect("innovation")
+    yield fleet.summary()
+    yield fleet.verdict()
+    yield fleet.diagnose()
+    yield fleet.detect("innovation")
+    yield select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0))
+
+
+def test_text_is_the_same_in_a_notebook(run, fleet, notebook, monkeypatch, capsys):
+    from rich.console import Console
+
+    assert Console().is_jupyter
+    with monkeypatch.context() as outside:
+        outside.delattr(builtins, "get_ipython")
+        expected = [str(one) for one in results(run, fleet)]
+    with monkeypatch.context() as elsewhere:
+        for name, value in (("FORCE_COLOR", "1"), ("TERM", "dumb"), ("COLUMNS", "40"), ("JUPYTER_COLUMNS", "40")):
+            elsewhere.setenv(name, value)
+        for one, text in zip(results(run, fleet), expected, strict=True):
+            assert str(one) == text
+            assert len(text) > 200
+            assert max(map(len, text.splitlines())) <= 96
+            shown = one._repr_mimebundle_([], [])
+            assert f"{type(one).__name__}(" not in shown["text/plain"]
+            assert "<pre" in shown["text/html"]
+    assert capsys.readouterr().out == ""
+
+
+WAYS = {"pickle": lambda one: pickle.loads(pickle.dumps(one)), "copy": copy.copy, "deepcopy": copy.deepcopy}
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_a_copied_stream_goes_on_by_itself(way):
+    for model, y, settings in ((ARX(2, 2), Y, {"lag": 3}), (ARX(2, 2), Y, {}), (ARX(1, 1, ny=2), TWO, {"lag": 3})):
+        live = Live(model, K, **settings)
+        for t in range(50):
+            live.update(y[t], U[t], time=float(t))
+        before, other = live.to_bytes(), way(live)
+        assert type(other) is type(live)
+        assert (other.lag, other.ignored, other.names) == (live.lag, live.ignored, live.names)
+        for t in range(50, 60):
+            other.update(y[t], U[t], time=float(t))
+        assert live.to_bytes() == before  # nothing is shared
+        for t in range(50, 60):
+            live.update(y[t], U[t], time=float(t))
+        assert live.to_bytes() == other.to_bytes()
+        assert same(live.theta, other.theta)
+        if settings:
+            assert same(live.smooth().theta, other.smooth().theta)
+
+
+def test_bytes_are_what_a_file_holds(tmp_path):
+    live = Live(ARX(2, 2), K)
+    live.update(1.0, 2.0)
+    (tmp_path / "state").write_bytes(live.to_bytes())
+    assert Live.load(tmp_path / "state").to_bytes() == live.to_bytes()
+    for data in (b"", b"hello", live.to_bytes()[:-30]):
+        with pytest.raises(ValueError, match="what was given is not a driftfit file, or it is damaged"):
+            Live.from_bytes(data)
+    two = Live(ARX(1, 1, ny=2), K)
+    with pytest.raises(ValueError, match="holds a outputs, not a state"):
+        Live.from_bytes(two.to_bytes())
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_results_can_be_copied_and_sent(run, fleet, way):
+    """Settings, records and what is said of them; the numbers stay, and what is asked of the copy is answered."""
+    for settings in (K, AdaptiveKalman(), FLS(), HammersteinWiener(1, 1), Regression(["a"], intercept=True)):
+        assert way(settings) == settings
+    for one in (run, fleet[3], track(Regression(1, ny=2), K, TWO, U)):
+        other = way(one)
+        assert same(other.theta, one.theta)
+        assert str(other.summary()) == str(one.summary())
+        assert same(other.forecast(2, U[:2]).y_std, one.forecast(2, U[:2]).y_std)
+    assert str(way(fleet).summary()) == str(fleet.summary())
+    for said in results(run, fleet):
+        assert str(way(said)) == str(said)
+    tuned = tune(ARX(2, 2), Kalman(), Y, U)
+    other = way(tuned)
+    assert repr(other) == repr(tuned)
+    assert other.table.equals(tuned.table)
+    for (_, x, value), (_, x2, value2) in zip(tuned.curves(), other.curves(), strict=True):
+        assert same(x, x2)
+        assert same(value, value2)
+
+
+def test_a_series_of_a_fleet_is_sent_alone(run, fleet):
+    assert len(pickle.dumps(fleet[3])) < 2 * len(pickle.dumps(run))
+
+
+def advanced(live):
+    """What another process does with a stream."""
+    live.update(Y[50], U[50])
+    return live
+
+
+def test_a_stream_can_be_sent_to_a_process():
+    live = Live(ARX(2, 2), K)
+    for t in range(50):
+        live.update(Y[t], U[t])
+    with get_context("spawn").Pool(1) as pool:
+        other = pool.apply(advanced, (live,))
+    assert same(other.theta, advanced(live).theta)
+
+
+MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: track(ARX, K, Y, U), "track: model is the class ARX itself; make one of it: ARX(na=...)."),
+        (lambda: track(ARX(2, 2), Kalman, Y, U), "class Kalman itself; make one of it: Kalman(q=..., r=...)."),
+        (lambda: track(ARX, Kalman, Y, U), "model is the class ARX itself"),
+        (lambda: track(K, ARX(2, 2), Y, U), f"changed places; the model comes first: track({MODEL}, {TRACKER}, ...)."),
+        (lambda: track(Kalman, ARX, Y, U), "the model comes first: track(ARX(na=...), Kalman(q=..., r=...), ...)."),
+        (lambda: track(ARX(2, 2), Y, U), "must be a tracker, such as AdaptiveKalman(); got an array of shape (200,)."),
+        (lambda: track(ARX(2, 2), [K, Kalman], Y, U), "tracker is the class Kalman"),
+        (lambda: track(ARX(2, 2), {"a": RLS}, "y", "u", data=pl.DataFrame(), by="k"), "tracker is the class RLS"),
+        (lambda: track("ARX(2, 2)", K, Y, U), "such as ARX(2, 2) or Regression(3); got 'ARX(2, 2)', a str."),
+        (lambda: Live(ARX, Kalman), "Live: model is the class ARX itself"),
+        (lambda: Live(K, ARX(2, 2)), f"the model comes first: Live({MODEL}, {TRACKER}, ...)."),
+        (lambda: Live(ARX(2, 2)), "Live: tracker must be a tracker, such as AdaptiveKalman(); got None."),
+        (lambda: Live(ARX(2, 2), [K]), "Live: tracker must be a tracker"),
+        (lambda: tune(ARX(2, 2), Kalman, Y, U), "tune: tracker is the class Kalman itself"),
+        (lambda: tune(Kalman(), ARX(2, 2), Y, U), f"the model comes first: tune({MODEL}, Kalman(), ...)."),
+        (lambda: select(ARX, Y, U), "select: model is the class ARX itself"),
+        (lambda: select([ARX(2, 2), K], Y, U), "model must be a model, such as ARX(2, 2) or Regression(3); got Kalman"),
+        (lambda: select(ARX(2, 2), Y, U, tracker=RLS), "select: tracker is the class RLS itself"),
+        (lambda: grid(ARX(2, 2), na=[1, 2]), "grid: it makes the models, so give their class"),
+        (lambda: frontier(ARX, Y, U), "frontier: model is the class ARX itself"),
+        (lambda: detect("band", Y), "detect: the run comes first, as in detect(run, 'band'); got 'band'."),
+    ],
+)  # fmt: skip
+def test_classes_and_swapped_arguments_are_named(call, says):
+    with pytest.raises(TypeError, match=re.escape(says)):
+        call()
