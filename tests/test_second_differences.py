@@ -84,7 +84,9 @@ def test_every_prefix_of_the_filter_and_every_window_is_the_smoother(tmp_path):
         np.testing.assert_array_equal(live.std, run.std[t])
         cut = slice(0, t + 1)
         part = track(TWO, tracker, y[cut], phi[cut], time=time[cut], drift=drift[cut], weights=w[cut]).smooth()
-        np.testing.assert_allclose(run.theta[t], part.theta[-1], rtol=1e-9, atol=1e-9)
+        # drift that differs between parameters moves what nothing was seen of too, which the filter leaves alone
+        sure = np.isfinite(run.std[t])
+        np.testing.assert_allclose(run.theta[t, sure], part.theta[-1, sure], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(np.isinf(run.std[t]), np.isinf(part._path.var[-1]))
         if t != 6:  # one sample more than unknowns, and y fits all but exactly
             window, k = live.smooth(), min(t, 5) + 1

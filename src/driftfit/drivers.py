@@ -30,8 +30,12 @@ from driftfit.kernel import Array, Driver, State, Step, kernel, routine
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
-LARGEST = 1e100
-"""Signals at least this large cannot be used: their squares, and products of those with a covariance, overflow."""
+LARGEST = 1e38
+"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+
+SMALLEST = 1e-38
+"""Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
+regressor, a covariance that earlier regressors left, and an innovation overflows."""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -64,11 +68,11 @@ def clean(s: State, l: int) -> None:
     for i in range(s.phi.shape[0]):
         x = s.phi[i, l]
         finite = abs(x) < LARGEST
-        s.phi[i, l] = x if finite else 0.0
+        s.phi[i, l] = x if finite & (abs(x) > SMALLEST) else 0.0
         valid = valid if finite else 0.0
     y, noise = s.y[l], s.noise[l]
     finite = abs(y) < LARGEST
-    s.y[l] = y if finite else 0.0
+    s.y[l] = y if finite & (abs(y) > SMALLEST) else 0.0
     s.valid[l] = valid
     s.seen[l] = 1.0 if finite else 0.0
     s.ok[l] = valid if finite & (noise < np.inf) else 0.0
@@ -103,11 +107,12 @@ class TrackerSteps(NamedTuple):
 
     ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.rank < n``, for trackers that
-    start from no knowledge at all. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
-    name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a
-    sample beside interval, noise and drift from the columns of ``known`` after the third, where there are some.
-    ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
+    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
+    that start from no knowledge at all (`driftfit.trackers.diffuse`), and ``machines`` are what it calls by symbol.
+    ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record ``s`` to
+    the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval, noise and
+    drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)``
+    copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -117,6 +122,7 @@ class TrackerSteps(NamedTuple):
     store: Any = nothing_more
     told: Any = nothing_told
     note: Any = nothing_more
+    machines: tuple[Any, ...] = ()
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -203,7 +209,7 @@ class Drivers(NamedTuple):
 
 
 def _advance(tracker: TrackerSteps) -> Any:
-    """predict, correct, report for all lanes of a tile; lanes that still know nothing take ``begin`` instead."""
+    """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
     predict, correct, report, begin, *_ = tracker
 
     @kernel
@@ -219,9 +225,8 @@ def _advance(tracker: TrackerSteps) -> Any:
 
     @routine
     def start(s: State) -> None:
-        n, L = s.theta.shape
-        for l in range(L):
-            if s.rank[l] < n:
+        for l in range(s.theta.shape[1]):
+            if s.root[l] > 0:
                 begin(s, l)
             else:
                 predict(s, l)
@@ -230,11 +235,10 @@ def _advance(tracker: TrackerSteps) -> Any:
 
     @kernel
     def advance_or_start(s: State) -> None:
-        n, L = s.theta.shape
-        lowest = n
-        for l in range(L):
-            lowest = min(lowest, s.rank[l])
-        if lowest < n:
+        some = 0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.root[l])
+        if some > 0:
             start(s)
         else:
             advance(s)
@@ -253,6 +257,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """
     regress, push, ready = model
     ready(1)
+    for machine in tracker.machines:
+        machine.load()
     told = tracker.told
     store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
     advance = _advance(tracker)

@@ -393,6 +393,12 @@ def floats(address: int, rows: int, columns: int) -> Any:
 
 
 @kernel
+def cubes(address: int, rows: int, columns: int, lanes: int) -> Any:
+    """The array (rows, columns, lanes) of floats that begins at an address."""
+    return carray(_pointer(address), (rows, columns, lanes), np.float64)
+
+
+@kernel
 def wholes(address: int, rows: int, columns: int) -> Any:
     """The array (rows, columns) of whole numbers that begins at an address."""
     return carray(_pointer(address), (rows, columns), np.int64)

@@ -41,7 +41,7 @@ from driftfit.hypotheses.table import (
 )  # fmt: skip
 from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
-from driftfit.trackers.diffuse import enter, measurement, spanned_variance
+from driftfit.trackers.diffuse import MACHINES, enter, measurement, spanned_variance, wander
 from driftfit.trackers.excitation import learn_scales
 from driftfit.trackers.resolution import resolve
 
@@ -58,6 +58,25 @@ def only_drift(s: State, l: int) -> None:
             at += 1
         unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         s.P[i, i, l] += s.size0[i, l] * unit * time
+
+
+@kernel
+def only_drifted(s: State, l: int) -> None:
+    """The same in square-root form."""
+    n = s.theta.shape[0]
+    time = s.dt[l] * s.drift[l]
+    root = exp(-0.5 * s.dt[l] * log(s.keep0[l]))
+    for i in range(n):
+        s.d[i, l] *= root
+        for j in range(i, n):
+            s.S[i, j, l] *= root
+            s.H[i, j, l] = s.G[i, j, l]
+    wander(s, np.sqrt(time), l)
+    for i in range(n):
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for j in range(i, n):
+            s.H[i, j, l] = np.sqrt(s.size0[i, l] * unit) if i == j else 0.0
+    wander(s, np.sqrt(time), l)
 
 
 @kernel
@@ -155,7 +174,7 @@ def correct(s: State, l: int) -> None:
 @kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
-    only_drift(s, l)
+    only_drifted(s, l)
     enter(s, l)
     alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
     spanned_variance(s, l)
@@ -170,7 +189,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     tell(s, l)
     s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
     s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
-    ready = s.rank[l] == s.theta.shape[0] and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
+    ready = s.root[l] == 0 and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
     s.many[SETTLED, l] = READY if ready else WAITING
     run(s, l)
     if ready:
@@ -202,4 +221,4 @@ def told(s: State, known: Array, t: int, l: int) -> None:
         s.memory[factors + i, l] = known[row, 3 + count + i, l]
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, told)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, MACHINES)

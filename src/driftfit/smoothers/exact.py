@@ -36,10 +36,10 @@ def smooth(walk: Walk, keep: str = "std") -> Path:
         return slopes.smooth(walk, keep)
     n = walk.phi.shape[1]
     scale = column_scale(walk.phi, walk.weight)
-    rank, spanned = ranks(walk.phi, walk.weight, scale)
+    rank, unseen = ranks(walk.phi, walk.weight, scale)
     simple = keep == "std" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
     found = elimination.smooth(walk) if simple else None
     if found is None:
         G = triangular_root(walk.q * np.outer(scale, scale))
-        found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, spanned), keep)
+        found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
     return found._replace(rank=rank)

@@ -98,13 +98,16 @@ class Window:
         N, walk = len(self.G), self._first(self.count)
         rows, values = self.before["S"][0, ..., 0], self.before["d"][0, :, 0]
         hidden = np.zeros(N, bool)
-        rank = int(tile["known" if len(walk.trend) else "rank"][0, lane])
-        if rank < N:
-            unseen = two_filters.unspanned(tile["V"][0, :rank, :, lane], np.ones(N))
+        if tile["rank"][0, lane] < N:
+            vectors = np.triu(tile["R"][0, ..., lane])[:, np.diagonal(tile["S"][0, ..., lane]) == 0.0]
+            tau = float(tile["tau"][0, lane]) if len(walk.trend) else 0.0
+            if len(walk.trend):  # the vectors are of now, and theta0 of the first sample
+                vectors[: N // 2] -= tau * vectors[N // 2 :]
+            unseen = two_filters.unspanned(vectors, np.ones(N))
             values = np.append(values, unseen @ walk.theta0)
             hidden = two_filters.undetermined(unseen)
             if len(walk.trend):
-                time = float(tile["tau"][0, lane]) + np.cumsum(walk.trend) - walk.trend.sum()
+                time = tau + np.cumsum(walk.trend) - walk.trend.sum()
                 hidden = slopes.undetermined(unseen, time)
                 unseen = slopes.moved(unseen, float(time[0]))
             rows = np.vstack([rows, unseen])

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import make_tile
 from driftfit.kernel import Array, Driver
 from driftfit.trackers import diffuse
 
@@ -31,36 +30,32 @@ def column_scale(phi: Array, weight: Array) -> Array:
 
 
 def ranks(phi: Array, weight: Array, scale: Array) -> tuple[Array, Array]:
-    """Rank of the scaled regressors up to each sample, (T,), and an orthonormal basis of their span, (rank, n)."""
-    tile = basis(len(scale)).copy()
+    """Rank of the scaled regressors up to each sample, (T,), and vectors that none of them sees, (n, n - rank)."""
+    n = len(scale)
     rank = np.empty(len(phi), np.int64)
-    compiled_ranks()(tile, phi, scale, weight, rank)
-    return rank, tile["V"][0, : rank[-1], :, 0]
-
-
-@lru_cache
-def basis(n: int) -> Array:
-    """A tile that has seen no regressors, to be copied."""
-    return make_tile(n, 0, {}, [{"theta": np.zeros(n), **diffuse.knowing_nothing(n)}])
+    S, R = np.zeros((n, n)), np.eye(n)
+    compiled_ranks()(S, R, np.zeros((diffuse.WORK, n)), phi, scale, weight, rank)
+    return rank, R[:, np.diag(S) == 0.0]
 
 
 @lru_cache
 def compiled_ranks() -> Any:
-    outside, tolerance = diffuse.outside, diffuse.TOLERANCE
+    refresh, outside, turn_in, row = diffuse.refresh, diffuse.outside, diffuse.turn_in, diffuse.ROW
 
     @Driver
-    def run(tile: Array, phi: Array, scale: Array, weight: Array, rank: Array) -> None:
-        s = tile[0]
-        n = s.theta.shape[0]
+    def run(S: Array, R: Array, work: Array, phi: Array, scale: Array, weight: Array, rank: Array) -> None:
+        n, known = len(scale), 0
+        scaled, values = np.empty(n), np.zeros(n)
         for t in range(phi.shape[0]):
-            if weight[t] > 0.0 and s.rank[0] < n:
+            if weight[t] > 0.0 and known < n:
                 for i in range(n):
-                    s.phi[i, 0] = phi[t, i] / scale[i]
-                _, square = outside(s.phi[:, 0], s.V[:, :, 0], s.rank[0], s.w[:, 0])
-                if square > tolerance * tolerance:
-                    for i in range(n):
-                        s.V[s.rank[0], i, 0] = s.w[i, 0] / np.sqrt(square)
-                    s.rank[0] += 1
-            rank[t] = s.rank[0]
+                    scaled[i] = phi[t, i] / scale[i]
+                entering, _, _ = outside(scaled, S, work)
+                for i in range(n):
+                    work[row, i] = scaled[i]
+                turn_in(S, values, work[row], 0.0, entering)
+                refresh(S, R, work)
+                known += 1 if entering >= 0 else 0
+            rank[t] = known
 
     return run

@@ -66,12 +66,12 @@ def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
     """Rank up to each sample, and what is known before the first one."""
     span = max(float(time[-1]), 1.0)
     at_first = np.hstack([walk.phi, walk.phi * (time / span)[:, None]])
-    rank, spanned = ranks(at_first, walk.weight, double)
+    rank, unseen = ranks(at_first, walk.weight, double)
     n = len(double) // 2
     hidden = np.zeros(len(double), bool)
     if rank[-1] == 2 * n:
         return rank, Start(np.zeros((0, 2 * n)), np.zeros(0), hidden)
-    natural = unspanned(spanned, double * np.repeat([1.0, span], n))
+    natural = unspanned(unseen, double * np.repeat([1.0, span], n))
     rows = natural / double
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     return rank, Start(rows, rows[:, :n] @ (double[:n] * walk.theta0), undetermined(natural, time))

@@ -82,8 +82,8 @@ def changes(walk: Walk) -> tuple[Array, Array]:
     return each, np.append(trend, 0.0) if len(trend) else trend
 
 
-def start(walk: Walk, scale: Array, spanned: Array) -> Start:
-    """The start of a problem whose regressors span ``spanned / scale``.
+def start(walk: Walk, scale: Array, unseen: Array) -> Start:
+    """The start of a problem whose regressors, divided by ``scale``, see none of the vectors ``unseen`` (n, k).
 
     A proper prior gives a row for each of its axes. Without one, a row that fixes the first point is needed in every
     direction that the regressors never span; it costs nothing there, so its weight does not matter.
@@ -94,20 +94,17 @@ def start(walk: Walk, scale: Array, spanned: Array) -> Start:
         sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
         rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
         return Start(rows, rows @ theta0, np.zeros(len(scale), bool))
-    if len(spanned) == len(scale):
+    if unseen.shape[1] == 0:
         return Start(np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool))
-    natural = unspanned(spanned, scale)
+    natural = unspanned(unseen, scale)
     rows = natural / scale
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     return Start(rows, rows @ theta0, undetermined(natural))
 
 
-def unspanned(spanned: Array, scale: Array) -> Array:
-    """Orthonormal basis, in rows, of the theta that regressors in the span of ``spanned / scale`` do not see."""
-    from scipy import linalg  # a fifth of a second to import
-
-    complement = linalg.null_space(spanned) if len(spanned) else np.eye(len(scale))
-    basis: Array = linalg.qr(complement / scale[:, None], mode="economic")[0].T
+def unspanned(unseen: Array, scale: Array) -> Array:
+    """Orthonormal basis, in rows, of the theta that regressors do not see, from such vectors for scaled regressors."""
+    basis: Array = np.linalg.qr(unseen / scale[:, None])[0].T
     return basis
 
 

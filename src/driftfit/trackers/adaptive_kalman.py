@@ -38,10 +38,18 @@ from driftfit.kernel import Array, State, kernel
 from driftfit.models.base import Model
 from driftfit.settings import numbers
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import enter, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.diffuse import ALMOST_ANY, MACHINES, enter, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.drift_ladder import filters, mix
 from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation, window
-from driftfit.trackers.filters import enter_filters, innovate, mixture, predict, update_filters, weigh
+from driftfit.trackers.filters import (
+    enter_filters,
+    innovate,
+    mixture,
+    predict,
+    unseen_variance,
+    update_filters,
+    weigh,
+)
 from driftfit.trackers.hindsight import NOTED, note, varying
 from driftfit.trackers.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.proportion import bound_leverage, learn_proportion, leave_out, no_proportion, proportion
@@ -93,7 +101,7 @@ def follow(s: State, l: int) -> None:
     innovate(s, l)
     leave_out(s, l)
     s.odd[l], s.weighed[l] = 0.0, 0
-    entered = s.rank[l] < s.theta.shape[0] and enter_filters(s, l)
+    entered = s.root[l] > 0 and enter_filters(s, l)
     if s.ok[l] > 0.0 and not entered:
         s.weighed[l] = 1
         weigh(s, l)
@@ -134,6 +142,7 @@ def begin(s: State, l: int) -> None:
         predict(s, l)
         follow(s, l)
         report(s, l)
+        unseen_variance(s, l)
     else:
         resolve(s, l)
         learn(s, l, 0.0)
@@ -141,7 +150,7 @@ def begin(s: State, l: int) -> None:
         if s.s[l] < np.inf:
             learn_start(s, l)
             settle(s, l)
-    spanned_variance(s, l)
+        spanned_variance(s, l)
 
 
 @dataclass(frozen=True)
@@ -196,7 +205,7 @@ class AdaptiveKalman(Tracker):
             "h": np.zeros(K),
             "inverse": np.zeros((J, K)),
             "joint": np.zeros((J, K)),
-            **knowing_nothing(n),
+            **knowing_nothing(n, ALMOST_ANY),
             **no_excitation(n),
             **no_proportion(),
             **unresolved(),
@@ -206,7 +215,7 @@ class AdaptiveKalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin, note=note)
+        return TrackerSteps(predict, correct, report, begin, note=note, machines=MACHINES)
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))

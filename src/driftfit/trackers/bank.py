@@ -53,7 +53,8 @@ from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import knowing, knowing_nothing
+from driftfit.trackers.diffuse import ALMOST_ANY, knowing, knowing_nothing
+from driftfit.trackers.information import triangular_root
 from driftfit.trackers.resolution import resolution, unresolved
 
 FAR = 100.0
@@ -261,13 +262,15 @@ class Bank(Tracker):
             if self.form == "sqrt":
                 factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
             arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
+        q0, Q0 = arrays["Q"][0, : n * (n + 1) // 2], np.zeros((n, n))
+        Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
             **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
-            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
-            "q0": arrays["Q"][0, : n * (n + 1) // 2], "size0": self.all_changes[0].increments(n)[1],
+            **(knowing_nothing(n, ALMOST_ANY) if self.p0 is None else knowing(n)),
+            "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
 

@@ -13,6 +13,7 @@ from driftfit.kernel import Array, Step
 from driftfit.models.base import Model
 from driftfit.settings import Settings
 from driftfit.trackers.each import roots
+from driftfit.trackers.information import widen
 
 
 class RandomWalk(NamedTuple):
@@ -152,10 +153,14 @@ class Tracker(Settings, ABC):
         scale = float(lane["scale"])
         np.einsum("ii->i", P)[:] += p / scale if scale > 0.0 else p
         lane["var"][:] += p
+        if "root" in lane:
+            widen(lane["S"], lane["d"], p / scale if scale > 0.0 else p)
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """Set entries of theta in the fields of one lane."""
         lane["theta"][list(which)] = values
+        if "root" in lane:
+            lane["d"][:] = lane["S"] @ lane["theta"]
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         """Covariance (n, n) of theta from the fields of one lane; inf on the diagonal where nothing is known."""

@@ -34,7 +34,7 @@ from driftfit.models.block_products import Structure
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.settings import covariance, matrix, numbers, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import product_with
+from driftfit.trackers.diffuse import LEFT, product_with
 from driftfit.trackers.each import told
 from driftfit.trackers.kalman import drift, drift_matrix
 
@@ -128,8 +128,9 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
         for i in range(s.theta.shape[0]):
             k = gain * s.g[i, l]
             s.theta[i, l] += k * e
-            for j in range(i + 1):
+            for j in range(i):
                 s.P[i, j, l] -= k * s.g[j, l]
+            s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
         s.y_hat[l] = y_hat
         s.e[l] = e
         s.s[l] = v

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.kernel import State, exp, kernel
-from driftfit.trackers.diffuse import TOLERANCE, outside, widen
+from driftfit.trackers.diffuse import LEFT, hand_over, take_in
 from driftfit.trackers.drift_ladder import TOP, leap
 from driftfit.trackers.noise_levels import OUTLIER
 from driftfit.trackers.resolution import lasting
@@ -132,9 +132,12 @@ def update_filters(s: State, l: int) -> None:
     for i in range(n):
         for k in range(K):
             s.m[i, k, l] += s.gain[i, k, l] * s.step[k, l]
-        for j in range(i + 1):
+        for j in range(i):
             for k in range(K):
                 s.C[i, j, k, l] -= s.h[k, l] * s.gain[i, k, l] * s.gain[j, k, l]
+        for k in range(K):
+            left = s.C[i, i, k, l] - s.h[k, l] * s.gain[i, k, l] * s.gain[i, k, l]
+            s.C[i, i, k, l] = max(left, LEFT * s.C[i, i, k, l])
 
 
 @kernel
@@ -156,21 +159,58 @@ def mixture(s: State, l: int) -> None:
 
 @kernel
 def enter_filters(s: State, l: int) -> bool:
-    """Take a regressor outside the span into all filters; returns whether it was one."""
-    rank, K = s.rank[l], s.mu.shape[0]
-    length, square = outside(s.phi[:, l], s.V[:, :, l], rank, s.w[:, l])
-    if square <= TOLERANCE * TOLERANCE:
+    """Take the sample into the square root of the start, and a regressor outside its span into all filters.
+
+    With N the vector of the free column that u = phi' N ends, the diffuse correction of filter k is
+
+        K = N / u,   m_k <- m_k + K e_k,   C_k <- C_k + K K' (h_k + v) - K g_k' - g_k K'
+
+    Returns whether the regressor was one.
+    """
+    n, K, v = s.theta.shape[0], s.mu.shape[0], s.s[l]
+    for j in range(n):
+        s.pivot[j, l] = 1.0 if s.S[j, j, l] == 0.0 else 0.0
+        for i in range(j + 1):
+            s.H[i, j, l] = s.R[i, j, l]
+    take_in(s, l)
+    hand_over(s, l)
+    innovated(s, l)
+    if s.s[l] < np.inf:
+        s.s[l] = v
         return False
     noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
-    if s.ok[l] > 0.0:
-        for k in range(K):
-            outside(s.phi[:, l], s.V[:, :, l], rank, s.w[:, l])
-            widen(
-                s.m[:, k, l], s.C[:, :, k, l], s.V[rank, :, l], s.w[:, l], s.gain[:, k, l], s.e_k[k, l],
-                s.h[k, l] + noise, length, square,
-            )  # fmt: skip
-            s.mu[k, l] = s.prior[k, l]
-        s.F[rank, l] = length * length * square
-        s.rank[l] = rank + 1
-    s.s[l] = np.inf
+    for j in range(n):
+        if s.ok[l] > 0.0 and s.pivot[j, l] > 0.0 and s.S[j, j, l] > 0.0:
+            u = 0.0
+            for i in range(j + 1):
+                u += s.phi[i, l] * s.H[i, j, l]
+            for k in range(K):
+                for a in range(n):
+                    gain = s.H[a, j, l] / u if a <= j else 0.0
+                    s.m[a, k, l] += gain * s.e_k[k, l]
+                    for b in range(a + 1):
+                        other = s.H[b, j, l] / u if b <= j else 0.0
+                        s.C[a, b, k, l] += gain * other * (s.h[k, l] + noise)
+                        s.C[a, b, k, l] -= gain * s.gain[b, k, l] + s.gain[a, k, l] * other
+                s.mu[k, l] = s.prior[k, l]
     return True
+
+
+@kernel
+def innovated(s: State, l: int) -> None:
+    """The prediction of the mixture and the innovation, after the start has written its own."""
+    mean = 0.0
+    for k in range(s.mu.shape[0]):
+        mean += s.prior[k, l] * (s.y[l] - s.e_k[k, l])
+    s.y_hat[l] = mean
+    s.e[l] = s.y[l] - mean
+
+
+@kernel
+def unseen_variance(s: State, l: int) -> None:
+    """An infinite variance for what no sample has told apart yet."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            if s.S[j, j, l] == 0.0 and s.R[i, j, l] != 0.0:
+                s.var[i, l] = np.inf

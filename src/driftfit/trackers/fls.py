@@ -39,7 +39,7 @@ from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, plain, vector
 from driftfit.trackers import second_differences
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
 from driftfit.trackers.each import told
 from driftfit.trackers.resolution import resolution, resolve
 from driftfit.trackers.rls import correct, learn_scale, no_scale
@@ -57,7 +57,8 @@ def drift(s: State, l: int) -> None:
 @kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
-    drift(s, l)
+    drifted(s, s.dt[l] * s.drift[l] * s.begun[l], l)
+    s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
     enter(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
@@ -132,6 +133,7 @@ class FLS(Tracker):
             "theta": theta0,
             "P": np.zeros((n, n)) if self.p0 is None else matrix("FLS", "p0", self.p0, n),
             "q": 1.0 / mu,
+            "G": np.diag(np.sqrt(1.0 / mu)),
             "r": 1.0,
             "g": np.zeros(n),
             "each": np.ones(n),
@@ -163,4 +165,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)

@@ -106,6 +106,12 @@ def invert(S: Array, R: Array, l: int) -> None:
             R[i, j, l] = t / S[i, i, l]
 
 
+def widen(S: Array, d: Array, p: Array) -> None:
+    """Let theta move by variances p, in place, outside compiled code: S (n, n), d (n,)."""
+    n = len(d)
+    spread.py_func(S[..., None], d[..., None], np.diag(np.sqrt(p))[..., None], 1.0, np.zeros((n, 1)), 0)
+
+
 def triangular_root(q: Array) -> Array:
     """An upper triangle G with G G' = q, for a covariance that may be singular."""
     variances = np.diag(q)

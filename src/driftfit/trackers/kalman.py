@@ -20,20 +20,21 @@ Departures: one triangle of P is kept; an exact diffuse start (`driftfit.tracker
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import Array, State, kernel
+from driftfit.kernel import State, kernel
 from driftfit.models.base import Model
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers import square_root
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, measurement, spanned_variance
 from driftfit.trackers.each import told
+from driftfit.trackers.information import triangular_root
 
 
 @kernel
@@ -51,18 +52,15 @@ def drift_matrix(s: State, l: int) -> None:
             s.P[i, j, l] += s.q[i, j, l] * (s.each[i, l] * s.each[j, l]) * time
 
 
-def _steps(predict: Any) -> TrackerSteps:
-    @kernel
-    def begin(s: State, l: int) -> None:
-        predict(s, l)
-        enter(s, l)
-        spanned_variance(s, l)
-
-    return TrackerSteps(predict, measurement, diagonal, begin, told=told)
+@kernel
+def begin(s: State, l: int) -> None:
+    drifted(s, s.dt[l] * s.drift[l], l)
+    enter(s, l)
+    spanned_variance(s, l)
 
 
-INDEPENDENT, TOGETHER = _steps(drift), _steps(drift_matrix)
-SQUARE_ROOT, SQUARE_ROOT_TOGETHER = square_root.steps(drift), square_root.steps(drift_matrix)
+INDEPENDENT = TrackerSteps(drift, measurement, diagonal, begin, told=told, machines=MACHINES)
+TOGETHER = TrackerSteps(drift_matrix, measurement, diagonal, begin, told=told, machines=MACHINES)
 
 
 @dataclass(frozen=True)
@@ -123,28 +121,19 @@ class Kalman(Tracker):
             "r": self.r,
             "g": np.zeros(n),
             "each": np.ones(n),
+            "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **(self._root(n) if self.form == "sqrt" else {}),
         }
 
     def _root(self, n: int) -> Mapping[str, Any]:
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
-        return square_root.state(matrix("Kalman", "q", self.q, n), vector("Kalman", "theta0", self.theta0, n), p0)
-
-    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        super().widen(lane, p)
-        if self.form == "sqrt":
-            square_root.widen(lane["S"], lane["d"], p)
-
-    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
-        super().place(lane, which, values)
-        if self.form == "sqrt":
-            lane["d"][:] = lane["S"] @ lane["theta"]
+        return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
     @property
     def steps(self) -> TrackerSteps:
         if self.form == "sqrt":
-            return SQUARE_ROOT_TOGETHER if np.ndim(self.q) == 2 else SQUARE_ROOT
+            return square_root.STEPS
         return TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
 
     def random_walk(self, model: Model) -> RandomWalk:

@@ -1,6 +1,6 @@
 """Recursive least squares with exponential or directional forgetting.
 
-    predict   P <- P / lambda_e,   lambda_e = min(1, max(lambda^dt, tr P / c_max))
+    predict   P <- P / lambda_e,   lambda_e = min(1, max(lambda^dt, max_i P_ii / (c_max P_ii at the start)))
     correct   e = y - phi' theta;  s = phi' P phi + 1;  K = P phi / s
               theta <- theta + K e;  P <- P - K (P phi)'
 
@@ -9,8 +9,8 @@ the noise variance, which is estimated as it goes: sum(e^2 / s) / count over the
 what coarse readings allow (`driftfit.trackers.resolution`).
 
 Use it when all parameters drift alike and nothing is known of noise and drift. Without excitation exponential
-forgetting would blow P up; it stops at ``c_max`` times the trace that P had when the regressors first had full rank
-(before that: when they last showed a new direction).
+forgetting would blow P up; it stops where a variance is ``c_max`` times what it was when the regressors first had full
+rank (before that: when they last showed a new direction), which does not depend on units.
 
 Directional forgetting (kind="directional") forgets only what a sample brings news of, after it was taken in:
 
@@ -37,53 +37,36 @@ from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import State, exp, kernel, nothing
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.diffuse import (
+    MACHINES,
+    enter,
+    hand_over,
+    knowing,
+    knowing_nothing,
+    measurement,
+    reform,
+    spanned_variance,
+    take_in,
+    wander,
+)
 from driftfit.trackers.resolution import resolution, resolve, unresolved
 
 
 @kernel
-def trace(s: State, l: int) -> float:
-    total = 0.0
+def growth(s: State, l: int) -> float:
+    """What forgetting multiplies P with."""
+    dt = s.dt[l]
+    faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
+    grown = 0.0
     for i in range(s.theta.shape[0]):
-        total += abs(s.P[i, i, l])  # rounding can make a variance negative: it must not grow behind the cap
-    return total
-
-
-@kernel
-def keep_to_span(s: State, l: int) -> None:
-    """P <- V'V P V'V: outside the span P is rounding error, and forgetting would let it grow without end."""
-    n = s.theta.shape[0]
-    rank = s.rank[l]
-    for i in range(n):
-        for k in range(rank):
-            total = 0.0
-            for j in range(n):
-                total += s.P[max(i, j), min(i, j), l] * s.V[k, j, l]
-            s.PV[i, k, l] = total
-    for k in range(rank):
-        for i in range(n):
-            s.w[i, l] = 0.0
-        for m in range(rank):
-            total = 0.0
-            for i in range(n):
-                total += s.V[m, i, l] * s.PV[i, k, l]
-            for i in range(n):
-                s.w[i, l] += total * s.V[m, i, l]
-        for i in range(n):
-            s.PV[i, k, l] = s.w[i, l]
-    for i in range(n):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(rank):
-                total += s.PV[i, k, l] * s.V[k, j, l]
-            s.P[i, j, l] = total
+        # rounding can make a variance negative: it must not grow behind the cap
+        grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
+    return 1.0 / min(1.0, max(faded, grown))
 
 
 @kernel
 def forget(s: State, l: int) -> None:
-    dt = s.dt[l]
-    faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
-    grow = 1.0 / min(1.0, max(faded, trace(s, l) * s.per_cap[l]))
+    grow = growth(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             s.P[i, j, l] *= grow
@@ -114,49 +97,76 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
-    rank = s.rank[l]
     resolve(s, l)
-    forget(s, l)
-    keep_to_span(s, l)
+    rank, n = s.rank[l], s.theta.shape[0]
+    shrink = 1.0 / np.sqrt(growth(s, l))
+    for i in range(n):
+        s.d[i, l] *= shrink
+        for j in range(i, n):
+            s.S[i, j, l] *= shrink
     enter(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
     spanned_variance(s, l)
     # the cap holds from the first direction on: regressors may stay silent before they span everything
-    if s.rank[l] > rank:
-        s.per_cap[l] = 1.0 / (s.c_max[l] * trace(s, l))
+    for i in range(n):
+        known = s.rank[l] > rank and s.P[i, i, l] > 0.0
+        s.per_cap[i, l] = 1.0 / (s.c_max[l] * s.P[i, i, l]) if known else s.per_cap[i, l]
 
 
 @kernel
-def forget_direction(s: State, l: int) -> None:
-    """After `measurement`: s.g is still P phi before the sample, s.s its innovation variance."""
-    h = s.s[l] - s.r[l] * s.noise[l]
-    gain = s.ok[l] * (1.0 / s.forgetting[l] - 1.0) / (s.s[l] * h) if h > 0.0 and s.ok[l] > 0.0 else 0.0
-    gain *= s.r[l] * s.noise[l] if s.ok[l] > 0.0 else 0.0
-    for i in range(s.theta.shape[0]):
-        for j in range(i + 1):
-            s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
+def forgotten(s: State, l: int) -> float:
+    """The factor of g g', after a correction: s.g is still P phi before the sample, s.s its innovation variance."""
+    r = s.r[l] * s.noise[l]
+    h = s.s[l] - r
+    news = s.ok[l] > 0.0 and h > 0.0 and h < np.inf
+    return r * (1.0 / s.forgetting[l] - 1.0) / (s.s[l] * h) if news else 0.0
 
 
 @kernel
 def correct_direction(s: State, l: int) -> None:
     resolve(s, l)
     measurement(s, l)
-    forget_direction(s, l)
+    gain = forgotten(s, l)
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
     learn_scale(s, l)
+
+
+@kernel
+def product_of_roots(s: State, l: int) -> None:
+    """s.g = R R' phi, which loses half the digits that P phi does."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        s.g[i, l] = 0.0
+    for k in range(n):
+        x = 0.0
+        for i in range(k + 1):
+            x += s.R[i, k, l] * s.phi[i, l]
+        x = x if s.S[k, k, l] > 0.0 else 0.0
+        for i in range(k + 1):
+            s.g[i, l] += s.R[i, k, l] * x
 
 
 @kernel
 def begin_direction(s: State, l: int) -> None:
     resolve(s, l)
-    enter(s, l)
+    n = s.theta.shape[0]
+    product_of_roots(s, l)
+    take_in(s, l)
+    for i in range(n):
+        s.H[i, n - 1, l] = s.g[i, l]
+    wander(s, np.sqrt(forgotten(s, l)), l)
+    reform(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
+    hand_over(s, l)
     spanned_variance(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, diagonal, begin)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, diagonal, begin_direction)
+EXPONENTIAL = TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
+DIRECTIONAL = TrackerSteps(nothing, correct_direction, diagonal, begin_direction, machines=MACHINES)
 
 
 @dataclass(frozen=True)
@@ -172,7 +182,7 @@ class RLS(Tracker):
     theta0 : number or (n,)
         Mean of theta before the first sample.
     c_max : number
-        Cap of the growth of P, as a multiple of its trace at the start (exponential forgetting).
+        Cap of the growth of a variance, as a multiple of what it was at the start (exponential forgetting).
     kind : "exponential" or "directional"
         What is forgotten: all directions alike, or only those that the regressors excite.
 
@@ -203,7 +213,7 @@ class RLS(Tracker):
 
     def state(self, n: int) -> Mapping[str, Any]:
         P = np.zeros((n, n)) if self.p0 is None else matrix("RLS", "p0", self.p0, n)
-        known = self.p0 is not None and np.trace(P) > 0.0
+        first = self.c_max * np.diag(P)
         return {
             "theta": vector("RLS", "theta0", self.theta0, n),
             "P": P,
@@ -211,9 +221,8 @@ class RLS(Tracker):
             "log_forgetting": np.log(np.asarray(self.forgetting)),
             "r": 1.0,
             "g": np.zeros(n),
-            "PV": np.zeros((n, n)),
             "c_max": self.c_max,
-            "per_cap": 1.0 / (self.c_max * np.trace(P)) if known else 0.0,
+            "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
         }

@@ -10,10 +10,9 @@ which for even steps prices theta_{k+1} - 2 theta_k + theta_{k-1}. With x = (the
     predict   x <- F x,  F = [[1, dt], [0, 1]];   P <- F P F' + D^-1 (dt, 1)(dt, 1)'       (not before the first sample)
     correct   as in `driftfit.trackers.fls`, with the regressor h = (phi, 0)
 
-Start: nothing is known of x at the first sample. The exact diffuse start of `driftfit.trackers.diffuse` works on
-the regressors of x *there*: after tau intervals these are z = F_tau' h = (phi, tau phi), and a new direction w of them
-moves x by F_tau w. Rank goes to 2 n; ``known`` counts it, and ``rank``, which tells the driver who is still starting,
-is half of it.
+Start: nothing is known of x at the first sample (`driftfit.trackers.diffuse`), and rank goes to 2 n. What is known of x
+moves with it, S <- S F^-1, which is a shear of the triangle: a level that was known is not after a gap, before there
+is a slope.
 
 Use it through ``FLS(mu, differences=2)``, for parameters that move smoothly and for forecasts that follow a trend.
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4 (the integrated random walk). Departure:
@@ -28,9 +27,20 @@ from typing import Any
 import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import Array, State, kernel, shared
-from driftfit.trackers.diffuse import SPANNED, TOLERANCE, outside, prediction, symmetric_product
+from driftfit.kernel import Array, State, kernel
+from driftfit.trackers.diffuse import (
+    LEFT,
+    MACHINES,
+    hand_over,
+    knowing_nothing,
+    prediction,
+    spanned_variance,
+    symmetric_product,
+    take_in_row,
+    wander,
+)
 from driftfit.trackers.each import told
+from driftfit.trackers.information import shear
 from driftfit.trackers.resolution import resolve
 from driftfit.trackers.rls import learn_scale, no_scale
 
@@ -38,11 +48,10 @@ from driftfit.trackers.rls import learn_scale, no_scale
 def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
     """Fields before the first sample."""
     n = len(theta0)
-    two = np.zeros(2 * n)
     return {
         "theta": theta0, "slope": np.zeros(n), "P": np.zeros((2 * n, 2 * n)), "q": 1.0 / mu, "r": 1.0,
-        "g": two, "each": np.ones(n), "begun": 0.0, **no_scale(),
-        "V": np.zeros((2 * n, 2 * n)), "z": two, "w": two, "F": np.ones(2 * n), "known": 0, "rank": 0, "tau": 0.0,
+        "g": np.zeros(2 * n), "each": np.ones(n), "begun": 0.0, **no_scale(),
+        "tau": 0.0, "x": np.zeros(2 * n), "z": np.zeros(2 * n), **knowing_nothing(2 * n),
     }  # fmt: skip
 
 
@@ -66,7 +75,6 @@ def drift(s: State, l: int) -> None:
         s.P[i, i, l] += dt * dt * q
         s.P[n + i, i, l] += dt * q
         s.P[n + i, n + i, l] += q
-    s.tau[l] += dt
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
 
 
@@ -95,8 +103,9 @@ def measurement(s: State, l: int) -> None:
         s.slope[i, l] += gain * s.g[n + i, l] * e
     for i in range(2 * n):
         k = gain * s.g[i, l]
-        for j in range(i + 1):
+        for j in range(i):
             s.P[i, j, l] -= k * s.g[j, l]
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v
@@ -109,73 +118,44 @@ def correct(s: State, l: int) -> None:
     learn_scale(s, l)
 
 
-@shared
-def widen(
-    theta: Array, slope: Array, P: Array, v: Array, w: Array, g: Array, tau: float, e: float, f: float,
-    length: float, square: float,
-) -> None:  # fmt: skip
-    """Take in a new direction w of x at the first sample: k = F_tau w / (|z| |w|^2), v becomes the row of V."""
-    n = theta.shape[0]
-    for i in range(2 * n):
-        v[i] = w[i] / np.sqrt(square)
-        w[i] /= square * length
+@kernel
+def drifted(s: State, l: int) -> None:
+    """The same in square-root form."""
+    n = s.theta.shape[0]
+    dt = s.dt[l] * s.begun[l]
+    s.tau[l] += dt
+    shear(s.S, -dt, l)
     for i in range(n):
-        w[i] += tau * w[n + i]
-    for i in range(n):
-        theta[i] += w[i] * e
-        slope[i] += w[n + i] * e
-    for i in range(2 * n):
-        for j in range(i + 1):
-            P[i, j] += w[i] * w[j] * f - w[i] * g[j] - g[i] * w[j]
+        root = s.each[i, l] * np.sqrt(s.q[i, l])
+        s.H[i, n + i, l], s.H[n + i, n + i, l] = dt * root, root
+        s.theta[i, l] += dt * s.slope[i, l]
+    wander(s, np.sqrt(dt * s.drift[l]), l)
+    s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
 
 
 @kernel
 def enter(s: State, l: int) -> None:
-    """The correction while not all directions are known."""
-    n, known, tau = s.theta.shape[0], s.known[l], s.tau[l]
+    """The correction while the state is in square-root form."""
+    n = s.theta.shape[0]
+    y_hat = prediction(s, l)
     for i in range(n):
-        s.z[i, l] = s.phi[i, l]
-        s.z[n + i, l] = tau * s.phi[i, l]
-    length, square = outside(s.z[:, l], s.V[:, :, l], known, s.w[:, l])
-    if square <= TOLERANCE * TOLERANCE:
-        measurement(s, l)
-    else:
-        y_hat = prediction(s, l)
-        e = s.y[l] - y_hat
-        f = spread(s, l) + s.r[l] * s.noise[l]
-        if s.ok[l] > 0.0:
-            widen(
-                s.theta[:, l], s.slope[:, l], s.P[:, :, l], s.V[known, :, l], s.w[:, l], s.g[:, l], tau, e, f, length,
-                square,
-            )  # fmt: skip
-            s.F[known, l] = length * length * square
-            s.known[l] = known + 1
-            s.rank[l] = (known + 1) // 2
-        s.y_hat[l] = y_hat
-        s.e[l] = e
-        s.s[l] = np.inf
-
-
-@shared
-def spanned(P: Array, V: Array, known: int, tau: float, scale: float, var: Array) -> None:
-    """var = diag P times the scale where the regressors determine the level now, else inf."""
-    n = var.shape[0]
-    size = np.sqrt(1.0 + tau * tau)
+        s.x[i, l], s.x[n + i, l] = s.theta[i, l], s.slope[i, l]
+        s.z[i, l], s.z[n + i, l] = s.phi[i, l], 0.0
+    take_in_row(s, s.x.ctypes.data, s.z.ctypes.data, s.tau[l], l)
     for i in range(n):
-        rest = 1.0
-        for k in range(known):
-            rest -= ((V[k, i] + tau * V[k, n + i]) / size) ** 2
-        var[i] = P[i, i] * scale if rest < SPANNED else np.inf
+        s.theta[i, l], s.slope[i, l] = s.x[i, l], s.x[n + i, l]
+    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
 
 
 @kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
-    drift(s, l)
+    drifted(s, l)
     enter(s, l)
+    hand_over(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
-    spanned(s.P[:, :, l], s.V[:, :, l], s.known[l], s.tau[l], s.scale[l], s.var[:, l])
+    spanned_variance(s, l)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)

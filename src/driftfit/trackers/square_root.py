@@ -4,9 +4,8 @@
     correct   (phi' theta = y) / sqrt(r / w)                      absorb;  theta = S^-1 d,  P = S^-1 S^-T
               s = |S^-T phi|^2 + r / w,  e = y - phi' theta       with S before the sample
 
-Use it through ``Kalman(form="sqrt")``. Until the regressors span, theta and P are those of the diffuse start in
-covariance form, whose rank decides; what they leave is not used afterwards. The rotations are in
-`driftfit.trackers.information`.
+Use it through ``Kalman(form="sqrt")``. The diffuse start (`driftfit.trackers.diffuse`) is in this form too. The
+rotations are in `driftfit.trackers.information`.
 
 Source: Bierman (1977), chapter 6. Cost per sample: O(n^3).
 """
@@ -20,30 +19,18 @@ import numpy as np
 
 from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel
-from driftfit.trackers.diffuse import enter, prediction, spanned_variance
+from driftfit.trackers.diffuse import MACHINES, drifted, prediction, spanned_variance, take_in
 from driftfit.trackers.each import told
 from driftfit.trackers.information import absorb, invert, solve, spread, triangular_root
 
 
-def state(q: Array, theta0: Array, p0: Array | None) -> Mapping[str, Any]:
+def state(theta0: Array, p0: Array | None) -> Mapping[str, Any]:
     """Fields beside those of the covariance form."""
     from scipy import linalg  # a fifth of a second to import
 
     n = len(theta0)
     S = np.zeros((n, n)) if p0 is None else linalg.solve_triangular(triangular_root(p0), np.eye(n))
-    return {
-        "S": S, "d": S @ theta0, "R": np.zeros((n, n)), "G": triangular_root(q), "H": np.zeros((n, n)),
-        "row": np.zeros(n), "pivot": np.zeros(n), "x": np.zeros(n),
-    }  # fmt: skip
-
-
-def widen(S: Array, d: Array, p: Array) -> None:
-    """Let theta move by variances p, in place: `spread` on arrays of one lane, by one orthogonal triangle."""
-    n = len(d)
-    rows = np.block([[np.eye(n), np.zeros((n, n + 1))], [-S * np.sqrt(p), S, d[:, None]]])
-    left = np.asarray(np.linalg.qr(rows, mode="r"))[n : 2 * n, n:]
-    left *= np.where(np.diag(left) < 0.0, -1.0, 1.0)[:, None]
-    S[:], d[:] = left[:, :n], left[:, n]
+    return {"S": S, "d": S @ theta0, "row": np.zeros(n), "x": np.zeros(n)}
 
 
 @kernel
@@ -56,7 +43,7 @@ def grow(s: State, l: int) -> None:
 
 
 @kernel
-def take_in(s: State, l: int) -> None:
+def rotate_in(s: State, l: int) -> None:
     """Absorb the sample, if there is one."""
     root = np.sqrt(s.ok[l] / (s.r[l] * s.noise[l]))
     for i in range(s.theta.shape[0]):
@@ -98,22 +85,16 @@ def correct(s: State, l: int) -> None:
     s.y_hat[l] = prediction(s, l)
     s.e[l] = s.y[l] - s.y_hat[l]
     s.s[l] = innovation_variance(s, l) + s.r[l] * s.noise[l]
-    take_in(s, l)
+    rotate_in(s, l)
     read_out(s, l)
 
 
-def steps(drift: Any) -> TrackerSteps:
-    """The steps, with what the covariance form does in time, which the diffuse start still needs."""
+@kernel
+def begin(s: State, l: int) -> None:
+    drifted(s, s.dt[l] * s.drift[l], l)
+    take_in(s, l)
+    spanned_variance(s, l)
+    s.root[l] = 1 if s.rank[l] < s.theta.shape[0] else 0
 
-    @kernel
-    def begin(s: State, l: int) -> None:
-        drift(s, l)
-        grow(s, l)
-        enter(s, l)
-        spanned_variance(s, l)
-        take_in(s, l)
-        if s.rank[l] == s.theta.shape[0]:
-            read_out(s, l)
-            diagonal(s, l)
 
-    return TrackerSteps(grow, correct, diagonal, begin, told=told)
+STEPS = TrackerSteps(grow, correct, diagonal, begin, told=told, machines=MACHINES)

@@ -1,0 +1,126 @@
+"""Units and offsets decide nothing: estimates of records in any units are those of the scaled record in other units."""
+
+import numpy as np
+import pytest
+from nist import DATA, digits
+
+from driftfit import FLS, RLS, AdaptiveKalman, Bank, Kalman, Regression, track
+
+MODEL = Regression(2, intercept=True)
+TRACKERS = {
+    "Kalman": lambda f, fy: Kalman(q=1e-4 * (fy / f) ** 2, r=0.01 * fy**2),
+    "Kalman(sqrt)": lambda f, fy: Kalman(q=1e-4 * (fy / f) ** 2, r=0.01 * fy**2, form="sqrt"),
+    "RLS": lambda f, fy: RLS(0.98),
+    "RLS(directional)": lambda f, fy: RLS(0.98, kind="directional"),
+    "FLS": lambda f, fy: FLS(100.0 * f**2),
+    "FLS(differences=2)": lambda f, fy: FLS(100.0 * f**2, differences=2),
+    "AdaptiveKalman": lambda f, fy: AdaptiveKalman(),
+    "Bank": lambda f, fy: Bank(),
+}
+UNITS = [(1e-12, 1e12, 1.0), (1e12, 1e-12, 3e-12), (7e-5, 1.3e5, 1e12), (3e-9, 7e11, 5e-3)]
+
+
+def record(offset, T=200):
+    rng = np.random.default_rng(5)
+    at = np.array([0.0, offset])
+    x = rng.standard_normal((T, 2)) + at
+    theta = np.array([2.0, -1.0]) + np.cumsum(0.01 * rng.standard_normal((T, 2)), axis=0)
+    return 3.0 + np.sum(theta * (x - at), axis=1) + 0.1 * rng.standard_normal(T), x
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
+@pytest.mark.parametrize("kind", TRACKERS)
+def test_estimates_do_not_depend_on_units(kind, offset):
+    """Factors 1e-12 to 1e12 on every column and on y, offsets up to 1e6 standard deviations."""
+    y, x = record(offset)
+    size = np.array([1.0, np.hypot(1.0, offset), 1.0])
+    scaled = track(MODEL, TRACKERS[kind](size, 1.0), y, x)
+    spanned = np.isfinite(scaled.std)
+    assert spanned[10].all()
+    for a, b, c in UNITS:
+        f = np.array([a, b, 1.0])
+        run = track(MODEL, TRACKERS[kind](f * size, c), c * y, x * f[:2])
+        np.testing.assert_array_equal(np.isfinite(run.std), spanned)
+        error = np.abs(run.theta * f / c - scaled.theta)[spanned] / scaled.std[spanned]
+        # many filters at once, each a covariance: of sixteen digits offsets of 1e6 cost twelve
+        most = 1e-3 if kind in ("AdaptiveKalman", "Bank") and offset == 1e6 else 1e-6
+        assert error.max() < most
+        np.testing.assert_allclose((run.std * f / c)[spanned], scaled.std[spanned], rtol=most)
+
+
+def plain_si():
+    """A valve, a pressure in Pa; a flow in m3/s; seconds since 1970; a day's number; dollars."""
+    rng = np.random.default_rng(1)
+    T = 1000
+    v, w = rng.standard_normal((2, T))
+    pa = 101325.0 + 100.0 * w
+    flow = 3e-4 + 1e-5 * v
+    seconds = 1.7e9 + 60.0 * np.arange(T)
+    day = 738000.0 + np.arange(T)
+    dollars = 4e9 + 3e7 * w
+    noise = 0.1 * rng.standard_normal(T)
+    return {
+        "valve and pressure": (10.0 + 2.0 * v + w + noise, np.column_stack([v, pa])),
+        "flow and pressure": (10.0 + v + w + noise, np.column_stack([flow, pa])),
+        "seconds": (10.0 + v + 1e-4 * np.arange(T) + noise, np.column_stack([v, seconds])),
+        "days": (10.0 + v + 1e-2 * np.arange(T) + noise, np.column_stack([v, day])),
+        "dollars": (1e9 * (10.0 + v + w + noise), np.column_stack([v, dollars])),
+    }
+
+
+@pytest.mark.parametrize("name", plain_si())
+def test_records_as_they_come_are_followed_as_least_squares_and_the_smoother_say(name):
+    y, x = plain_si()[name]
+    spread = x.std(axis=0)
+    centred = np.column_stack([(x - x.mean(axis=0)) / spread, np.ones(len(y))])
+    found = np.linalg.lstsq(centred, y, rcond=None)[0]
+    slopes = found[:2] / spread
+    constant = np.append(slopes, found[2] - slopes @ x.mean(axis=0))
+    r = float(np.var(y - x @ slopes))
+    for tracker in (RLS(1.0), Kalman(q=0.0, r=r), Kalman(q=0.0, r=r, form="sqrt"), FLS(np.inf)):
+        run = track(MODEL, tracker, y, x)
+        assert np.isfinite(run.std[5]).all()
+        assert (np.abs(run.theta[-1] - constant) < 1e-6 * run.std[-1]).all()
+        if not isinstance(tracker, RLS):
+            assert (np.abs(run.theta[-1] - run.smooth().theta[-1]) < 1e-6 * run.std[-1]).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e4, 1e6])
+def test_the_filter_ends_where_the_smoother_does(offset):
+    y, x = record(offset)
+    f, size = np.array([1e-6, 1e7, 1.0]), np.array([1.0, np.hypot(1.0, offset), 1.0])
+    for kind in ("Kalman", "Kalman(sqrt)", "FLS", "FLS(differences=2)"):
+        run = track(MODEL, TRACKERS[kind](f * size, 1.0), y, x * f[:2])
+        smooth = run.smooth()
+        assert (np.abs(run.theta[-1] - smooth.theta[-1]) < 1e-6 * run.std[-1]).all()
+        np.testing.assert_allclose(run.std[-1], smooth.std[-1], rtol=1e-5)
+
+
+def test_what_is_never_excited_stays_unknown_and_spoils_nothing():
+    """An input at rest, and one that is a multiple of another in other units."""
+    y, x = record(0.0)
+    idle = track(MODEL, RLS(1.0), y, np.column_stack([1e-9 * x[:, 0], np.zeros(len(y))]))
+    assert np.isinf(idle.std[-1]).tolist() == [False, True, False]
+    found = np.linalg.lstsq(np.column_stack([x[:, 0], np.ones(len(y))]), y, rcond=None)[0]
+    np.testing.assert_allclose(idle.theta[-1, [0, 2]] * [1e-9, 1.0], found, rtol=1e-9)
+    twice = track(MODEL, RLS(1.0), y, np.column_stack([x[:, 0], 1.8e5 * x[:, 0] + 32.0]))
+    assert np.isinf(twice.std[-1]).all()
+    np.testing.assert_allclose(twice.prediction[-1], idle.prediction[-1], rtol=1e-9)
+
+
+LEAST = {"Longley": 10.5, "Filip": 5.0, "Wampler1": 9.0, "Wampler2": 12.0, "Wampler3": 7.0, "Wampler4": 5.0}
+LEAST |= {"Wampler5": 3.0}
+
+
+@pytest.mark.parametrize("name", DATA)
+def test_certified_values(name):
+    """NIST's data sets; the recursion may lose what `form="sqrt"` keeps, but not to more than a millionth of a std."""
+    y, X, certified, sd = DATA[name]
+    model, order = Regression(X.shape[1], intercept=True), [X.shape[1], *range(X.shape[1])]
+    run = track(model, RLS(1.0), y, X)
+    assert digits(run.theta[-1, order], certified) > LEAST[name]
+    if sd > 0.0:
+        assert (np.abs(run.theta[-1, order] - certified) < 1e-6 * run.std[-1, order]).all() or name == "Filip"
+    if name != "Filip":
+        root = track(model, Kalman(q=0.0, r=1.0, form="sqrt"), y, X)
+        assert digits(root.theta[-1, order], certified) > {"Wampler5": 6.5}.get(name, 9.0)
