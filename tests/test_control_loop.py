@@ -24,29 +24,30 @@ def again(live, t):
 
 
 @pytest.mark.parametrize(
-    ("model", "tracker", "y"),
+    ("model", "tracker", "y", "u"),
     [
-        (ARX(2, 2), K, Y),
-        (ARX(1, 1, ny=2), K, TWO),
-        (HammersteinWiener(2, 2, input=Legendre(2, (-4, 4))), OutputError(q=1e-4, r=0.1, q_w=0.1), Y),
+        (ARX(2, 2), K, Y, U),
+        (ARX(1, 1, ny=2), K, TWO, U),
+        (HammersteinWiener(2, 2, input=Legendre(2, (-4, 4))), OutputError(q=1e-4, r=0.1, q_w=0.1), Y, U),
+        (HammersteinWiener(1, 1, nk=[1, 2], input=[Legendre(2, (-4, 4)), None]), K, Y, np.column_stack([U, U[::-1]])),
     ],
-    ids=["ARX", "two outputs", "Hammerstein"],
+    ids=["ARX", "two outputs", "Hammerstein", "two inputs"],
 )
-def test_output_then_input_is_the_record(model, tracker, y):
+def test_output_then_input_is_the_record(model, tracker, y, u):
     whole, split = Live(model, tracker), Live(model, tracker)
     for t in range(len(y)):
-        assert all(same(a, b) for a, b in zip(whole.update(y[t], U[t]), split.update(y[t]), strict=True))
+        assert all(same(a, b) for a, b in zip(whole.update(y[t], u[t]), split.update(y[t]), strict=True))
         assert split.awaits
         split = again(split, t)
-        assert all(same(a, b) for a, b in zip(split.predict(U[t]), whole.predict(), strict=True))
+        assert all(same(a, b) for a, b in zip(split.predict(u[t]), whole.predict(), strict=True))
         if t in (7, 40):
-            ahead = whole.forecast(3, [*U[t + 1 : t + 3], 0.0])
-            assert all(same(a, b) for a, b in zip(split.forecast(3, U[t : t + 3]), ahead, strict=True))
-        split.apply(U[t])
+            ahead = whole.forecast(3, [*u[t + 1 : t + 3], 0.0 * u[0]])
+            assert all(same(a, b) for a, b in zip(split.forecast(3, u[t : t + 3]), ahead, strict=True))
+        split.apply(u[t])
         assert not split.awaits
         for name in set(fields(whole._tile)) - {"u"}:
             assert same(whole._tile[name], split._tile[name]), (t, name)
-    assert same(split.theta, track(model, tracker, y, U).theta[-1])
+    assert same(split.theta, track(model, tracker, y, u).theta[-1])
 
 
 def test_times_windows_and_warm_starts_go_along():

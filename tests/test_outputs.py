@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support import same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
 from driftfit.live_outputs import LiveOutputs
@@ -141,12 +142,16 @@ def test_summary_and_pictures():
     run = track(ARX(1, 1, ny=NAMES), Kalman(q=1e-5, r=0.01), y, u)
     assert "a1[flow<-level]" in run.summary()
     assert "b1[level<-u]" in run.summary()
-    assert len(run.plot().axes) == 2 * 3
+    drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in run.plot().axes}
+    assert drawn.keys() == {name for names in run.names for name in names}
+    for k, names in enumerate(run.names):
+        assert all(same(drawn[name], run.theta[:, k, i]) for i, name in enumerate(names))
     assert "level 119" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
     assert "One-step prediction error" in shared.summary()
-    assert shared.plot().axes
+    drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in shared.plot().axes}
+    assert all(same(drawn[name][1::2], shared.theta[:, i]) for i, name in enumerate(shared.names))
 
 
 def test_what_does_not_fit_is_named():

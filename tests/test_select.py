@@ -88,8 +88,8 @@ def test_average_is_the_recursion_written_out(said):
         raised /= raised.sum()
         assert got.weights[t] == pytest.approx(raised, abs=1e-9)
         likelihood = np.exp([p.loglik[t] for p in said.predictions])
-        w = raised * likelihood if np.isfinite(likelihood).all() else raised
-        w = np.maximum(w / w.sum(), 1e-300)
+        if np.isfinite(likelihood).all():
+            w = np.maximum(raised * likelihood / np.sum(raised * likelihood), 1e-300)
     t = 300
     y_k = np.array([p.y_hat[t] for p in said.predictions])
     s_k = np.array([p.s[t] for p in said.predictions])
@@ -98,6 +98,16 @@ def test_average_is_the_recursion_written_out(said):
     assert got.std[t] ** 2 == pytest.approx(got.weights[t] @ (s_k + (y_k - mean) ** 2))
     assert got.inclusion[t, 0] == pytest.approx(1.0)
     assert got.rms == pytest.approx(np.sqrt(np.mean((y - got.y_hat)[said.judged] ** 2)))
+
+
+def test_an_average_forgets_nothing_over_missing_samples(record):
+    """Weights after an outage are those before it; where outputs are seen again they go on."""
+    y, u = record[0].copy(), record[1]
+    y[200:260] = np.nan
+    got = select(ORDERS, y, u, tracker=K).average(0.9)
+    assert got.weights[259] == pytest.approx(got.weights[200], abs=1e-12)
+    assert got.weights[201:260] == pytest.approx(np.tile(got.weights[200], (59, 1)), abs=1e-12)
+    assert np.abs(got.weights[262:300] - got.weights[200]).max() > 1e-6
 
 
 def test_average_follows_a_change_of_structure():
@@ -132,8 +142,12 @@ def test_a_model_that_is_no_set_of_columns_runs_by_itself(record):
 def test_damaged_records_and_the_table(said):
     y, u = damaged(*arx_record(500, 3))
     assert select(ORDERS, y, u, tracker=K).model().n == 4
-    assert said.table.height == 4
-    assert said.best in str(said)
+    assert said.table["name"].to_list() == [row.name for row in said.rows]
+    assert said.table["below"].to_list() == sorted(row.below for row in said.rows)
+    lines = str(said).splitlines()
+    shown = [line for line in lines if line.startswith(" ARX(")]
+    assert [float(line.split()[-3]) for line in shown[:4]] == pytest.approx([row.below for row in said.rows], abs=0.06)
+    assert f" best: {said.best}" in lines
     assert len(said.plot().axes) == 2
 
 

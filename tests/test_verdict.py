@@ -8,10 +8,12 @@ from support import THETA, arx_record, damaged
 from driftfit import ARX, RLS, Kalman, Regression, track
 from driftfit.compare import compare
 from driftfit.judges.attribute import attribute, holm
-from driftfit.judges.constancy import constancy, robust_fit
+from driftfit.judges.constancy import constancy
 from driftfit.judges.constants import constant_least_squares
 from driftfit.judges.paired import newey_west, paired
 from driftfit.judges.quadratic import quantile, tail
+from driftfit.judges.robust import robust_fit
+from driftfit.judges.supremum import scanned, suprema, together
 from driftfit.judges.whiteness import crossing, whiteness
 
 BRIDGE = 1.0 / (np.pi * np.arange(1, 400)) ** 2
@@ -68,14 +70,108 @@ def test_null_is_that_of_a_naive_simulation(noise):
         S = F - A @ G @ F[-1]
         beyond.append(np.mean(np.einsum("ti,ij,tj->t", S, np.linalg.inv(V), S)) > L)
     assert got.joint == pytest.approx(L, rel=0.03)
-    assert got.p_joint == pytest.approx(np.mean(beyond), abs=0.04)
+    assert got.p_each[0] == pytest.approx(np.mean(beyond), abs=0.04)
 
 
-@pytest.mark.parametrize("noise", ["steady", "outliers", "changing"])
+@pytest.mark.parametrize("noise", ["steady", "outliers", "changing", "correlated"])
 def test_error_rate(noise):
-    """At level 0.2 within three standard errors of 50 records; the full table is benchmarks/verdict_error_rate.py."""
-    said = [constancy(*record(120, seed, noise)).p_joint < 0.2 for seed in range(50)]
-    assert abs(np.mean(said) - 0.2) < 3.0 * np.sqrt(0.16 / 50)
+    """Of 200 constant records 1 to 9 % are rejected at 5 %, three standard errors above; hardly any at 0.1 %.
+
+    The full table is benchmarks/verdict_error_rate.py.
+    """
+    made = correlated if noise == "correlated" else record
+    p = np.array([constancy(*made(seed=seed, T=250, **({} if made is correlated else {"noise": noise}))).p_joint
+                  for seed in range(200)])  # fmt: skip
+    assert 0.01 <= np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 200)
+    assert np.mean(p < 0.001) <= 0.01
+
+
+@pytest.mark.parametrize(("m", "n", "N"), [(48, 1, 480), (24, 3, 120)])
+def test_suprema_of_a_brownian_bridge_are_exceeded_as_often_as_they_say(m, n, N):
+    rng, t = np.random.default_rng(4), np.arange(1, m + 1) / m
+    cov = np.einsum("ab,ij->aibj", np.minimum.outer(t, t) - np.outer(t, t), np.eye(n))
+    p = []
+    for _ in range(1500):
+        path = np.cumsum(rng.normal(size=(m, n)), axis=0) / np.sqrt(m)
+        p.append(suprema(path - t[:, None] * path[-1], cov, np.arange(1, m + 1) * (N // m), 12, False))
+    for level in (0.1, 0.05, 0.01):
+        error = 3.0 * np.sqrt(level / 1500)
+        assert np.mean(np.array(p) < level, axis=0) == pytest.approx(level, abs=error + 0.25 * level)
+
+
+def test_quadratic_forms_are_those_of_plain_numpy():
+    """Q of one stretch, by solving with its covariance."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(36, 36))
+    cov, S = (root @ root.T).reshape(12, 3, 12, 3), rng.normal(size=(12, 3))
+    Q, left, right = scanned(S, cov)
+    moved = S[7] - S[2]
+    W = cov[7, :, 7] + cov[2, :, 2] - cov[7, :, 2] - cov[2, :, 7]
+    assert Q[3, 8] == pytest.approx(moved @ np.linalg.solve(W, moved), rel=1e-9)
+    step = cov[7, :, 7] + cov[6, :, 6] - cov[7, :, 6] - cov[6, :, 7]
+    assert right[3, 8] == pytest.approx(np.trace(np.linalg.solve(W, step)) / 6, rel=1e-9)
+    step = cov[3, :, 3] + cov[2, :, 2] - cov[3, :, 2] - cov[2, :, 3]
+    assert left[3, 8] == pytest.approx(np.trace(np.linalg.solve(W, step)) / 6, rel=1e-9)
+
+
+def test_p_values_together():
+    assert together(0.03, 0.03, 0.03) == pytest.approx(0.03)
+    assert together(1e-9, 1.0, 0.5) == pytest.approx(2e-9, rel=1e-3)
+    assert together(1.0, 1e-9, 0.5) == pytest.approx(4e-9, rel=1e-3)
+    assert together(0.03, np.nan, np.nan) == pytest.approx(0.03)
+    assert np.isnan(together(np.nan, np.nan))
+    rng = np.random.default_rng(1)
+    assert np.mean([together(*row) < 0.05 for row in rng.uniform(size=(4000, 3))]) == pytest.approx(0.05, abs=0.012)
+
+
+def fault(size, seed=0, to=860):
+    rng, t = np.random.default_rng(seed), np.arange(1000)
+    u = rng.normal(size=1000)
+    y = 32.0 - size * ((t >= 560) & (t < to)) + 0.2 * u + 0.5 * rng.normal(size=1000)
+    return np.column_stack([u, np.ones(1000)]), y
+
+
+def test_the_larger_a_fault_the_surer():
+    """A passing fault is not counted as noise: not one of 60 standard deviations, nor one of a thousand."""
+    for to in (860, 620):
+        p = np.array([[constancy(*fault(size, seed, to)).p_joint for size in (0.3, 1, 3, 30, 1000)] for seed in (0, 1)])
+        assert (p[:, 1:] < 1e-4).all()
+        assert (np.diff(p, axis=1) <= 1e-6).all()
+    phi, y = fault(0.0)
+    for size in (1.0, 10.0, 100.0):
+        assert constancy(phi, y + size * np.clip((np.arange(1000) - 700) / 60.0, 0.0, 1.0)).p_joint < 1e-4
+
+
+def test_a_passing_fault_is_told_as_such():
+    phi, y = fault(30.0)
+    said = track(Regression(1, intercept=True), Kalman(q=1e-3, r=0.25), y, phi[:, 0]).verdict()
+    assert said.moving == ("intercept",)
+    moved = said.parameters[1]
+    assert (moved.before, moved.after, moved.last) == pytest.approx((32.0, 2.0, 32.0), abs=0.2)
+    assert moved.at == pytest.approx(560, abs=5)
+    assert "from 32" in said.sentences[1]
+    assert "back to 3" in said.sentences[1]
+
+
+def test_what_returns_to_where_it_was_is_not_named_as_a_move():
+    """Whatever is named has moved by more than chance allows."""
+    for seed in range(6):
+        phi, y = record(300, seed)
+        y = y + 0.4 * phi[:, 0] * (np.arange(300) >= 150)
+        got = attribute(phi, y, constancy(phi, y), 0.05)
+        assert (np.abs(got.after - got.before)[got.moves] > 1.9 * got.std[got.moves]).all()
+
+
+def test_the_headline_is_one_statement_of_both_answers():
+    """A mean that wanders as noise does: it cannot be told from noise, but following it pays, and nothing denies that."""
+    rng = np.random.default_rng(3)
+    e = signal.lfilter([1.0], [1.0, -0.95], rng.normal(size=600))
+    said = track(Regression(0, intercept=True), Kalman(q=1.0, r=0.1), 5.0 + e).verdict()
+    assert said.drifts is False
+    assert said.pays
+    assert "No drift" not in str(said)
+    assert said.sentences[0].startswith("Something can be followed")
+    assert "smaller than that of constants" in said.sentences[0]
 
 
 def correlated(seed, T=300, rho=0.6, jump=0.0):
@@ -94,7 +190,7 @@ def test_correlated_noise_does_not_pass_for_drift():
         for jump, lags in ((0.0, 0), (0.0, None), (0.8, None))
     )
     assert plain > 0.3
-    assert allowed < 0.15
+    assert allowed <= 0.1
     assert found > 0.6
 
 
@@ -107,7 +203,9 @@ def test_white_scores_need_no_lags_and_drift_does_not_pass_for_correlation():
     jumped = y + 3.0 * phi[:, 1] * (np.arange(400) >= 200)
     assert constancy(phi, jumped).lags <= 5  # the rule of thumb
     assert constancy(phi, jumped).p_joint < 1e-4
-    assert constancy(*correlated(1)).lags >= 3
+    found = constancy(*correlated(1))
+    assert found.lags >= 1
+    assert found.noise.ar.sum() == pytest.approx(0.6, abs=0.15)
 
 
 def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
@@ -143,7 +241,7 @@ def test_steps_are_found_one_after_the_other_with_their_sizes():
     path = np.where(np.arange(600)[:, None] < 350, THETA, THETA + np.array([0.0, 0.0, 1.0, 0.0]))
     said = track(ARX(2, 2), Kalman(q=1e-3, r=0.01), *arx_record(600, 1, theta=path)).verdict()
     assert said.moving == ("b1",)
-    assert said.parameters[2].when == "350"
+    assert int(said.parameters[2].when) == pytest.approx(350, abs=3)
 
 
 def test_robust_fit_is_the_minimum_of_hubers_loss():
@@ -158,8 +256,8 @@ def test_robust_fit_is_the_minimum_of_hubers_loss():
 def test_verdict_of_constants_and_of_a_jump():
     y, u = arx_record(500, 2)
     steady = track(ARX(2, 2), Kalman(q=1e-4, r=0.01), y, u).verdict()
-    assert not steady.drifts
-    assert not steady.pays
+    assert steady.drifts is False
+    assert steady.pays is False
     assert steady.moving == ()
     assert "No drift found" in str(steady)
     path = np.where(np.arange(500)[:, None] < 250, THETA, THETA + np.array([0.0, 0.0, 0.5, 0.0]))
@@ -199,10 +297,14 @@ def test_records_that_can_tell_nothing():
     y, u = arx_record(20, 1)
     said = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict()
     assert np.isnan(said.p)
-    assert not said.drifts
-    assert "cannot tell" in said.sentences[0]
+    assert said.drifts is None
+    assert said.pays is None
+    assert "18 samples can be used, and 24 are the least" in said.sentences[0]
+    assert "0 samples are left after the first 50" in said.sentences[0]
+    assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
     same = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
     assert np.isnan(same.p)
+    assert same.drifts is None
     none = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), np.full(100, np.nan), np.ones(100)).verdict()
     assert none.samples == 0
 
@@ -222,7 +324,7 @@ def test_holm_by_hand():
     assert holm(np.array([np.nan, 0.001]), 0.05).tolist() == [False, True]
 
 
-@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 5}, {"lags": -1}])
+@pytest.mark.parametrize("wrong", [{"level": 0.0}, {"level": 5}, {"lags": -1}, {"burn": -1}])
 def test_wrong_settings(wrong):
     y, u = arx_record(60, 1)
     with pytest.raises(ValueError, match="verdict"):
@@ -232,10 +334,11 @@ def test_wrong_settings(wrong):
 def test_whiteness_does_not_mistake_changing_variance_for_correlation():
     """p-values of uncorrelated noise whose variance moves stay uniform; correlated noise is found."""
     p = []
-    for seed in range(200):
+    for seed in range(1000):
         z = np.random.default_rng(seed).normal(size=300) * np.where(np.arange(300) % 100 < 50, 1.0, 4.0)
         p.append(whiteness(z).p)
-    assert 0.0 <= np.mean(np.array(p) < 0.1) < 0.2
+    assert np.mean(np.array(p) < 0.1) == pytest.approx(0.1, abs=3.0 * np.sqrt(0.09 / 1000))
+    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=3.0 * np.sqrt(0.25 / 1000))
     z = np.random.default_rng(0).normal(size=300)
     assert whiteness(z[1:] + 0.5 * z[:-1]).p < 1e-4
     assert crossing(z[1:], z[:-1]).p > 0.001

@@ -12,6 +12,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener import HammersteinWiener
 from driftfit.models.regression import Regression
 from driftfit.result import Track
+from driftfit.segment import segment
 from driftfit.select import grid, select
 from driftfit.settings import DataWarning
 from driftfit.track import track
@@ -52,6 +53,7 @@ __all__ = [
     "Track",
     "frontier",
     "grid",
+    "segment",
     "select",
     "track",
     "tune",

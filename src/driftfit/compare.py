@@ -52,8 +52,16 @@ class Errors(NamedTuple):
     scored: Array
 
 
-def errors(run: Track) -> Errors:
-    """One-step errors of a run, of persistence, of constant least squares and of constant ARX."""
+def burn_in(n: int) -> int:
+    """Samples that are not scored where a model has n parameters."""
+    return max(50, 5 * n)
+
+
+def errors(run: Track, burn: int | None = None) -> Errors:
+    """One-step errors of a run, of persistence, of constant least squares and of constant ARX.
+
+    The first ``burn`` samples are not scored, max(50, 5 n) unless it is said.
+    """
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     steady = constant_least_squares(run.model, run.y, run.u, run._known)
     known = run._known[:, :3].copy()
@@ -63,7 +71,7 @@ def errors(run: Track) -> Errors:
     arx = constant_least_squares(small, y, u, known)
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     own = (tracked, y - persistence(y), constant, arx["e"][:, 0])
-    scored = np.arange(len(y)) >= max(50, 5 * run.model.n)
+    scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
     for error in own:
         scored &= np.isfinite(error)
     return Errors(*own, scored)

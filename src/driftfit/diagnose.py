@@ -30,7 +30,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.compare import errors
+from driftfit.compare import burn_in, errors
 from driftfit.drivers import LARGEST
 from driftfit.judges.constancy import Constancy, constancy
 from driftfit.judges.excitation import INDEX, Excitation, excitation
@@ -125,7 +125,7 @@ class Diagnosis(Printed):
 
 def diagnose(run: Track) -> Diagnosis:
     """Check a run; see the module for the numbers and their limits. Never raises for what the data are."""
-    start = max(50, 5 * run.model.n)
+    start = burn_in(run.model.n)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = run.innovation / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)

@@ -107,6 +107,7 @@ class TrackerSteps(NamedTuple):
     start from no knowledge at all. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs``
     name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a
     sample beside interval, noise and drift from the columns of ``known`` after the third, where there are some.
+    ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -115,6 +116,7 @@ class TrackerSteps(NamedTuple):
     begin: Step | None = None
     store: Any = nothing_more
     told: Any = nothing_told
+    note: Any = nothing_more
 
 
 def _common(n: int, m: int) -> dict[str, Any]:

@@ -130,9 +130,9 @@ class Shared:
         rows = self.rows
         return end_of(rows.model, (rows.tracker,), rows._tile, None if self._time is None else self._time[-1])
 
-    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
+    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
         """Do the shared parameters move? The verdict of the rows; see `driftfit.verdict`."""
-        return self.rows.verdict(level, lags)
+        return self.rows.verdict(level, lags, burn)
 
     def diagnose(self) -> Diagnosis:
         """What `Track.diagnose` says of the rows."""

@@ -248,7 +248,9 @@ def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Ru
         known[0, 0] *= first_interval(before, None if time is None else time[0], records.labels)
     tile = fresh_tile(model, tracker, start)
     out = drive(model, tracker, tile, y, u, known, keep)
-    return Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)
+    run = Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)
+    tracker.inspect(run)
+    return run
 
 
 def drive(model: Model, tracker: Tracker, tile: Array, y: Array, u: Array, known: Array, keep: str = "std") -> Array:

@@ -2,20 +2,23 @@
 
 Two questions that have different answers:
 
-* *Do the parameters move?* A score test of constant coefficients (Nyblom and Hansen, `driftfit.judges.constancy`)
-  whose null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
-  variance and changing inputs do not pass for drift. It asks the record, not the tracker: q and r do not enter. Where
-  constants are true, "they move" is said with probability ``level``, as ``benchmarks/verdict_error_rate.py`` verifies.
+* *Do the parameters move?* Score tests of constant coefficients (`driftfit.judges.constancy`): the mean square of
+  Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their null
+  distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise variance,
+  changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r do not
+  enter. Where constants are true, "they move" is said with probability ``level``, as
+  ``benchmarks/verdict_error_rate.py`` verifies.
 * *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
   constant ARX, on the same samples, with paired tests (`driftfit.judges.paired`).
 
-A parameter is named as one that moves where the joint test rejects, and its own still does when what was named before
-it is taken into account (`driftfit.judges.attribute`).
+The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
+rejects, its own still does when what was named before it is taken into account (`driftfit.judges.attribute`), and its
+values before and after differ by more than chance.
 
-A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The test finds from
-the record how many lags of correlation it must allow for, ``lags=`` sets them, and the verdict says so. Not for smooth
-fast oscillations: a parameter that swings many times within the record leaves little trace in a
-cumulated score. Cost: three constant fits, O(T n^2).
+A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
+autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
+wanders as fast as the noise itself passes for such noise. Not for smooth fast oscillations: a parameter that swings
+many times within the record leaves little trace in a cumulated score. Cost: three constant fits, O(T n^2).
 """
 
 from __future__ import annotations
@@ -26,9 +29,10 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
-from driftfit.compare import errors
+from driftfit.compare import burn_in, errors
 from driftfit.judges.attribute import Attribution, attribute
-from driftfit.judges.constancy import Constancy, constancy
+from driftfit.judges.constancy import Constancy, constancy, least_rows
+from driftfit.judges.paired import LEAST as COMPARED
 from driftfit.judges.paired import Paired, paired
 from driftfit.judges.regressors import Rows, regressors
 from driftfit.judges.whiteness import whiteness
@@ -38,7 +42,7 @@ from driftfit.summary import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "constant ARX")
 CORRELATED = 1e-3
-"""Below this p-value of whiteness the residuals of constant coefficients are said to be correlated."""
+"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,9 @@ class Moved:
 
     ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
     parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
-    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``, ``after``: its value before
-    its first and after its last step, ``std`` the standard error of their difference.
+    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
+    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
+    after the last step, which is ``before`` again after a fault that passed.
     """
 
     name: str
@@ -61,6 +66,7 @@ class Moved:
     before: float
     after: float
     std: float
+    last: float
 
 
 @dataclass(frozen=True)
@@ -69,12 +75,15 @@ class Verdict(Printed):
 
     Attributes
     ----------
-    drifts : bool
-        The parameters move: ``p`` is below ``level``.
-    pays : bool
-        The run predicts better than constant least squares on the past: its paired p-value is below ``level``.
-    p, statistic : float
+    drifts : bool or None
+        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+    pays : bool or None
+        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
+        where there are too few samples to compare.
+    p : float
         Joint test of all parameters; NaN where the record cannot tell.
+    statistic : float
+        Its part that is Nyblom's.
     level : float
         Error rate: how often constants are said to move.
     parameters : tuple of Moved
@@ -85,13 +94,15 @@ class Verdict(Printed):
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        The residuals of constant coefficients are correlated, so that p may be too small.
+        The residuals are correlated, also within segments of constant coefficients.
     lags : int
         Lags of correlation that were allowed for.
+    burn : int
+        Samples at the beginning that are not scored.
     """
 
-    drifts: bool
-    pays: bool
+    drifts: bool | None
+    pays: bool | None
     p: float
     statistic: float
     level: float
@@ -102,6 +113,7 @@ class Verdict(Printed):
     scored: int
     correlated: bool
     lags: int
+    burn: int
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -111,13 +123,27 @@ class Verdict(Printed):
     @property
     def sentences(self) -> tuple[str, ...]:
         """The verdict in words."""
-        return tuple(filter(None, (self._drift(), self._which(), self._gain(), self._caution())))
+        return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
-        if np.isnan(self.p):
-            return "The record cannot tell whether parameters move: too few samples, or regressors that do not span."
+        if self.drifts is None:
+            least = least_rows(len(self.parameters))
+            short = f"{self.samples} samples can be used, and {least} are the least that tell."
+            alike = "its regressors do not tell the parameters apart, or explain it without error."
+            return f"The record cannot say whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
             return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
+        if self.pays:
+            reason = (
+                "once correlated noise is allowed for. A model with too few lags has that, and a parameter that "
+                "wanders as fast looks the same."
+                if self.lags
+                else "by a test of the whole record, which a small or a fast drift escapes."
+            )
+            return (
+                "Something can be followed, but it is not shown that parameters move: constants are not rejected "
+                f"({p_equals(self.p)}, level {self.level:g}) {reason}"
+            )
         return (
             f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
             "A drift that is small beside the noise cannot be ruled out."
@@ -128,17 +154,20 @@ class Verdict(Printed):
             return ""
         if not self.moving:
             return "Which of them moves cannot be told: their regressors are too alike, or the move is spread over all."
-        told = [f"{m.name} from {m.before:.4g} to {m.after:.4g} about {m.when}" for m in self.parameters if m.moves]
-        return f"It is {'; '.join(told)}."
+        return f"It is {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
         steady = self.rivals[1]
-        if np.isnan(steady.p):
-            return "There are too few samples to compare predictions."
+        if self.pays is None:
+            return (
+                f"Predictions cannot be compared: {self.scored} samples are left after the first {self.burn}, and "
+                f"{COMPARED} are the least; burn= leaves out fewer."
+            )
         change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            return f"Following them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            follow = "Following the parameters pays" if self.drifts else "Following it pays"
+            return f"{follow}: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
         return (
             f"Following them does not clearly pay here: the one-step error is {size} than that of constants "
             f"({p_equals(steady.p)})."
@@ -149,8 +178,9 @@ class Verdict(Printed):
         told = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             told += (
-                "The residuals of constant coefficients are correlated: a drift does that, and so does a model with "
-                f"too few lags. The test allows for {self.lags} lags of correlation; try one more lag in the model."
+                "The residuals are correlated, also where parameters are constant: a model with too few lags does that, "
+                f"and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} of it; "
+                "try one more lag in the model."
             )
         return told.strip()
 
@@ -159,7 +189,7 @@ class Verdict(Printed):
             yield Text(f" {sentence}")
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
-            shown = (f"{m.statistic:.3f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            shown = (f"{m.statistic:.3g}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
             change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
             table.add_row(Text(m.name), *shown, *change)
         yield table
@@ -169,6 +199,15 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def _told(moved: Moved) -> str:
+    """What one parameter did, in words."""
+    text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
+    if abs(moved.last - moved.after) <= 2.0 * moved.std:
+        return text
+    back = "back to" if abs(moved.last - moved.before) < abs(moved.last - moved.after) else "then"
+    return f"{text}, {back} {moved.last:.4g} at the end"
 
 
 def p_text(p: float) -> str:
@@ -181,7 +220,7 @@ def p_equals(p: float) -> str:
     return f"p {p_text(p)}" if p < 1e-4 else f"p = {p_text(p)}"
 
 
-def verdict(run: Track, level: float = 0.05, lags: int | None = None) -> Verdict:
+def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
     """Judge a run.
 
     Parameters
@@ -193,45 +232,54 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None) -> Verdict
     lags : int or None
         Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
         one-step errors are known to be white.
+    burn : int or None
+        So many samples at the beginning are not scored; max(50, 5 n) by default.
 
     Raises
     ------
     ValueError
-        If level is not between 0 and 1, or lags is negative.
+        If level is not between 0 and 1, or lags or burn is negative.
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"verdict: level must be between 0 and 1, such as 0.05; got {level!r}.")
-    if lags is not None:
-        whole("verdict", "lags", lags, 0)
+    for name, given in (("lags", lags), ("burn", burn)):
+        if given is not None:
+            whole("verdict", name, given, 0)
+    burn = burn_in(run.model.n) if burn is None else burn
     rows = regressors(run)
     test = constancy(rows.phi, rows.y, lags)
-    drifts = bool(test.p_joint < level)
+    drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
-    parameters = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
-    own, *others, scored = errors(run)
+    own, *others, scored = errors(run, burn)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
-        pays=bool(rivals[1].p < level),
+        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
         p=test.p_joint,
         statistic=test.joint,
         level=level,
-        parameters=parameters,
+        parameters=tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p))),
         rms=root_mean_square(own[scored]),
         rivals=rivals,
         samples=len(rows.y),
         scored=int(scored.sum()),
-        correlated=bool(whiteness(test.fit.residual).p < CORRELATED),
+        correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
         lags=test.lags,
+        burn=burn,
     )
 
 
 def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
-    name, at = run.model.names[i], steps.first(i) if steps else None
-    own = float(test.p_own[i] if steps is None else steps.p[i])
-    if steps is None or at is None:
-        sample, sides = int(rows.at[min(int(test.at[i]), len(rows.at) - 1)]) if len(rows.at) else 0, (np.nan,) * 3
+    name = run.model.names[i]
+    if steps is None or not steps.moves[i]:
+        at = min(int(test.at[i]), len(rows.at) - 1)
+        own, sides = float(test.p_own[i] if steps is None else steps.p[i]), (np.nan,) * 4
     else:
-        sample, sides = int(rows.at[at]), (float(steps.before[i]), float(steps.after[i]), float(steps.std[i]))
-    when = run.time_text(sample)
-    return Moved(name, float(test.L[i]), float(test.p[i]), own, at is not None, sample, when, *sides)
+        at = steps.first(i)
+        own, sides = (
+            float(steps.p[i]),
+            tuple(float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last)),
+        )
+    sample = int(rows.at[at]) if len(rows.at) else 0
+    named = steps is not None and bool(steps.moves[i])
+    return Moved(name, float(test.L[i]), float(test.p[i]), own, named, sample, run.time_text(sample), *sides)

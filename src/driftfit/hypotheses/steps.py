@@ -43,6 +43,7 @@ from driftfit.kernel import Array, State, exp, floats, kernel, log, nothing, who
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.diffuse import enter, measurement, spanned_variance
 from driftfit.trackers.excitation import learn_scales
+from driftfit.trackers.resolution import resolve
 
 
 @kernel
@@ -133,11 +134,12 @@ def tell(s: State, l: int) -> None:
     s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
-    s.now[R, l], s.now[LEAST, l] = s.r[l], FLOOR * s.power[l] + 1e-300
+    s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    resolve(s, l)
     if s.many[SETTLED, l] > 0:
         tell(s, l)
         run(s, l)
@@ -152,6 +154,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
+    resolve(s, l)
     only_drift(s, l)
     enter(s, l)
     alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)

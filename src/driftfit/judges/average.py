@@ -5,7 +5,7 @@
 
 so that log w_k(t) = a log w_k(t-1) + log p_k(y_t) up to a constant that all share: an exponentially weighted sum of
 log-likelihoods. The averaged prediction is the mean of the mixture, its variance that of the mixture. A sample that one
-structure cannot predict moves no weights. The weight of a regressor is that of all structures that have it.
+structure cannot predict moves no weights: nothing is learned, and nothing forgotten. The weight of a regressor is that of all structures that have it.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1), equations 15 to 17. Cost: O(T K).
 """
@@ -51,9 +51,10 @@ def averaged(
     """Average predictions; ``scored`` (T,) says where they are judged."""
     terms = np.stack([p.loglik for p in predictions], axis=1)
     known = np.isfinite(terms).all(axis=1)
-    steps = np.where(known[:, None], terms - np.max(np.where(known[:, None], terms, 0.0), axis=1, keepdims=True), 0.0)
-    total = signal.lfilter([1.0], [1.0, -forgetting], steps, axis=0)
-    before = np.concatenate([np.zeros((1, terms.shape[1])), forgetting * total[:-1]])
+    seen = terms[known]
+    steps = seen - seen.max(axis=1, keepdims=True)
+    total = np.concatenate([np.zeros((1, terms.shape[1])), signal.lfilter([1.0], [1.0, -forgetting], steps, axis=0)])
+    before = forgetting * total[np.cumsum(known) - known]
     log_weights = special.log_softmax(before, axis=1)
     weights = np.exp(log_weights)
     y_k, s_k = (np.stack([getattr(p, name) for p in predictions], axis=1) for name in ("y_hat", "s"))

@@ -6,33 +6,22 @@
              it is by chance: 2 n / N where the noise is steady
     lags     1.1447 (4 rho^2 / (1 - rho^2)^2 N)^(1/3)      best for a Bartlett window and an autoregression
 
-rho belongs to the most correlated of all combinations of the scores, however the regressors are scaled or combined. A
-drift makes the residuals of constant coefficients correlated too, and a test that allowed for all of that would not
-find it. So two numbers are taken, and the larger one holds: the lags of coefficients that are fitted anew in each of up
-to four parts of the record, where most of a drift is gone and the correlation of the noise is not; and the lags of
-constant coefficients, but at most 4 (N / 100)^(2/9), the rule of thumb, which a drift that matters survives.
+rho belongs to the most correlated of all combinations of the scores, however the regressors are scaled or combined.
 
-Source: Andrews (1991), equations 5.3 and 6.4. Newey and West (1994) for the rule of thumb. Departures: one direction
-instead of weights, parts, and the chance.
+Source: Andrews (1991), equations 5.3 and 6.4. Newey and West (1994) for the rule of thumb, 4 (N / 100)^(2/9).
+Departures: one direction instead of weights, and the chance.
 """
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import numpy as np
 
 from driftfit.kernel import Array
 
-PARTS = 4
-ROWS = 10
-"""At least so many samples for each parameter in a part."""
 
-
-def automatic(phi: Array, constant: Array, by_part: Array) -> int:
-    """Lags for regressors phi (N, n) and bounded residuals (N,) of constants, and of coefficients of each part."""
-    rule = int(4.0 * (len(phi) / 100.0) ** (2.0 / 9.0))
-    return max(plugged_in(phi, by_part), min(plugged_in(phi, constant), rule))
+def rule_of_thumb(N: int) -> int:
+    """4 (N / 100)^(2/9)."""
+    return int(4.0 * (N / 100.0) ** (2.0 / 9.0))
 
 
 def plugged_in(phi: Array, psi: Array) -> int:
@@ -50,10 +39,3 @@ def plugged_in(phi: Array, psi: Array) -> int:
     chance = 2.0 * float(size[1:] @ size[:-1]) / (len(G) * N * N)
     square = min(max(largest**2 - chance, 0.0), 0.9)
     return min(int(1.1447 * (4.0 * square / (1.0 - square) ** 2 * N) ** (1.0 / 3.0)), N // 8)
-
-
-def parts(N: int, n: int) -> list[slice]:
-    """Where the record is cut."""
-    count = max(1, min(PARTS, N // (ROWS * n)))
-    edges = np.linspace(0, N, count + 1).astype(int)
-    return [slice(a, b) for a, b in pairwise(edges)]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
+from rich.progress import Progress
 from rich.text import Text
 
 from driftfit.diagnose import Diagnosis, diagnose
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from driftfit.result import Track
 
 SHOWN = 20
+BAR = 100
+"""Runs from which on there is a progress bar."""
 
 Said = TypeVar("Said")
 
@@ -60,6 +63,13 @@ class Judgement:
     def moving(self) -> tuple[str, ...]:
         """Names of the parameters that move."""
         return self.said.moving if self.drifts else ()
+
+    @property
+    def relative(self) -> float:
+        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named."""
+        moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(max((np.abs(np.divide(m.after - m.before, m.before)) for m in moved), default=0.0))
 
     @property
     def change(self) -> str:
@@ -94,6 +104,15 @@ class ManyVerdicts(Printed):
             if row.key == key:
                 return row
         raise KeyError(f"there is no verdict of {key!r}.")
+
+    def ranked(self, by: str = "clearest") -> ManyVerdicts:
+        """The same rows in another order: the "clearest" first, or the largest relative "change" first."""
+        if by not in ("clearest", "change"):
+            raise ValueError(f"ranked: by must be 'clearest' or 'change'; got {by!r}.")
+        clear = sorted(self.rows, key=lambda row: (np.isnan(row.q), row.said.p, -row.said.statistic))
+        if by == "change":
+            clear.sort(key=lambda row: -row.relative)
+        return ManyVerdicts(tuple(clear), self.level)
 
     @property
     def drifting(self) -> tuple[Hashable, ...]:
@@ -133,6 +152,7 @@ class ManyVerdicts(Printed):
                 "drifts": [row.drifts for row in self.rows],
                 "moving": [", ".join(row.moving) for row in self.rows],
                 "change": [row.change for row in self.rows],
+                "relative": [row.relative for row in self.rows],
                 "rms": [row.said.rms for row in self.rows],
                 "constant_ls": [row.said.rivals[1].rms for row in self.rows],
                 "pays": [row.pays for row in self.rows],
@@ -211,9 +231,11 @@ class ManyDiagnoses(Printed):
         yield table
 
 
-def verdicts(runs: Mapping[Hashable, Track], level: float, lags: int | None) -> ManyVerdicts:
+def verdicts(
+    runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
+) -> ManyVerdicts:
     """Judge runs by key; see `driftfit.verdict.verdict` for the settings and errors."""
-    said = _each(runs, lambda run: verdict(run, level, lags))
+    said = _each(runs, lambda run: verdict(run, level, lags, burn), "verdict")
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.rivals[1].p for v in said.values()])
     )
@@ -221,20 +243,23 @@ def verdicts(runs: Mapping[Hashable, Track], level: float, lags: int | None) -> 
         Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))
         for (key, one), a, b in zip(said.items(), q, q_pays, strict=True)
     ]
-    rows.sort(key=lambda row: (np.isnan(row.q), row.said.p, -row.said.statistic))
-    return ManyVerdicts(tuple(rows), level)
+    return ManyVerdicts(tuple(rows), level).ranked("clearest")
 
 
 def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
     """Diagnose runs by key."""
-    return ManyDiagnoses(_each(runs, diagnose))
+    return ManyDiagnoses(_each(runs, diagnose, "diagnosis"))
 
 
-def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said]) -> dict[Hashable, Said]:
+def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: str) -> dict[Hashable, Said]:
     """What is said of each run, on all cores; the first is alone, so that only one thread compiles."""
     from driftfit.fleet import cores
 
     keys, tracks = list(runs), list(runs.values())
     first = [judge(track) for track in tracks[:1]]
-    with ThreadPoolExecutor(cores()) as pool:
-        return dict(zip(keys, [*first, *pool.map(judge, tracks[1:])], strict=True))
+    with (
+        Progress(console=Console(stderr=True), transient=True, disable=len(tracks) < BAR) as progress,
+        ThreadPoolExecutor(cores()) as pool,
+    ):
+        rest = progress.track(pool.map(judge, tracks[1:]), total=len(tracks) - 1, description=what)
+        return dict(zip(keys, [*first, *rest], strict=True))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from driftfit.judges.many_alarms import ManyAlarms
     from driftfit.kernel import Array
     from driftfit.result import Track
+    from driftfit.segment import Segmentation
     from driftfit.simulate import Prediction
     from driftfit.system import FrequencyResponse, LongRun, Response
     from driftfit.verdict import Verdict
@@ -28,11 +29,11 @@ class JudgedMany:
     def _runs(self) -> dict[Hashable, Track]:
         raise NotImplementedError
 
-    def verdict(self, level: float = 0.05, lags: int | None = None) -> ManyVerdicts:
+    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
         from driftfit.judges.many import verdicts
 
-        return verdicts(self._runs(), level, lags)
+        return verdicts(self._runs(), level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
         """What `Track.diagnose` says of each, and how often each number is out of bounds."""
@@ -80,11 +81,17 @@ class JudgedMany:
 class Judged:
     """Questions to a run. Each is a module of its own, imported when it is asked."""
 
-    def verdict(self, level: float = 0.05, lags: int | None = None) -> Verdict:
+    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
         """Is the time variation real, which parameters move, and does following them pay? See `driftfit.verdict`."""
         from driftfit.verdict import verdict
 
-        return verdict(cast("Track", self), level, lags)
+        return verdict(cast("Track", self), level, lags, burn)
+
+    def segment(self, **settings: Any) -> Segmentation:
+        """Segments of the whole record with constant parameters, with dates and their intervals; `driftfit.segment`."""
+        from driftfit.segment import segmented
+
+        return segmented(cast("Track", self), **settings)
 
     def diagnose(self) -> Diagnosis:
         """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.diagnose`."""

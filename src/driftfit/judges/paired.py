@@ -17,6 +17,9 @@ import numpy as np
 
 from driftfit.kernel import Array
 
+LEAST = 10
+"""Fewest errors that are compared."""
+
 
 class Paired(NamedTuple):
     """A rival beside the run: its root mean square error, the t statistic and p-value of being worse than the run."""
@@ -41,7 +44,7 @@ def newey_west(d: Array) -> float:
 def paired(name: str, rival: Array, own: Array) -> Paired:
     """Compare the one-step errors (N,) of a rival with those of a run; NaN where there are fewer than ten."""
     rms = float(np.sqrt(np.mean(rival * rival))) if len(rival) else float("nan")
-    if len(own) < 10:
+    if len(own) < LEAST:
         return Paired(name, rms, float("nan"), float("nan"))
     d = rival * rival - own * own
     v = newey_west(d)

@@ -14,11 +14,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from driftfit.kernel import Array
+from driftfit.kernel import Array, Driver, exp, log
 
-TERMS = 256
-MOST = 256
-"""Terms of the sum that are taken at once, and how many times at the most."""
+TERMS = 65536
+"""Terms of the sum at the most."""
 SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 
@@ -36,18 +35,29 @@ def tail(weights: Array, x: float) -> float:
     w = weights[kept] / largest
     if x <= 0.0:
         return 1.0
-    step = 2.0 * np.pi / (x + w.sum() + 60.0)
-    total = 0.0
-    for first in range(0, MOST * TERMS, TERMS):
-        k = np.arange(first, first + TERMS) + 0.5
+    total = np.zeros(1)
+    _invert(np.ascontiguousarray(w), np.array([x]), total)
+    return float(np.clip(0.5 + total[0], 0.0, 1.0))
+
+
+def _inverted(w: Array, x: Array, total: Array) -> None:
+    """The sum, until its terms have vanished."""
+    step = 2.0 * np.pi / (x[0] + w.sum() + 60.0)
+    for term in range(TERMS):
+        k = term + 0.5
         v = k * step
-        scaled = 2.0 * v[:, None] * w
-        angle = 0.5 * np.arctan(scaled).sum(axis=1) - v * x
-        size = np.exp(-0.25 * np.log1p(scaled * scaled).sum(axis=1)) / (np.pi * k)
-        total += float(np.sum(size * np.sin(angle)))
-        if size[-1] < 1e-9:
+        angle, log_size = -v * x[0], 0.0
+        for j in range(w.shape[0]):
+            scaled = 2.0 * v * w[j]
+            angle += 0.5 * np.arctan(scaled)
+            log_size -= 0.25 * log(1.0 + scaled * scaled)
+        size = exp(log_size) / (np.pi * k)
+        total[0] += size * np.sin(angle)
+        if size < 1e-9:
             break
-    return float(np.clip(0.5 + total, 0.0, 1.0))
+
+
+_invert = Driver(_inverted)
 
 
 def quantile(weights: Array, p: float) -> float:

@@ -89,6 +89,11 @@ def constants(n: int) -> RandomWalk:
     return RandomWalk(np.zeros((n, n)), None, np.zeros(n), None, at_first_sample=True)
 
 
+def free(n: int) -> RandomWalk:
+    """Parameters whose drift is given for every sample, and the noise too, of which nothing is known."""
+    return RandomWalk(np.eye(n), 1.0, np.zeros(n), None)
+
+
 class Path(NamedTuple):
     """What a smoother found; covariances are relative to the noise variance."""
 
@@ -126,20 +131,19 @@ def collect(o: State, s: State, l: int) -> None:
     o.valid[l] = s.valid[l]
 
 
-@kernel
-def collect_all(o: State, s: State, l: int) -> None:
-    """The same, and the factor of the noise variance that the correction used."""
-    collect(o, s, l)
-    o.used_noise[l] = s.used_noise[l]
-
-
 @lru_cache
 def attentive(steps: TrackerSteps) -> TrackerSteps:
-    """Steps that note the factor of the noise variance when the tracker is at work.
+    """Steps that note the factor of the noise variance when the tracker is at work, and what the tracker notes itself.
 
     A model may make it larger than what the user gave (measurement noise that comes in through a curve).
     """
-    predict, begin = steps.predict, steps.begin
+    predict, begin, note = steps.predict, steps.begin, steps.note
+
+    @kernel
+    def collect_all(o: State, s: State, l: int) -> None:
+        collect(o, s, l)
+        note(o, s, l)
+        o.used_noise[l] = s.used_noise[l]
 
     @kernel
     def noting(s: State, l: int) -> None:
@@ -165,7 +169,7 @@ def replay(run: Track) -> Array:
     """
     model, tracker = run.model, run.tracker
     tile = make_tile(model.n, model.m, model.memory(), [{**tracker.state_for(model), "used_noise": 1.0}])
-    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise")))
+    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *tracker.noted)))
     steps = attentive(tracker.steps_for(model))
     drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
     return out
@@ -176,12 +180,18 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
 
     ``prior`` replaces what the tracker takes theta to be.
     """
-    each = run._known[:, 3:] if prior is None and run._known.shape[1] > 3 else NONE
-    prior = run.tracker.random_walk(run.model) if prior is None else prior
+    own, tracker = prior is None, run.tracker
+    each = run._known[:, 3:] if own and run._known.shape[1] > 3 else NONE
+    if prior is None:
+        prior = free(run.model.n) if tracker.noted else tracker.random_walk(run.model)
     seen = replay(run)
     dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
     weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run._known[:, 2]
+    if own and tracker.noted:
+        noted = {name: seen[name][..., 0] for name in tracker.noted}
+        q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
+        each, weight, drift = np.sqrt(q), weight / r_of, np.ones(len(drift))
     trend = dt if prior.slopes else NONE
     if prior.at_first_sample or prior.p0 is None:
         first = int(np.argmax(dt > 0.0)) + 1

@@ -87,3 +87,22 @@ def furnace(seed: int = 0, T: int = 5000, reach: float = 3.0) -> Furnace:
         if L.min() > SHORTEST and L.max() < LONGEST:
             return Furnace(u, resistance(L, gradient), L, gradient, v)
         seed += 1000
+
+
+class Switching(NamedTuple):
+    """Voltage u (T,), current i (T,) and conductance g (T,) of an arc."""
+
+    u: Array
+    i: Array
+    g: Array
+
+
+def switching(
+    seed: int = 0, T: int = 3000, half: int = 50, low: float = 0.02, high: float = 4.0, noise: float = 0.05
+) -> Switching:
+    """An arc that burns in every other half period of its voltage: i = g u + v, u a sine of ``half`` samples a half
+    period and amplitude 1, g switching between ``low`` and ``high``, v white with standard deviation ``noise``.
+    """
+    t = np.arange(T)
+    u, g = np.sin(np.pi * (t + 0.5) / half), np.where(t // half % 2 == 0, low, high)
+    return Switching(u, g * u + noise * np.random.default_rng(seed).normal(size=T), g)

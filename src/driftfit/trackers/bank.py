@@ -54,6 +54,7 @@ from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.signals import as_numbers, factor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import knowing, knowing_nothing
+from driftfit.trackers.resolution import resolution, unresolved
 
 FAR = 100.0
 """Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
@@ -264,7 +265,7 @@ class Bank(Tracker):
             **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "now": now, "many": many,
+            "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             "q0": arrays["Q"][0, : n * (n + 1) // 2], "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
@@ -357,7 +358,8 @@ class Bank(Tracker):
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
-        return tuple(said)
+        lane = run.end().state
+        return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     @property
     def steps(self) -> TrackerSteps:

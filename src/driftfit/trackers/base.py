@@ -51,6 +51,8 @@ class Tracker(Settings, ABC):
     outputs: ClassVar[tuple[str, ...]] = ()
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
+    noted: ClassVar[tuple[str, ...]] = ()
+    """Fields of the record that `varying` needs of every sample; ``steps.note`` stores them when a run is replayed."""
     drift_each: ClassVar[bool] = False
     """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
     adapts: ClassVar[bool] = False
@@ -109,6 +111,13 @@ class Tracker(Settings, ABC):
             "track with FLS or Kalman."
         )
 
+    def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
+        """Variances of the drift before each sample (T, n), and of its noise (T,), for a tracker that finds its own.
+
+        ``noted`` (T, ..) are the fields that ``noted`` names, e (T,) the innovations, time (T,) the intervals of drift.
+        """
+        raise NotImplementedError
+
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
         if prob is None and drift is not None and self.drift_each:
@@ -161,6 +170,9 @@ class Tracker(Settings, ABC):
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         """What the summary of a run should say beside its numbers: a name and a sentence each."""
         return ()
+
+    def inspect(self, run: Any) -> None:
+        """Warn of what a record could not tell; `track` calls it with the run of a single series."""
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""

@@ -8,6 +8,10 @@ T moves one rung up or down, and from every rung straight to the top, which is h
 the top straight back to the bottom: mixing the wide covariance of the top filter into the filter without drift costs
 more than all else when nothing moves (measured: 1.8 times the error of least squares instead of 1.15).
 
+The top filter may also *leap*: where a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
+deviations of the output (times patience, `driftfit.trackers.proportion`), explains the sample better by more than a
+factor 1 / RARE, its covariance grows by that move.
+
 Source: Blom and Bar-Shalom (1988); the ladder and its transitions are ours. Cost per sample: O(K^2 n^2) for K modes,
 vectorised over the modes that receive.
 """
@@ -18,11 +22,17 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array, State, kernel
+from driftfit.kernel import Array, State, kernel, log
 
 LADDER = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0)
 UP, DOWN, JUMP, BACK = 0.0005, 0.002, 0.0015, 0.1
 """Probabilities: to the rung above, to the one below, to the top, and from the top to the rung below it."""
+
+
+TOP = len(LADDER) - 1
+"""The mode at the top of the ladder that all parameters climb."""
+LEAP, RARE = 3.0, 0.02
+"""Standard deviations of the output that a leap may reach, and its prior probability in the top mode."""
 
 
 def ladders(n: int, groups: Any) -> tuple[Array, Array]:
@@ -58,6 +68,8 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "m": np.zeros((n, K)),
         "m_next": np.zeros((n, K)),
         "C": np.zeros((n, n, K)),
+        "rare": 1.0,
+        "leapt": 0.0,
     }
 
 
@@ -94,3 +106,23 @@ def mix(s: State, l: int) -> None:
     for a in range(n):
         for j in range(K):
             s.m[a, j, l] = s.m_next[a, j, l]
+
+
+@kernel
+def leap(s: State, l: int, noise: float) -> None:
+    """Let the top filter explain the innovation by a move as large as it takes, where that is the likelier."""
+    most = LEAP * s.patience[l]
+    square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
+    for i in range(s.theta.shape[0]):
+        own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        unit += own * s.phi[i, l] * s.phi[i, l]
+    wide = max(v, min(square, most * most * s.spread[l]))
+    better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
+    s.rare[l], s.leapt[l] = 1.0, 0.0
+    if better and unit > 0.0:
+        s.rare[l], s.leapt[l] = RARE, (wide - v) / unit
+        for i in range(s.theta.shape[0]):
+            own = s.leapt[l] * s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+            s.C[i, i, TOP, l] += own
+            s.gain[i, TOP, l] += own * s.phi[i, l]
+        s.h[TOP, l] += wide - v

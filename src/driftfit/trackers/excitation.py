@@ -18,33 +18,49 @@ from typing import Any
 import numpy as np
 
 from driftfit.kernel import Array, State, kernel
+from driftfit.trackers.proportion import FIRST
 
 MEMORY = 200.0
 """Samples over which the mean square of a regressor is remembered."""
 DULL = 1e-4
 """A square below this share of the mean square counts as nothing happening."""
 
+LARGE = 25.0
+"""A square above this multiple of the mean square counts as this multiple."""
+
+
+def window(n: int) -> int:
+    """Samples over which G looks."""
+    return max(50, 10 * n)
+
 
 def no_excitation(n: int) -> dict[str, Any]:
-    """Fields before the first sample; the window of G is max(50, 10 n) samples."""
+    """Fields before the first sample."""
     return {
         "seen_samples": 0.0,
         "power": 0.0,
         "c": np.zeros(n),
         "active": np.zeros(n),
         "information": np.zeros((n, n)),
-        "fade": 1.0 - 1.0 / max(50, 10 * n),
+        "fade": 1.0 - 1.0 / window(n),
     }
+
+
+@kernel
+def bounded(square: float, mean: float, count: float) -> float:
+    """A square as it counts in a mean square of ``count`` others: a fault code may not make a scale of its own."""
+    return min(square, LARGE * mean) if count >= FIRST else square
 
 
 @kernel
 def learn_scales(s: State, l: int) -> None:
     """Mean squares of the regressors over the samples on which they did anything, and of y."""
     s.seen_samples[l] += s.ok[l]
-    active = s.ok[l] if s.y[l] * s.y[l] > DULL * s.power[l] else 0.0
-    s.power[l] += active * (s.y[l] * s.y[l] - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
+    square = bounded(s.y[l] * s.y[l], s.power[l], s.seen_samples[l])
+    active = s.ok[l] if square > DULL * s.power[l] else 0.0
+    s.power[l] += active * (square - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
     for i in range(s.theta.shape[0]):
-        square = s.phi[i, l] * s.phi[i, l]
+        square = bounded(s.phi[i, l] * s.phi[i, l], s.c[i, l], s.active[i, l])
         active = s.ok[l] if square > DULL * s.c[i, l] else 0.0
         s.active[i, l] += active
         s.c[i, l] += active * (square - s.c[i, l]) / min(max(s.active[i, l], 1.0), MEMORY)
@@ -57,7 +73,8 @@ def learn_information(s: State, l: int) -> None:
     for i in range(n):
         for j in range(i + 1):
             unit = s.c[i, l] * s.c[j, l]
-            fresh = s.ok[l] * s.phi[i, l] * s.phi[j, l] / np.sqrt(unit) if unit > 0.0 else 0.0
+            fresh = s.phi[i, l] * s.phi[j, l] / np.sqrt(unit) if unit > 0.0 else 0.0
+            fresh *= s.ok[l] / s.leverage[l]
             s.information[i, j, l] = s.fade[l] * s.information[i, j, l] + fresh
 
 

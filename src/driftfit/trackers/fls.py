@@ -41,7 +41,8 @@ from driftfit.trackers import second_differences
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, spanned_variance
 from driftfit.trackers.each import told
-from driftfit.trackers.rls import correct, learn_scale
+from driftfit.trackers.resolution import resolution, resolve
+from driftfit.trackers.rls import correct, learn_scale, no_scale
 
 
 @kernel
@@ -55,6 +56,7 @@ def drift(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
+    resolve(s, l)
     drift(s, l)
     enter(s, l)
     if s.s[l] < np.inf:
@@ -134,15 +136,16 @@ class FLS(Tracker):
             "g": np.zeros(n),
             "each": np.ones(n),
             "begun": 0.0,
-            "squares": 0.0,
-            "count": 0.0,
-            "scale": np.nan,
+            **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
         }
 
     @property
     def steps(self) -> TrackerSteps:
         return second_differences.STEPS if self.differences == 2 else STEPS
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return resolution(run.end().state)
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])

@@ -5,7 +5,8 @@
               theta <- theta + K e;  P <- P - K (P phi)'
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
-the noise variance, which is estimated as it goes: sum(e^2 / s) / count over the samples after the start.
+the noise variance, which is estimated as it goes: sum(e^2 / s) / count over the samples after the start, and not below
+what coarse readings allow (`driftfit.trackers.resolution`).
 
 Use it when all parameters drift alike and nothing is known of noise and drift. Without excitation exponential
 forgetting would blow P up; it stops at ``c_max`` times the trace that P had when the regressors first had full rank
@@ -37,6 +38,7 @@ from driftfit.kernel import State, exp, kernel, nothing
 from driftfit.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.diffuse import enter, knowing, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.resolution import resolution, resolve, unresolved
 
 
 @kernel
@@ -87,17 +89,25 @@ def forget(s: State, l: int) -> None:
             s.P[i, j, l] *= grow
 
 
+def no_scale() -> dict[str, Any]:
+    """Fields of an estimated noise variance before the first innovation."""
+    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved()}
+
+
 @kernel
 def learn_scale(s: State, l: int) -> None:
     """Count the innovation; s.s becomes a variance with the scale known before this sample, s.scale takes it in."""
-    s.squares[l] += s.ok[l] * s.e[l] * s.e[l] / s.s[l]
-    s.count[l] += s.ok[l]
+    counted = s.ok[l] * s.fresh[l]
+    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
+    s.count[l] += counted
     s.s[l] *= s.scale[l]
-    s.scale[l] = s.squares[l] / s.count[l]
+    scale = s.squares[l] / s.count[l]
+    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN stays
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    resolve(s, l)
     measurement(s, l)
     learn_scale(s, l)
 
@@ -105,6 +115,7 @@ def correct(s: State, l: int) -> None:
 @kernel
 def begin(s: State, l: int) -> None:
     rank = s.rank[l]
+    resolve(s, l)
     forget(s, l)
     keep_to_span(s, l)
     enter(s, l)
@@ -129,6 +140,7 @@ def forget_direction(s: State, l: int) -> None:
 
 @kernel
 def correct_direction(s: State, l: int) -> None:
+    resolve(s, l)
     measurement(s, l)
     forget_direction(s, l)
     learn_scale(s, l)
@@ -136,6 +148,7 @@ def correct_direction(s: State, l: int) -> None:
 
 @kernel
 def begin_direction(s: State, l: int) -> None:
+    resolve(s, l)
     enter(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
@@ -201,11 +214,12 @@ class RLS(Tracker):
             "PV": np.zeros((n, n)),
             "c_max": self.c_max,
             "per_cap": 1.0 / (self.c_max * np.trace(P)) if known else 0.0,
-            "squares": 0.0,
-            "count": 0.0,
-            "scale": np.nan,
+            **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
         }
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return resolution(run.end().state)
 
     @property
     def steps(self) -> TrackerSteps:

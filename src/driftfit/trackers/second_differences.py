@@ -31,7 +31,8 @@ from driftfit.drivers import TrackerSteps, diagonal
 from driftfit.kernel import Array, State, kernel, shared
 from driftfit.trackers.diffuse import SPANNED, TOLERANCE, outside, prediction, symmetric_product
 from driftfit.trackers.each import told
-from driftfit.trackers.rls import learn_scale
+from driftfit.trackers.resolution import resolve
+from driftfit.trackers.rls import learn_scale, no_scale
 
 
 def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
@@ -40,7 +41,7 @@ def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
     two = np.zeros(2 * n)
     return {
         "theta": theta0, "slope": np.zeros(n), "P": np.zeros((2 * n, 2 * n)), "q": 1.0 / mu, "r": 1.0,
-        "g": two, "each": np.ones(n), "begun": 0.0, "squares": 0.0, "count": 0.0, "scale": np.nan,
+        "g": two, "each": np.ones(n), "begun": 0.0, **no_scale(),
         "V": np.zeros((2 * n, 2 * n)), "z": two, "w": two, "F": np.ones(2 * n), "known": 0, "rank": 0, "tau": 0.0,
     }  # fmt: skip
 
@@ -103,6 +104,7 @@ def measurement(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
+    resolve(s, l)
     measurement(s, l)
     learn_scale(s, l)
 
@@ -168,6 +170,7 @@ def spanned(P: Array, V: Array, known: int, tau: float, scale: float, var: Array
 
 @kernel
 def begin(s: State, l: int) -> None:
+    resolve(s, l)
     drift(s, l)
     enter(s, l)
     if s.s[l] < np.inf:

@@ -221,25 +221,28 @@ MOST_PROBABLE = 0.5
 def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
     """Scales and prior probabilities of the changes of a bank; bounds are of the factors of the scales."""
     changes = tracker.all_changes
+    if all(one.prob is not None for one in changes):  # the first has what the others leave
+        changes = (replace(changes[0], prob=None), *changes[1:])
     moving = [i for i, one in enumerate(changes) if any(part.any() for part in one.scales())]
     given = [] if tracker.transition is not None else [i for i, one in enumerate(changes) if i and one.prob]
     if not moving and not given:
         raise ValueError("tune: no change of this Bank moves anything, and none has a probability to be found.")
     low, high = _ends(bounds, -3.0, 3.0)
-    most = [float(np.log10(MOST_PROBABLE / len(given) / (changes[i].prob or 1.0))) for i in given]
-    lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, np.array(most) - 2.0)]
+    priors = np.array([changes[i].prob or 0.0 for i in given])
+    most = np.log10(MOST_PROBABLE / max(len(given), 1) / priors)
+    lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, most - 2.0)]
     highs = np.r_[np.full(len(moving), high), most]
 
     def build(x: Array, sigma2: float = 1.0) -> Tracker:
         made = list(changes)
         for i, factor in zip(moving, 10.0 ** x[: len(moving)], strict=True):
             made[i] = made[i].scaled(float(factor))
-        for i, factor in zip(given, 10.0 ** x[len(moving) :], strict=True):
-            made[i] = replace(made[i], prob=float(changes[i].prob * factor))
+        for i, prob in zip(given, priors * 10.0 ** x[len(moving) :], strict=True):
+            made[i] = replace(made[i], prob=float(prob))
         return replace(tracker, changes=tuple(made))
 
     def values(x: Array) -> Array:
-        return np.asarray(10.0**x * np.r_[np.ones(len(moving)), [changes[i].prob for i in given]])
+        return np.asarray(10.0**x * np.r_[np.ones(len(moving)), priors])
 
     names = tuple(f"scale[{tracker.change_names[i]}]" for i in moving)
     names += tuple(f"prob[{tracker.change_names[i]}]" for i in given)

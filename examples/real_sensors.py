@@ -1,0 +1,123 @@
+"""What sensors of a plant do, simulated: an input that stands still, fault codes, a coarse meter, a switching arc; and
+parameters that walk, smoothed.
+
+Prints the tables of docs/real_sensors.md. Run: python examples/real_sensors.py
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from driftfit import ARX, AdaptiveKalman, Bank, Kalman, Regression, Track, track
+from driftfit.kernel import Array
+from driftfit.systems.arc_furnace import switching
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.rls import RLS
+
+T = 2000
+FORGET, WALK = RLS(0.98), Kalman(q=1e-4, r=0.01)
+
+
+def rms(values: Array) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def idle() -> None:
+    """The first of two parameters jumps from 1 to 2 at sample 1000."""
+    rng = np.random.default_rng(0)
+    x, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
+    y = np.where(np.arange(T) < 1000, 1.0, 2.0) * x + v
+    print("An input that stands still: response to x, 2 after a jump, at the end")
+    print(f"  {'second column':18}{'AdaptiveKalman':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
+    for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
+        cells = []
+        for tracker in (AdaptiveKalman(), FORGET, WALK):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run = track(Regression(2), tracker, y, np.column_stack([x, second]))
+            both = name == "is x again"
+            cells.append(f"{run.theta[-1].sum() if both else run.theta[-1, 0]:.3f} (std {run.std[-1, 0]:.3f})")
+        print(f"  {name:18}" + "".join(f"{cell:>22}" for cell in cells))
+
+
+def codes() -> None:
+    """y_t = 0.7 y_{t-1} + 2 u_{t-1} + v."""
+    rng = np.random.default_rng(1)
+    u, y = rng.normal(size=T), np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.7 * y[t - 1] + 2.0 * u[t - 1] + 0.1 * rng.normal()
+    print("\nFault codes: largest distance from [0.7, 2], 5 and 500 samples after the last of them")
+    names = ("AdaptiveKalman", "Bank", "RLS(0.98)", "Kalman")
+    print(f"  {'codes':22}" + "".join(f"{name:>18}" for name in names))
+    for code, count, where in ((9999.0, 1, "y"), (9999.0, 5, "y"), (-999.0, 1, "y"), (9999.0, 1, "u")):
+        record = {"y": y.copy(), "u": u.copy()}
+        record[where][100 : 100 + count] = code
+        cells = []
+        for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
+            away = np.abs(track(ARX(1, 1), tracker, **record).theta - [0.7, 2.0]).max(axis=1)
+            cells.append(f"{away[104 + count]:.3f}, {away[599 + count]:.3f}")
+        print(f"  {f'{code:g}, {count} in {where}':22}" + "".join(f"{cell:>18}" for cell in cells))
+
+
+def coarse() -> None:
+    """A flow of 32 +- 2 read in whole numbers."""
+    rng = np.random.default_rng(2)
+    x = np.repeat(rng.normal(size=T // 20), 20)
+    u = np.column_stack([x, np.ones(T)])
+    y = np.round(u @ [2.0, 32.0] + 0.05 * rng.normal(size=T))
+    print("\nWhole numbers, inputs that change every 20 samples (1 / sqrt 12 is 0.289)")
+    print(f"  {'':18}{'innovation std':>16}{'y in band':>12}{'theta in band':>15}{'log-likelihood':>16}")
+    for name, tracker in (("AdaptiveKalman", AdaptiveKalman()), ("RLS(0.98)", FORGET), ("Kalman", WALK)):
+        run, late = track(Regression(2), tracker, y, u), slice(200, None)
+        inside = np.abs(run.innovation[late]) < 1.96 * run.innovation_std[late]
+        covered = np.abs(run.theta[late] - [2.0, 32.0]) < 1.96 * run.std[late]
+        print(
+            f"  {name:18}{np.median(run.innovation_std[late]):>16.3f}{inside.mean():>12.2f}{covered.mean():>15.2f}"
+            f"{run.loglik:>16.0f}"
+        )
+
+
+def arcs() -> None:
+    """i = g u, g between 0.02 and 4 in turn."""
+    print("\nA conductance that switches between 0.02 and 4: rms error of g u")
+    names = ("AdaptiveKalman", "RLS(0.998)", "RLS(0.98)", "Kalman")
+    print(f"  {'half period':18}" + "".join(f"{name:>16}" for name in names))
+    for half in (10, 25, 50, 100):
+        arc = switching(half=half)
+        u = np.column_stack([arc.u, np.random.default_rng(3).normal(size=len(arc.u))])
+        trackers: list[Tracker] = [AdaptiveKalman(), RLS(0.998), FORGET, WALK]
+        runs: list[Track] = [track(Regression(2), tracker, arc.i, u) for tracker in trackers]
+        cells = (rms(((run.theta[:, 0] - arc.g) * arc.u)[200:]) for run in runs)
+        print(f"  {f'{half} samples':18}" + "".join(f"{cell:>16.2f}" for cell in cells))
+
+
+def smoothing() -> None:
+    """Both parameters walk, in noise of standard deviation 0.3; 20 records of 500 samples."""
+    print("\nParameters that walk, 20 records: rms error, and share of the truth in 95 % bands")
+    print(f"  {'step':18}{'followed':>16}{'smoothed':>16}")
+    for step in (0.01, 0.03, 0.1):
+        found: list[list[float]] = []
+        for seed in range(20):
+            rng = np.random.default_rng(seed)
+            u, theta = rng.normal(size=(500, 2)), 1.0 + np.cumsum(step * rng.normal(size=(500, 2)), axis=0)
+            run = track(Regression(2), AdaptiveKalman(), (u * theta).sum(axis=1) + 0.3 * rng.normal(size=500), u)
+            path, late = run.smooth(), slice(100, None)
+            away, back = (run.theta - theta)[late], (path.theta - theta)[late]
+            inside, covered = np.abs(away) < 1.96 * run.std[late], np.abs(back) < 1.96 * path.std[late]
+            found.append([rms(away), float(inside.mean()), rms(back), float(covered.mean())])
+        a, b, c, d = np.mean(found, axis=0)
+        print(f"  {f'{step:g} a sample':18}{f'{a:.3f}, {b:.2f}':>16}{f'{c:.3f}, {d:.2f}':>16}")
+
+
+def main() -> None:
+    idle()
+    codes()
+    coarse()
+    arcs()
+    smoothing()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""Sensors of a plant: inputs that stand still, fault codes, coarse meters, arcs; and the adaptive smoother."""
+
+import numpy as np
+import pytest
+
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, Live, Regression, select, track, tune
+from driftfit.systems import scenarios
+from driftfit.systems.arc_furnace import switching
+
+T = 1500
+MODEL, PLANT = Regression(3), ARX(2, 2)
+
+
+def jumping(second, third, jump=750, seed=0):
+    """y, u: the response to the first column jumps from 1 to 2, that to the second is 0.5."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=T)
+    u = np.column_stack([x, second(rng, x), third(rng, x)])
+    return np.where(np.arange(T) < jump, 1.0, 2.0) * x + 0.5 * u[:, 1] + 0.1 * rng.normal(size=T), u
+
+
+def noise(rng, x):
+    return rng.normal(size=T)
+
+
+def level(value):
+    return lambda rng, x: np.full(T, value)
+
+
+def first(rng, x):
+    return x
+
+
+IDLE = {
+    "an idle input": (noise, level(0.0), [2]),
+    "the same tag twice": (noise, first, [0, 2]),
+    "a constant beside an intercept": (level(50.0), level(1.0), [1, 2]),
+}
+
+
+@pytest.mark.parametrize("case", IDLE)
+def test_a_direction_without_excitation_does_not_weigh_on_the_others(case):
+    second, third, unknown = IDLE[case]
+    y, u = jumping(second, third)
+    names = ", ".join(f"theta{i + 1}" for i in unknown)
+    with pytest.warns(UserWarning, match=f"{names} could not be learned"):
+        run = track(MODEL, AdaptiveKalman(), y, u)
+    assert np.isinf(run.std[-1]).nonzero()[0].tolist() == unknown
+    response = run.theta[:, 0] + (run.theta[:, 2] if unknown == [0, 2] else 0.0)
+    assert abs(response[770] - 2.0) < 0.2
+    assert abs(response[-1] - 2.0) < 0.05
+    assert 0.09 < np.median(run.innovation_std[-500:]) < 0.13
+    assert f"{names}: never moved apart from the others" in str(run.summary())
+    path = run.smooth()
+    assert np.isinf(path.std[-1]).nonzero()[0].tolist() == unknown
+
+
+def test_an_idle_column_changes_nothing_and_is_taken_in_when_it_wakes_up():
+    y, u = jumping(noise, level(0.0))
+    u[1200:, 2] = np.random.default_rng(1).normal(size=300)
+    y[1200:] += -0.7 * u[1200:, 2]
+    run = track(MODEL, AdaptiveKalman(), y, u)
+    moving = u.copy()
+    moving[:, 2] = np.random.default_rng(2).normal(size=T)
+    without = track(MODEL, AdaptiveKalman(), y, moving)
+    np.testing.assert_allclose(run.theta[1190, :2], without.theta[1190, :2], atol=0.02)
+    assert np.isfinite(run.std[1201:]).all()
+    np.testing.assert_allclose(run.theta[1260:, 2], -0.7, atol=0.15)
+    live = Live(MODEL, AdaptiveKalman())
+    for t in range(T):
+        live.update(y[t], u[t])
+        if t == 1100:
+            assert live.learning.tolist() == [True, True, False]
+    assert live.learning.all()
+    assert (live.theta == run.theta[-1]).all()
+
+
+def plant(seed=3, size=T):
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=size), np.zeros(size)
+    for t in range(2, size):
+        y[t] = 1.1 * y[t - 1] - 0.5 * y[t - 2] + u[t - 1] + 0.5 * u[t - 2] + 0.1 * rng.normal()
+    return y, u
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), Bank()], ids=["adaptive", "bank"])
+@pytest.mark.parametrize(("code", "count"), [(9999.0, 1), (-999.0, 1), (1e6, 3), (9999.0, 8)])
+def test_a_fault_code_is_left_out_and_does_no_harm(tracker, code, count):
+    y, u = plant()
+    clean = track(PLANT, tracker, y, u)
+    broken = y.copy()
+    broken[100 : 100 + count] = code
+    for unit in (1.0, 1e-3):
+        run = track(PLANT, tracker, broken * unit, u)
+        assert not run.ok[100 : 100 + count].any()
+        assert run.ok[103 + count + 2 :].all()
+        theta = run.theta / [1.0, 1.0, unit, unit]
+        assert np.abs(theta - clean.theta)[100:200].max() < 0.15
+        assert np.abs(theta - clean.theta)[300:].max() < 0.02
+    assert f"{count} readings out of all proportion" in str(run.summary())
+
+
+def test_a_change_of_level_that_stays_is_taken_in():
+    rng = np.random.default_rng(4)
+    u = np.column_stack([rng.normal(size=T), rng.normal(size=T), np.ones(T)])
+    for size in (10.0, 1000.0):
+        y = u @ [1.0, 0.5, 0.0] + size * (np.arange(T) >= 700) + 0.1 * rng.normal(size=T)
+        run = track(MODEL, AdaptiveKalman(), y, u)
+        assert np.abs(run.theta[720:] - [1.0, 0.5, size]).max() < 0.5
+        assert np.sqrt(np.mean(run.innovation[800:] ** 2)) < 0.11
+
+
+def test_an_absurd_input_counts_for_little():
+    y, u = plant()
+    clean = track(PLANT, AdaptiveKalman(), y, u)
+    for code, count in ((9999.0, 1), (-999.0, 3)):
+        broken = u.copy()
+        broken[100 : 100 + count] = code
+        run = track(PLANT, AdaptiveKalman(), y, broken)
+        assert np.abs(run.theta - clean.theta)[100:].max() < 0.35
+        assert np.abs(run.theta - clean.theta)[300:].max() < 0.02
+
+
+def meter(seed, unit=1.0):
+    """Whole numbers; the inputs change every 30 samples."""
+    rng = np.random.default_rng(seed)
+    held = np.repeat(rng.normal(size=(T // 30, 2)), 30, axis=0)
+    u = np.column_stack([held, np.ones(T)])
+    return np.round(u @ [2.0, -1.0, 32.0] + 0.05 * rng.normal(size=T)) * unit, u
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.99), FLS(1e3), Bank()], ids=lambda one: type(one).__name__)
+def test_coarse_readings_bound_the_noise(tracker):
+    y, u = meter(5)
+    run = track(MODEL, tracker, y, u)
+    assert run.innovation_std[300:].min() >= 1.0 / np.sqrt(12.0)
+    assert np.median(run.innovation_std[300:]) < 1.0
+    assert -2.0 * T < run.loglik < 0.5 * T
+    assert np.mean(np.abs(run.innovation[300:]) < 1.96 * run.innovation_std[300:]) > 0.93
+    assert "steps of 1, " in str(run.summary())
+    for unit in (1e-9, 1e9):
+        scaled = track(MODEL, tracker, y * unit, u)
+        np.testing.assert_allclose(scaled.innovation_std[300:] / unit, run.innovation_std[300:], rtol=1e-6)
+
+
+def test_bands_of_theta_hold_for_a_coarse_meter():
+    covered = []
+    for seed in range(6):
+        y, u = meter(seed)
+        run = track(MODEL, AdaptiveKalman(), y, u)
+        covered.append(np.mean(np.abs(run.theta - [2.0, -1.0, 32.0])[400:] < 1.96 * run.std[400:]))
+    assert np.mean(covered) > 0.93
+
+
+def test_readings_that_are_fine_have_no_resolution():
+    rng = np.random.default_rng(6)
+    u = rng.normal(size=(T, 3))
+    fine = u @ [1.0, 0.5, -1.0] + 0.1 * rng.normal(size=T)
+    held = np.repeat(fine[::5], 5)
+    off = np.where(np.arange(T) // 100 % 2 == 0, 0.0, fine)
+    for y in (fine, held, off, np.clip(fine, -1.0, 1.0)):
+        run = track(MODEL, RLS(0.99), y, u)
+        assert run.end().state["coarse"] == 0.0
+    assert "Resolution" not in str(run.summary())
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), RLS(0.99), FLS(1e3), Bank()], ids=lambda one: type(one).__name__)
+def test_equal_rows_at_the_start_claim_nothing(tracker):
+    y, u = meter(7)
+    y[:30], u[:30] = 32.0, [1.0, 0.0, 1.0]
+    run = track(MODEL, tracker, y, u)
+    assert not (run.innovation_std[:200] < 1e-3).any()
+    assert not (run.std[:200] < 1e-3).any()
+
+
+def test_structures_and_settings_are_compared_on_coarse_readings():
+    y, u = meter(8)
+    wide = u[:, :2]
+    chosen = select([Regression(2, intercept=True), Regression(2)], y, wide)
+    assert all(abs(row.loglik) < 100.0 * T for row in chosen.rows)
+    assert chosen.best == Regression(2, intercept=True)
+    tuned = tune(MODEL, FLS(), y, u, bounds=(1.0, 1e6))
+    assert np.isfinite(tuned.loglik)
+    assert track(MODEL, tuned.tracker, y, u).innovation_std[-1] > 0.25
+
+
+def test_a_conductance_that_switches_is_followed():
+    arc = switching()
+    u = np.column_stack([arc.u, np.random.default_rng(9).normal(size=(len(arc.u), 2))])
+    errors = {}
+    for tracker in (AdaptiveKalman(), RLS(0.99)):
+        run = track(MODEL, tracker, arc.i, u)
+        errors[type(tracker).__name__] = np.sqrt(np.mean(((run.theta[:, 0] - arc.g) * arc.u)[200:] ** 2))
+    assert errors["AdaptiveKalman"] < 0.3 < errors["RLS"]
+
+
+def test_noise_that_grows_thirtyfold_is_followed():
+    rng = np.random.default_rng(10)
+    u = rng.normal(size=(T, 3))
+    size = np.where(np.arange(T) < 700, 0.1, 3.0)
+    run = track(MODEL, AdaptiveKalman(), u @ [1.0, 0.5, -1.0] + size * rng.normal(size=T), u)
+    inside = np.abs(run.innovation) < 1.96 * run.innovation_std
+    assert 0.91 < inside[760:].mean() < 0.98
+
+
+@pytest.mark.parametrize("kind", ["regression", "arx"])
+def test_smoothed_bands_hold_where_the_truth_walks(kind):
+    model, inside, better = {"regression": MODEL, "arx": PLANT}[kind], [], []
+    for seed in range(10):
+        for name in ("slow_walk", "fast_walk"):
+            simulated = scenarios.simulate(name, kind, seed)
+            run = track(model, AdaptiveKalman(), simulated.y, simulated.u)
+            path = run.smooth()
+            inside.append(np.mean(np.abs(path.theta - simulated.theta)[20:-20] < 1.96 * path.std[20:-20]))
+            better.append(
+                np.mean((path.theta - simulated.theta)[200:] ** 2) / np.mean((run.theta - simulated.theta)[200:] ** 2)
+            )
+    assert 0.93 < np.mean(inside) < 0.97
+    assert np.mean(better) < 0.75

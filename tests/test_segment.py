@@ -1,0 +1,138 @@
+"""Segmentation: exact against brute force, breaks found, intervals that hold, outliers and correlation withstood."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from driftfit import ARX, RLS, Regression, segment, track
+from driftfit.judges.dates import date_loglik, smallest
+from driftfit.judges.noise import penalty
+from driftfit.judges.partition import partition
+
+AT = (133, 266)
+
+
+def two_jumps(seed, size=0.8, kind="", rho=0.0, T=400):
+    """A mean with two jumps in noise of 0.5."""
+    rng, t = np.random.default_rng(seed), np.arange(T)
+    e = signal.lfilter([np.sqrt(1.0 - rho * rho)], [1.0, -rho], rng.normal(size=T + 200))[200:]
+    if kind == "outliers":
+        e *= np.where(rng.random(T) < 0.05, 10.0, 1.0)
+    return 5.0 + size * ((t >= AT[0]) & (t < AT[1])) + 0.5 * e
+
+
+def cost(phi, y):
+    return float(np.sum((y - phi @ np.linalg.lstsq(phi, y, rcond=None)[0]) ** 2))
+
+
+@pytest.mark.parametrize("price", [1.0, 6.0, 30.0])
+def test_the_partition_is_the_cheapest_of_all(price):
+    """Against dynamic programming over all pairs, without pruning."""
+    rng = np.random.default_rng(int(price))
+    phi = np.column_stack([rng.normal(size=60), np.ones(60)])
+    y = phi @ [1.0, 2.0] + np.repeat(rng.normal(size=6), 10) * phi[:, 0] * 2.0 + rng.normal(size=60)
+    F, last = [-price], [0]
+    for t in range(1, 61):
+        options = [(F[s] + cost(phi[s:t], y[s:t]) + price, s) for s in range(max(t - 4, 0)) if np.isfinite(F[s])]
+        best = min(options, default=(np.inf, 0))
+        F.append(best[0])
+        last.append(best[1])
+    expected, t = [], 60
+    while last[t] > 0:
+        t = last[t]
+        expected.append(t)
+    assert partition(phi, y, np.arange(1, 61), price, 5).tolist() == expected[::-1]
+    assert len(expected) > 0 or price == 30.0
+
+
+def test_likelihood_of_dates_is_that_of_dense_matrices():
+    """RSS and determinant of the regression on what was before and after, whitened as a whole."""
+    rng, a = np.random.default_rng(1), np.array([0.5, -0.2])
+    X, y = rng.normal(size=(40, 2)), rng.normal(size=40)
+    got = date_loglik(X, y, a, 10, 30)
+    white = np.eye(40) - a[0] * np.eye(40, k=-1) - a[1] * np.eye(40, k=-2)
+    for d in (10, 17, 30):
+        split = np.column_stack([X * (np.arange(40) < d)[:, None], X * (np.arange(40) >= d)[:, None]])
+        W, z = (white @ split)[2:], (white @ y)[2:]
+        expected = -0.5 * cost(W, z) - 0.5 * np.linalg.slogdet(W.T @ W)[1]
+        assert got[d - 10] == pytest.approx(expected, rel=1e-9)
+    assert smallest(np.log([0.01, 0.3, 0.6, 0.05, 0.04]), 0.9) == (1, 2)
+
+
+def test_two_jumps_are_found_every_time_and_as_well_as_by_ruptures():
+    ruptures = pytest.importorskip("ruptures", reason="ruptures, to compare with, is not installed")
+    ours = theirs = 0
+    for seed in range(20):
+        y = two_jumps(seed)
+        found = [one.at for one in segment(y).breaks]
+        assert len(found) <= 3
+        ours += sum(any(abs(f - at) <= 20 for f in found) for at in AT)
+        other = ruptures.Pelt("linear", min_size=10, jump=1).fit(np.column_stack([y, np.ones(400)]))
+        theirs += sum(any(abs(f - at) <= 20 for f in other.predict(pen=0.25 * 2.0 * np.log(400))) for at in AT)
+    assert ours == 40
+    assert ours >= theirs
+
+
+@pytest.mark.parametrize(("kind", "rho", "size"), [("", 0.0, 0.8), ("outliers", 0.0, 0.8), ("", 0.5, 1.2)])
+def test_intervals_hold_their_level(kind, rho, size):
+    """95 % of 120 dates, less three standard errors; and they are not the whole record."""
+    inside, width = [], []
+    for seed in range(60):
+        said = segment(two_jumps(seed, size, kind, rho))
+        if len(said.breaks) == 2:
+            inside += [one.first <= at <= one.last for one, at in zip(said.breaks, AT, strict=True)]
+            width += [one.last - one.first for one in said.breaks]
+    assert len(inside) > 100
+    assert np.mean(inside) > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
+    assert np.median(width) < 25
+
+
+@pytest.mark.parametrize(("kind", "rho", "most"), [("", 0.0, 3), ("outliers", 0.0, 3), ("", 0.7, 6)])
+def test_a_record_without_breaks_is_seldom_divided(kind, rho, most):
+    """At 1 % of eighty, with three standard errors; a few per cent where an autoregression is estimated."""
+    assert sum(bool(segment(two_jumps(seed, 0.0, kind, rho)).breaks) for seed in range(80)) <= most
+
+
+def test_the_penalty_grows_with_the_record_and_its_parameters():
+    assert penalty(400, 1, 10, 0.01) < penalty(4000, 1, 10, 0.01) < penalty(4000, 3, 12, 0.01)
+    assert penalty(400, 1, 10, 0.1) < penalty(400, 1, 10, 0.01)
+
+
+def test_parameters_and_standard_errors_of_segments():
+    """A gain that changes, of a regression with times; y of a thousand times the size says the same."""
+    rng = np.random.default_rng(2)
+    u, t = rng.normal(size=(500, 2)), np.arange(500)
+    y = np.where(t < 300, 1.0, 2.0) * u[:, 0] - u[:, 1] + 0.3 * rng.normal(size=500)
+    y[100] = 1e4
+    y[[50, 400]] = np.nan
+    time = np.datetime64("2024-01-01") + t * np.timedelta64(1, "h")
+    run = track(Regression(2), RLS(1.0), y, u, time=time, dt=np.timedelta64(1, "h"))
+    said = run.segment()
+    (only,) = said.breaks
+    assert only.at == pytest.approx(300, abs=3)
+    assert only.date == time[only.at]
+    assert only.first <= time[300] <= only.last
+    for part, gain, count in zip(said.segments, (1.0, 2.0), (298, 199), strict=True):
+        assert np.abs((part.theta - [gain, -1.0]) / part.std).max() < 4.0
+        assert part.std == pytest.approx(0.3 / np.sqrt(count), rel=0.25)
+    assert said.theta.shape == (500, 2)
+    assert str(only.date)[:13].replace("T", " ") in said.summary()
+    assert len(said.plot().axes) == 3
+    large = segment(1000.0 * y, u, Regression(2))
+    assert [one.at for one in large.breaks] == [only.at]
+    assert large.segments[0].theta == pytest.approx(1000.0 * said.segments[0].theta)
+
+
+def test_lags_of_the_output_and_records_that_cannot_be_divided():
+    rng = np.random.default_rng(3)
+    u, y = rng.normal(size=600), np.zeros(600)
+    for t in range(1, 600):
+        y[t] = 0.7 * y[t - 1] + (1.0 if t < 350 else 1.4) * u[t - 1] + 0.2 * rng.normal()
+    said = segment(y, u, ARX(1, 1))
+    assert [one.at for one in said.breaks] == pytest.approx([350], abs=3)
+    assert segment(y[:15]).breaks == ()
+    assert segment(np.full(100, 3.0)).segments[0].theta == pytest.approx([3.0])
+    assert np.isnan(segment(np.full(100, np.nan)).segments[0].theta).all()
+    for wrong in ({"level": 1.0}, {"false": 0.0}, {"shortest": 0}):
+        with pytest.raises(ValueError, match="segment"):
+            segment(y, **wrong)
