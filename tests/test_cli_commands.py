@@ -123,6 +123,10 @@ def test_valid_ranges_and_stretches_left_out(table):
     left = track(ARX(1, 1, inputs=["valve"]), K, whole, u).theta[:, 1]
     assert np.array_equal(theta(*SIGNALS, "--exclude", "101..121"), left)
     assert np.array_equal(theta(*DATED, "--exclude", "2024-03-01 09:40..2024-03-01 10:00"), left)
+    said = run("track", *SIGNALS, "--limits", "flow=-2:2", "--exclude", "101..121")
+    assert "21 excluded" in " ".join(said.split())
+    run("tune", *SIGNALS[:-2], "--limits", "flow=-2:2", "--exclude", "101..121")
+    assert "given in rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
     assert "column=low:high" in fails("track", *SIGNALS, "--limits", "flow=2")
     assert "did you mean flow" in fails("track", *SIGNALS, "--limits", "flo=1:2")
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")

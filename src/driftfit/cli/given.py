@@ -115,12 +115,13 @@ class Given:
         return Part.of(self.first, self.last, self.rows, self.separator, self.decimal, self.limits, self.exclude, names)
 
     def signals(self, rows: Rows | None = None) -> dict[str, Any]:
-        """y, u, data, time, by, dt and units, as `track` takes them; ``rows`` are the data where they were read."""
+        """What `track` takes beside model and tracker; ``rows`` are the data where they were read."""
         outputs = self.outputs
         if rows is None and (not self.part().whole or "-" in self.file):
             rows = self.read()
         data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
         signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
+        signals |= self.part().restrictions(self.time is not None)
         return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
 
     def read(self, *more: str) -> Rows:
@@ -154,7 +155,7 @@ class Given:
         return before.model, before.tracker, before
 
     def arrays(self) -> dict[str, Any]:
-        """y (T,), u (T, m), time and dt of one series, in order of time, as `tune` and `select` take them."""
+        """One series in order of time, as `tune` and `select` take it."""
         outputs = self.outputs
         if self.by or len(outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
@@ -162,7 +163,12 @@ class Given:
         order = read.order()
         u = np.stack([read.numbers[name][order] for name in self.inputs], axis=1) if self.inputs else None
         time = None if read.time is None else read.time[order]
-        return {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
+        restrictions = self.part().restrictions(time is not None)
+        places: dict[str, Any] = {name: j for j, name in enumerate(self.inputs)} | {outputs[0]: "y"}
+        if restrictions["limits"]:
+            restrictions["limits"] = {places[name]: one for name, one in restrictions["limits"].items()}
+        known = {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
+        return known | restrictions
 
 
 def saved(path: Path) -> Any:

@@ -1,8 +1,7 @@
-"""Parts of files: ranges of rows and times, decimal commas, separators, stdin, valid ranges, stretches left out.
+"""Parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and stretches left out.
 
-Rows are counted from 1 after the header, as in messages about cells, and ranges hold both their ends. What lies outside
-its valid range, and the signals of stretches that are left out, become missing: such a sample is neither used nor
-remembered.
+Rows are counted from 1 after the header, as in messages about cells, and ranges hold both their ends. Valid ranges and
+stretches are handed on as they are (`driftfit.restrict`).
 """
 
 from __future__ import annotations
@@ -54,7 +53,20 @@ class Part:
     @property
     def whole(self) -> bool:
         """Whether the files are read as they are."""
-        return self == Part()
+        return self == Part(limits=self.limits, exclude=self.exclude)
+
+    def restrictions(self, timed: bool) -> dict[str, Any]:
+        """limits= and exclude= of `track`; without time stretches are rows, which it numbers from 0."""
+        exclude: list[tuple[Any, Any]] = list(self.exclude)
+        if not timed:
+            exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
+        return {"limits": dict(self.limits) or None, "exclude": exclude or None}
+
+    def _sample(self, row: str) -> int:
+        """The sample of a row."""
+        if not row.isdigit():
+            raise ValueError(f"--exclude: without --time a stretch is given in rows, such as 100..120; got {row!r}.")
+        return int(row) - self.rows[0]
 
 
 class Rows(NamedTuple):
@@ -135,7 +147,7 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
         read[0].zone,
         [[value for one in read for value in one.by[k]] for k in range(len(by))],
     )
-    return _restricted(found, part)
+    return _between(found, part)
 
 
 def _one(path: str, wanted: Wanted, part: Part) -> Columns:
@@ -181,27 +193,20 @@ def _points(frame: pl.DataFrame, wanted: Wanted) -> list[pl.Series]:
     return made
 
 
-def _restricted(rows: Rows, part: Part) -> Rows:
-    """The rows between the first and last time, without what is outside its limits or in a stretch left out."""
-    numbers = {name: column.copy() for name, column in rows.numbers.items()}
-    for name, (low, high) in part.limits:
-        numbers[name][(numbers[name] < low) | (numbers[name] > high)] = np.nan
-    count = len(next(iter(numbers.values())))
-    axis = np.arange(1, count + 1) if rows.time is None else rows.time
-    for first, last in part.exclude:
-        out = (axis >= moment(first, axis, rows.zone)) & (axis <= moment(last, axis, rows.zone, end=True))
-        for column in numbers.values():
-            column[out] = np.nan
-    keep = np.ones(count, bool)
+def _between(rows: Rows, part: Part) -> Rows:
+    """The rows between the first and last time."""
+    if rows.time is None or (part.first is None and part.last is None):
+        return rows
+    axis = rows.time
+    keep = np.ones(len(axis), bool)
     if part.first is not None:
         keep &= axis >= moment(part.first, axis, rows.zone)
     if part.last is not None:
         keep &= axis <= moment(part.last, axis, rows.zone, end=True)
     if not keep.any():
         raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
-    time = None if rows.time is None else rows.time[keep]
     by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
-    return Rows({name: column[keep] for name, column in numbers.items()}, time, rows.zone, by)
+    return Rows({name: column[keep] for name, column in rows.numbers.items()}, axis[keep], rows.zone, by)
 
 
 def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
