@@ -179,8 +179,8 @@ class Verdict(Printed):
         if self.correlated:
             told += (
                 "The residuals are correlated, also where parameters are constant: a model with too few lags does "
-                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} of it; "
-                "try one more lag in the model."
+                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} "
+                "of it; try one more lag in the model."
             )
         return told.strip()
 
@@ -271,7 +271,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
 
 def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
     at, own = int(test.at[i]), float(test.p_own[i])
-    before = after = std = last = float("nan")
+    before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
     if steps is not None:
         own = float(steps.p[i])
