@@ -163,7 +163,7 @@ def test_what_returns_to_where_it_was_is_not_named_as_a_move():
 
 
 def test_the_headline_is_one_statement_of_both_answers():
-    """A mean that wanders as noise does: it cannot be told from noise, but following it pays, and nothing denies that."""
+    """A mean that wanders as noise does cannot be told from it, but following it pays: nothing denies that."""
     rng = np.random.default_rng(3)
     e = signal.lfilter([1.0], [1.0, -0.95], rng.normal(size=600))
     said = track(Regression(0, intercept=True), Kalman(q=1.0, r=0.1), 5.0 + e).verdict()

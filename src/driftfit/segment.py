@@ -112,14 +112,14 @@ class Segmentation(Printed):
         count = len(self.breaks)
         yield Text(f" {count or 'no'} break{'' if count == 1 else 's'}, dates with {100.0 * self.level:g} % intervals")
         names = self.run.model.names
-        table = table_of("Segments", "", "samples", "from", "to", *(text for name in names for text in (name, "+-")))
         text = self.run.time_text
-        low = [self._sample(b.first) for b in self.breaks]
-        high = [self._sample(b.last) for b in self.breaks]
-        for k, part in enumerate(self.segments):
-            span = (text(low[k - 1]), text(high[k - 1])) if k else ("", "")
+        for one in self.breaks:
+            yield Text(f" {text(one.at)}, from {text(self._sample(one.first))} to {text(self._sample(one.last))}")
+        names = self.run.model.names
+        table = table_of("Segments, from sample", "", "samples", *(text for name in names for text in (name, "+-")))
+        for part in self.segments:
             numbers = (f"{value:.4g}" for pair in zip(part.theta, part.std, strict=True) for value in pair)
-            table.add_row(text(part.start), str(part.stop - part.start), *span, *numbers)
+            table.add_row(str(part.start), str(part.stop - part.start), *numbers)
         yield table
         correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
         yield Text(f" noise {self.noise:.4g}{correlated}; penalty of a break {self.penalty:.1f}", "dim")
@@ -132,6 +132,7 @@ class Segmentation(Printed):
         import matplotlib.pyplot as plt
 
         names, time = self.run.model.names, self.run.time
+        figure: Figure
         figure, axes = plt.subplots(
             len(names) + 1, 1, sharex=True, figsize=(8.0, 2.0 * len(names) + 2.0), squeeze=False
         )
@@ -201,7 +202,7 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     rows = regressors(run)
     N = len(rows.y)
     size = np.sqrt(np.mean(rows.phi**2, axis=0)) if N else np.zeros(n)
-    if N < max(2 * least, n + 2) or not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
+    if max(2 * least, n + 2) > N or not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
         return _undivided(run, rows.phi, rows.y, level)
     fit = robust_fit(rows.phi, rows.y)
     if not fit.scale > 1e-10 * np.sqrt(np.mean(rows.y**2)):

@@ -178,9 +178,9 @@ class Verdict(Printed):
         told = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             told += (
-                "The residuals are correlated, also where parameters are constant: a model with too few lags does that, "
-                f"and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} of it; "
-                "try one more lag in the model."
+                "The residuals are correlated, also where parameters are constant: a model with too few lags does "
+                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} "
+                "of it; try one more lag in the model."
             )
         return told.strip()
 
@@ -270,16 +270,15 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
 
 
 def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
-    name = run.model.names[i]
-    if steps is None or not steps.moves[i]:
-        at = min(int(test.at[i]), len(rows.at) - 1)
-        own, sides = float(test.p_own[i] if steps is None else steps.p[i]), (np.nan,) * 4
-    else:
-        at = steps.first(i)
-        own, sides = (
-            float(steps.p[i]),
-            tuple(float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last)),
-        )
-    sample = int(rows.at[at]) if len(rows.at) else 0
+    at, own = int(test.at[i]), float(test.p_own[i])
+    before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
-    return Moved(name, float(test.L[i]), float(test.p[i]), own, named, sample, run.time_text(sample), *sides)
+    if steps is not None:
+        own = float(steps.p[i])
+        if named:
+            at = steps.first(i) or 0
+            before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
+    sample = int(rows.at[min(at, len(rows.at) - 1)]) if len(rows.at) else 0
+    when = run.time_text(sample)
+    L, p = float(test.L[i]), float(test.p[i])
+    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last)

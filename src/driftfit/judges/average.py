@@ -5,7 +5,8 @@
 
 so that log w_k(t) = a log w_k(t-1) + log p_k(y_t) up to a constant that all share: an exponentially weighted sum of
 log-likelihoods. The averaged prediction is the mean of the mixture, its variance that of the mixture. A sample that one
-structure cannot predict moves no weights: nothing is learned, and nothing forgotten. The weight of a regressor is that of all structures that have it.
+structure cannot predict moves no weights: nothing is learned, and nothing forgotten. The
+weight of a regressor is that of all structures that have it.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1), equations 15 to 17. Cost: O(T K).
 """

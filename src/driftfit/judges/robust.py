@@ -55,10 +55,10 @@ def cholesky(M: Array, n: int) -> float:
             for i in range(j):
                 total -= M[r, i] * M[j, i]
             M[r, j] = total / root if root > 0.0 else 0.0
-    left = M[k - 1, k - 1]
+    left: float = M[k - 1, k - 1]
     for i in range(n):
         left -= M[k - 1, i] * M[k - 1, i]
-    return max(left, 0.0)
+    return left if left > 0.0 else 0.0
 
 
 @shared

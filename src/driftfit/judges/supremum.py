@@ -116,7 +116,8 @@ def _kappa(x: Array) -> Array:
     density = np.exp(-0.5 * half * half) / np.sqrt(2.0 * np.pi)
     above = special.ndtr(half)
     nu = (above - 0.5) / half / (half * above + density)
-    return np.minimum(1.0, np.maximum(x, 0.0) * nu)
+    kappa: Array = np.minimum(1.0, np.maximum(x, 0.0) * nu)
+    return kappa
 
 
 def together(mean: float, *suprema: float) -> float:
