@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from driftfit import ARX, AdaptiveKalman, Bank, Kalman, Regression, Track, track
+from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
 from driftfit.kernel import Array
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.base import Tracker
@@ -49,13 +49,13 @@ def codes() -> None:
     for t in range(1, T):
         y[t] = 0.7 * y[t - 1] + 2.0 * u[t - 1] + 0.1 * rng.normal()
     print("\nFault codes: largest distance from [0.7, 2], 5 and 500 samples after the last of them")
-    names = ("AdaptiveKalman", "Bank", "RLS(0.98)", "Kalman")
+    names = ("AdaptiveKalman", "RLS(0.98)", "Kalman")
     print(f"  {'codes':22}" + "".join(f"{name:>18}" for name in names))
     for code, count, where in ((9999.0, 1, "y"), (9999.0, 5, "y"), (-999.0, 1, "y"), (9999.0, 1, "u")):
         record = {"y": y.copy(), "u": u.copy()}
         record[where][100 : 100 + count] = code
         cells = []
-        for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
+        for tracker in (AdaptiveKalman(), FORGET, WALK):
             away = np.abs(track(ARX(1, 1), tracker, **record).theta - [0.7, 2.0]).max(axis=1)
             cells.append(f"{away[104 + count]:.3f}, {away[599 + count]:.3f}")
         print(f"  {f'{code:g}, {count} in {where}':22}" + "".join(f"{cell:>18}" for cell in cells))

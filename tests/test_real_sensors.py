@@ -83,9 +83,9 @@ def plant(seed=3, size=T):
     return y, u
 
 
-@pytest.mark.parametrize("tracker", [AdaptiveKalman(), Bank()], ids=["adaptive", "bank"])
 @pytest.mark.parametrize(("code", "count"), [(9999.0, 1), (-999.0, 1), (1e6, 3), (9999.0, 8)])
-def test_a_fault_code_is_left_out_and_does_no_harm(tracker, code, count):
+def test_a_fault_code_is_left_out_and_does_no_harm(code, count):
+    tracker = AdaptiveKalman()
     y, u = plant()
     clean = track(PLANT, tracker, y, u)
     broken = y.copy()
