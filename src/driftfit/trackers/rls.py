@@ -61,7 +61,8 @@ def growth(s: State, l: int) -> float:
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative: it must not grow behind the cap
         grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
-    return 1.0 / min(1.0, max(faded, grown))
+    factor: float = 1.0 / min(1.0, max(faded, grown))
+    return factor
 
 
 @kernel
