@@ -39,7 +39,7 @@ def main() -> None:
                 began = time.perf_counter()
                 wrong, count = failures(model, this, range(0, T, step), T + AFTER + 10)
                 what = sorted({(value, signal, said) for _, value, signal, said in wrong}, key=str)
-                print(f"{name:25} {kind:16} {str(form or ''):20} {count:6} records, {len(wrong)} wrong, "
+                print(f"{name:25} {kind:16} {form or ''!s:20} {count:6} records, {len(wrong)} wrong, "
                       f"{time.perf_counter() - began:.0f} s", *what[:6], sep="\n    ", flush=True)  # fmt: skip
 
 

@@ -319,19 +319,15 @@ class TestSquareRoot:
         np.testing.assert_allclose(b.smooth().theta, a.smooth().theta, rtol=1e-9, atol=1e-10)
 
     @pytest.mark.parametrize("mu", [1e-12, 1.0, 1e6])
-    def test_it_holds_where_the_covariance_form_loses_digits(self, mu):
+    def test_both_forms_hold_where_a_covariance_would_lose_digits(self, mu):
         """Regressors that differ by 1e-6, against eighty digits."""
         phi, y = record()
         phi[:, 1] = phi[:, 0] + 1e-6 * phi[:, 1]
         theta, var = naive.precise(phi, y, mu)
-        errors = {}
-        for form in ("covariance", "sqrt"):
+        for form in ("covariance", "sqrt"):  # the former keeps the square root by itself
             run = track(Regression(2), Kalman(q=1.0 / mu, r=1.0, form=form), y, phi)
-            errors[form] = max(
-                np.abs(run.std[-1] ** 2 / var[-1] - 1.0).max(), np.abs(run.theta[-1] / theta[-1] - 1.0).max()
-            )
-        assert errors["sqrt"] < 1e-7
-        assert errors["sqrt"] < 0.01 * errors["covariance"]
+            assert np.abs(run.std[-1] ** 2 / var[-1] - 1.0).max() < 1e-7
+            assert np.abs(run.theta[-1] / theta[-1] - 1.0).max() < 1e-7
 
     def test_a_known_parameter_needs_the_covariance_form(self):
         with pytest.raises(ValueError, match="p0 must be positive definite"):
