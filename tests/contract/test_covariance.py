@@ -32,6 +32,7 @@ def records(T):
 RECORDS = records(LONG)
 
 
+@pytest.mark.filterwarnings("ignore:.*could not be learned:UserWarning")
 @pytest.mark.parametrize("name", list(RECORDS))
 def test_covariance_stays_finite_symmetric_and_positive(model, tracker, name):
     run = track(model, tracker, *RECORDS[name])

@@ -213,15 +213,19 @@ class Expressions:
             return self._reinterpreted(node)
         function = self.value(node.func).constant
         arguments = [self.value(one) for one in node.args]
-        if function in (kernel.floats, kernel.wholes):
-            rows, width = arguments[1].constant, int(arguments[2].constant)
-            shape = (self.unit.largest if rows is None else rows, width)
-            return Value("array", arguments[0].text, shape=shape, strides=(width, 1))
+        if function in (kernel.floats, kernel.wholes, kernel.cubes):
+            return self._at_address(arguments)
         if function in FOUR or function is eights.reached:
             return self._of_four(function, arguments)
         if hasattr(function, "py_func"):
             return self.called(function.py_func, arguments, statement)
         return self._builtin(node, function, arguments)
+
+    def _at_address(self, arguments: list[Value]) -> Value:
+        """An array of these extents; only the first of them may be unknown."""
+        extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
+        strides = [int(np.prod(extents[axis + 1 :])) for axis in range(len(extents))]
+        return Value("array", arguments[0].text, shape=tuple(extents), strides=tuple(strides))
 
     def _builtin(self, node: ast.Call, function: Any, arguments: list[Value]) -> Value:
         if function in (min, max):

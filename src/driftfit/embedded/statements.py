@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import re
 import textwrap
 from collections import Counter
@@ -25,7 +26,6 @@ from driftfit.embedded.values import RANK, Value, bare, begin_of, joined, lifted
 RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if int long register return
     short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
-    exp log sqrt
     """.split()  # noqa: SIM905
 )
 """Words that may not name a variable or function."""
@@ -39,7 +39,9 @@ def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
         unit.names[source.__name__] += 1
         count = unit.names[source.__name__]
         name = f"{source.__name__.lstrip('_')}{'' if count == 1 else f'_{count}'}"
-        unit.functions[key] = Body(unit, source, arguments).function(f"{name}_" if name in RESERVED else name)
+        unit.functions[key] = Body(unit, source, arguments).function(
+            f"{name}_" if name in RESERVED or hasattr(math, name) else name
+        )
     return unit.functions[key]
 
 

@@ -72,9 +72,13 @@ def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
             both = earlier + now
             if both > 0.0:
                 kept = earlier * (gap[i, k] + chance * (1.0 + more) * mean) + now * (Q[i, k] + more * mean)
-                Q[i, k] = (kept + (earlier + now * apart) * Q[0, k]) / both
+                if earlier + more + apart > 0.0:
+                    Q[i, k] = (kept + (earlier + now * apart) * Q[0, k]) / both
+                    kept = kept / both
+                else:  # one nominal sample: to the last bit what it would be if it were used
+                    kept = Q[i, k]
                 if not used:
-                    gap[i, k] = kept / both
+                    gap[i, k] = kept
 
 
 @core

@@ -221,4 +221,4 @@ def told(s: State, known: Array, t: int, l: int) -> None:
         s.memory[factors + i, l] = known[row, 3 + count + i, l]
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, MACHINES)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=MACHINES)

@@ -42,6 +42,7 @@ from driftfit.trackers.diffuse import ALMOST_ANY, MACHINES, enter, knowing_nothi
 from driftfit.trackers.drift_ladder import filters, mix
 from driftfit.trackers.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.filters import (
+    determined,
     enter_filters,
     innovate,
     mixture,
@@ -149,7 +150,8 @@ def begin(s: State, l: int) -> None:
         enter(s, l)
         if s.s[l] < np.inf:
             learn_start(s, l)
-            settle(s, l)
+            if determined(s, l):
+                settle(s, l)
         spanned_variance(s, l)
 
 

@@ -17,10 +17,13 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.kernel import State, exp, kernel
-from driftfit.trackers.diffuse import LEFT, hand_over, take_in
+from driftfit.trackers.diffuse import LEFT, SIZE, hand_over, take_in
 from driftfit.trackers.drift_ladder import TOP, leap
 from driftfit.trackers.noise_levels import OUTLIER
 from driftfit.trackers.resolution import lasting
+
+WIDE = 1e10
+"""Variance of the prediction in a direction of which nothing was known, beside all other variance of it."""
 
 LEAST = 1e-100
 """Probability that a filter is never below."""
@@ -158,12 +161,21 @@ def mixture(s: State, l: int) -> None:
 
 
 @kernel
+def determined(s: State, l: int) -> bool:
+    """Whether what the start has spanned is determined well enough for covariances to hold it."""
+    worst = 0.0
+    for i in range(s.theta.shape[0]):
+        inflation = s.P[i, i, l] * s.work[SIZE, i, l] * s.work[SIZE, i, l]
+        worst = max(worst, inflation if s.S[i, i, l] > 0.0 else 0.0)
+    return worst <= s.worst[l]  # type: ignore[no-any-return]
+
+
+@kernel
 def enter_filters(s: State, l: int) -> bool:
     """Take the sample into the square root of the start, and a regressor outside its span into all filters.
 
-    With N the vector of the free column that u = phi' N ends, the diffuse correction of filter k is
-
-        K = N / u,   m_k <- m_k + K e_k,   C_k <- C_k + K K' (h_k + v) - K g_k' - g_k K'
+    With N the vector of the free column that u = phi' N ends, C_k becomes C_k + w N N' before its correction, w so
+    large that what was known before has no say. An infinite w would divide by u, which may be all but rounding.
 
     Returns whether the regressor was one.
     """
@@ -181,17 +193,19 @@ def enter_filters(s: State, l: int) -> bool:
     noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
     for j in range(n):
         if s.ok[l] > 0.0 and s.pivot[j, l] > 0.0 and s.S[j, j, l] > 0.0:
-            u = 0.0
+            u, size = 0.0, 0.0
             for i in range(j + 1):
                 u += s.phi[i, l] * s.H[i, j, l]
+                size += abs(s.phi[i, l] * s.H[i, j, l])
             for k in range(K):
+                wide = WIDE * (s.h[k, l] + noise) / (size * size)
+                total = s.h[k, l] + wide * u * u + noise
                 for a in range(n):
-                    gain = s.H[a, j, l] / u if a <= j else 0.0
-                    s.m[a, k, l] += gain * s.e_k[k, l]
+                    s.gain[a, k, l] += wide * u * s.H[a, j, l] if a <= j else 0.0
+                    s.m[a, k, l] += s.gain[a, k, l] / total * s.e_k[k, l]
                     for b in range(a + 1):
-                        other = s.H[b, j, l] / u if b <= j else 0.0
-                        s.C[a, b, k, l] += gain * other * (s.h[k, l] + noise)
-                        s.C[a, b, k, l] -= gain * s.gain[b, k, l] + s.gain[a, k, l] * other
+                        s.C[a, b, k, l] += wide * s.H[a, j, l] * s.H[b, j, l] if a <= j else 0.0
+                        s.C[a, b, k, l] -= s.gain[a, k, l] * s.gain[b, k, l] / total
                 s.mu[k, l] = s.prior[k, l]
     return True
 
