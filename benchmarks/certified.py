@@ -1,6 +1,7 @@
 """Correct digits of NIST's certified estimates: least squares sample by sample, beside statsmodels (a minute).
 
-    python benchmarks/certified.py
+    python benchmarks/certified.py            all data sets
+    python benchmarks/certified.py --quick    the first alone
 
 Printed here is the table of docs/units.md. Needs statsmodels.
 """
@@ -22,7 +23,7 @@ from driftfit import FLS, RLS, Kalman, Regression, track
 def main() -> None:
     columns = ("RLS(1.0)", 'Kalman(form="sqrt")', "FLS, smoothed", "OLS, pinv", "OLS, qr", "RecursiveLS")
     table = Table("data set", *columns)
-    for name, (y, X, certified, _) in DATA.items():
+    for name, (y, X, certified, _) in list(DATA.items())[: 1 if "--quick" in sys.argv else None]:
         model, order = Regression(X.shape[1], intercept=True), [X.shape[1], *range(X.shape[1])]
         ours = [
             track(model, RLS(1.0), y, X).theta[-1],

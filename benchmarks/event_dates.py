@@ -65,4 +65,4 @@ def main(records: int = 1000) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(x) for x in sys.argv[1:2]))
+    main(2 if "--quick" in sys.argv else int([*sys.argv, 1000][1]))

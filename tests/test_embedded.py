@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from contract_table import forms, ready
+from typer.testing import CliRunner
 
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, Kalman, Live, Regression, trackers
+from driftfit.cli import app
 from driftfit.drivers import TrackerSteps
 from driftfit.embedded import export_c, from_struct, to_struct
 from driftfit.embedded.selftest import record
@@ -240,6 +242,17 @@ def test_the_loop_of_the_docs_prints_what_they_say(capsys, monkeypatch):
     page = (ROOT / "docs" / "embedded.md").read_text()
     said = re.search(r"`python examples/controller.py` prints.*?```text\n(.*?)```", page, re.S)[1]
     assert capsys.readouterr().out.split() == said.split()
+
+
+def test_the_command_writes_the_same(tmp_path):
+    export_c(ARX(2, 2), Kalman(q=1e-4, r=0.1), tmp_path / "one")
+    words = ["--model", "arx:2,2", "--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.1", "--out", str(tmp_path / "two")]
+    assert CliRunner().invoke(app, ["export", "c", *words]).exit_code == 0
+    for path in (tmp_path / "one").iterdir():
+        assert path.read_text() == (tmp_path / "two" / path.name).read_text()
+    wrong = CliRunner().invoke(app, ["export", "c", "--model", "arx:2,2", "--tracker", "bank", "--out", str(tmp_path)])
+    assert wrong.exit_code == 2
+    assert "Bank has no C form" in wrong.output
 
 
 def test_readme_and_header_say_what_there_is(tmp_path):

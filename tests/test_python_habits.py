@@ -9,6 +9,7 @@ from multiprocessing import get_context
 import numpy as np
 import polars as pl
 import pytest
+import rich
 from support import arx_record, same
 
 from driftfit import (
@@ -51,6 +52,7 @@ def notebook(monkeypatch):
         pass
 
     monkeypatch.setattr(builtins, "get_ipython", ZMQInteractiveShell, raising=False)
+    monkeypatch.setattr(rich, "_console", None)  # made once, and kept after the notebook is gone
 
 
 def results(run, fleet):

@@ -178,7 +178,7 @@ def test_structures_and_settings_are_compared_on_coarse_readings():
     wide = u[:, :2]
     chosen = select([Regression(2, intercept=True), Regression(2)], y, wide)
     assert all(abs(row.loglik) < 100.0 * T for row in chosen.rows)
-    assert chosen.best == Regression(2, intercept=True)
+    assert chosen.model() == Regression(2, intercept=True)
     tuned = tune(MODEL, FLS(), y, u, bounds=(1.0, 1e6))
     assert np.isfinite(tuned.loglik)
     assert track(MODEL, tuned.tracker, y, u).innovation_std[-1] > 0.25

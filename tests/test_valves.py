@@ -175,4 +175,4 @@ def test_forecasts_never_warn(h):
         if output is y:
             assert told.y_std[-1] == pytest.approx(0.02 if h == 1 else 0.02 / 0.6, rel=0.05)
         elif h == 2000:
-            assert np.nanmax(told.y_std) > 1e90
+            assert np.nanmax(told.y_std) > 1e30  # up to where readings end

@@ -75,14 +75,14 @@ def test_null_is_that_of_a_naive_simulation(noise):
 
 @pytest.mark.parametrize("noise", ["steady", "outliers", "changing", "correlated"])
 def test_error_rate(noise):
-    """Of 200 constant records 1 to 9 % are rejected at 5 %, three standard errors above; hardly any at 0.1 %.
+    """Of 200 constant records .5 to 9 % are rejected at 5 %, three standard errors above; hardly any at 0.1 %.
 
     The full table is benchmarks/verdict_error_rate.py.
     """
     made = correlated if noise == "correlated" else record
     p = np.array([constancy(*made(seed=seed, T=250, **({} if made is correlated else {"noise": noise}))).p_joint
                   for seed in range(200)])  # fmt: skip
-    assert 0.01 <= np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 200)
+    assert 0.005 <= np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 200)
     assert np.mean(p < 0.001) <= 0.01
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from driftfit.kernel import Array
 from driftfit.models.base import Model
 from driftfit.roles import check_role
+from driftfit.smoothers.shared import SmoothedShared
 from driftfit.track import track
 from driftfit.trackers.fls import FLS
 
@@ -75,6 +76,7 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
 
 def _movement(path: Smoothed) -> float:
     """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
+    path = path.rows if isinstance(path, SmoothedShared) else path
     walk = path.walk
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
     factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)

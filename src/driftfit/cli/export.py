@@ -1,0 +1,38 @@
+"""``driftfit export c``: a tracker as standalone C99."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftfit.cli.arguments import parse_model, parse_tracker
+from driftfit.cli.program import app, helpful, say
+from driftfit.summary import facts
+
+export = typer.Typer(no_args_is_help=True, help="Write a tracker in another language.")
+app.add_typer(export, name="export")
+
+
+@export.callback()
+def _languages() -> None:
+    """Write a tracker in another language."""
+
+
+@export.command(name="c")
+def to_c(
+    model: Annotated[str, typer.Option(help="As of `driftfit track`, such as arx:2,2.")],
+    out: Annotated[Path, typer.Option(help="The folder to write into.")],
+    tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
+    p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
+    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own.")] = None,
+) -> None:
+    """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
+    from driftfit.embedded import export_c
+
+    with helpful():
+        export_c(parse_model(model), parse_tracker(tracker, p or [], own), out)
+        said = (out / "README.md").read_text(encoding="utf-8")
+        state = said.split("State: ")[1].split(".")[0]
+        say(facts(("Written", str(out)), ("State", state), ("Check it", f"see {out / 'README.md'}")))
