@@ -4,6 +4,6 @@ from driftfit.cli import cache, demo, detect, export, forecast, select, smooth, 
 from driftfit.cli.program import app, main
 
 __all__ = [
-    "app", "cache", "demo", "detect", "export", "forecast", "main", "select", "smooth", "track", "trackers", "tune", "verdict",
-    "warm",
+    "app", "cache", "demo", "detect", "export", "forecast", "main", "select", "smooth", "track", "trackers", "tune",
+    "verdict", "warm",
 ]  # fmt: skip
