@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from driftfit.data import prepare
 from driftfit.engine.settings import DataWarning
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.select import grid, select
@@ -53,6 +54,7 @@ __all__ = [
     "Track",
     "frontier",
     "grid",
+    "prepare",
     "segment",
     "select",
     "track",
