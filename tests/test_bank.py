@@ -43,11 +43,11 @@ PRIORS = {
 
 
 def told(run, name):
-    return run.tracker.told(run._written("report"), name)
+    return run.tracker.told(run.written("report"), name)
 
 
 def state(run, name):
-    return run.tracker.array(run.model, {"memory": run._tile["memory"][0, :, 0]}, name)
+    return run.tracker.array(run.model, {"memory": run.state["memory"]}, name)
 
 
 def compare(run, twin, y, u, atol=1e-10, lags=1):

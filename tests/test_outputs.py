@@ -5,7 +5,7 @@ import pytest
 from support import same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.run.live.outputs import LiveOutputs
+from driftfit.streams import LiveOutputs
 
 NAMES = ["level", "flow"]
 

@@ -16,10 +16,10 @@ from rich.table import Table
 
 from driftfit.models.regression import Regression
 from driftfit.run.result import root_mean_square as rms
-from driftfit.run.track import track
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import MU, Simulated, example
 from driftfit.trackers.fls import FLS
+from driftfit.tracking import track
 from driftfit.tune.tune import Tuned, tune
 
 METHODS = ("ml", "loo", "gcv")

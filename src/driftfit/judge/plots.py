@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from driftfit.engine.kernel import Array
-from driftfit.show.plots import BLUE, GREY, RED, date_axis, new_figure, time_label
+from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, new_figure, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import picture, table
-from driftfit.show.summary import key_text
+from driftfit.show.parts.text import key_text
 
 if TYPE_CHECKING:
     from driftfit.judge.alarms.detect import Alarms

@@ -26,7 +26,6 @@ levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -35,7 +34,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import numbers
+from driftfit.engine.settings import numbers, warn
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, MACHINES, enter, knowing_nothing, measurement, spanned_variance
@@ -226,7 +225,7 @@ class AdaptiveKalman(Tracker):
         return learned(lane)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        lane, names = run.end().state, np.array(run.names)
+        lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
         said = []
@@ -237,13 +236,12 @@ class AdaptiveKalman(Tracker):
         return (*said, *proportion(lane), *resolution(lane))
 
     def inspect(self, run: Any) -> None:
-        lane = run.end().state
+        lane = run.state
         never = np.isinf(lane["var"])
         if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
-            warnings.warn(
+            warn(
                 f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, since the regressors "
                 "never moved apart from the others: std is inf. The other parameters are followed all the same; leave "
                 "out a column that stands still, or that repeats another, to be rid of this.",
                 UserWarning,
-                stacklevel=4,
             )

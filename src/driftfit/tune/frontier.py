@@ -17,8 +17,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.data.arguments import check_role
+from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.trackers.fls import FLS
@@ -64,14 +67,24 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
         raise ValueError("frontier: of one output at a time: take run[name], and frontier(run[name].model, .y, .u).")
+    reading = Reading(**known)
     if mu is None:
-        steady = track(model, FLS(1.0), y, u, **known).smooth()
+        steady = _path(model, FLS(1.0), y, u, reading)
         used = steady.walk.weight > 0.0
         power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
-    paths = [track(model, FLS(float(m), differences=differences), y, u, **known).smooth() for m in weights]
+    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading) for m in weights]
     return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
+
+
+def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading) -> Smoothed:
+    """The smoothed path of a record."""
+    run = track(model, tracker, y, u, reading)
+    if isinstance(run, Shared):
+        return SmoothedShared.of_shared(run)
+    assert isinstance(run, Track)
+    return Smoothed.of(run)
 
 
 def _movement(path: Smoothed) -> float:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.show.plots import BLUE, GREY, RED, new_figure
+from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

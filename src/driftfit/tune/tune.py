@@ -18,7 +18,7 @@ out after Allen (1974), GCV after Craven and Wahba (1979).
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -28,11 +28,10 @@ from driftfit.data.record import Reading, one_series
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
-from driftfit.run.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.knobs import find_knobs
-from driftfit.tune.lanes import Record, score
+from driftfit.tune.lanes import Task, score
 from driftfit.tune.objective import Criterion, along
 from driftfit.tune.search import Counted, Search, minimise
 
@@ -186,22 +185,22 @@ def tune(
 
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        found = tune_outputs(model, tracker, y, u, known, lambda record: _tuned(record, tracker, *options))
+        found = tune_outputs(model, tracker, y, u, known, lambda task: _tuned(task, tracker, *options))
         return cast("Tuned", found)
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    return _tuned(_record(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
+    return _tuned(_task(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
-    record: Record, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
+    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
 ) -> Tuned:
-    """Tune a checked record."""
+    """Tune on a checked record."""
     if order_by is not None:
-        record = along(record, tracker, order_by)
-    knobs = find_knobs(record, tracker, groups, bounds)
-    f = Counted(Criterion(record, knobs, method, h))
+        task = along(task, tracker, order_by)
+    knobs = find_knobs(task, tracker, groups, bounds)
+    f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
-    final = score(record, [knobs.run(search.x)], h)
+    final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
     tuned = Tuned(
         tracker=knobs.build(search.x, sigma2),
@@ -209,7 +208,7 @@ def _tuned(
         loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
-        interval=intervals_of(search, record, method, tracker, level),
+        interval=intervals_of(search, task, method, tracker, level),
         level=level,
         _search=search,
     )
@@ -234,8 +233,7 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _record(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Record:
+def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Task:
     records = one_series(y, u, reading).for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
-    records = with_drifts(bound, [tracker], records)
-    return Record(bound, records.y, records.u, records.known)
+    return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))

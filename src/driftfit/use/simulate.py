@@ -224,7 +224,7 @@ def _filled(values: Array) -> Array:
 
 def unbroken(run: Track, na: int, k: int) -> Array:
     """Samples whose k steps, and the lags before them, have no gap in time."""
-    gaps = np.broadcast_to(run._known[:, 0], len(run)) > GAP
+    gaps = np.broadcast_to(run.known.interval, len(run)) > GAP
     total = np.concatenate([[0], np.cumsum(gaps)])
     first = np.maximum(np.arange(len(run)) - k - max(na, 1) + 2, 0)
     return np.asarray(total[1:] == total[first])

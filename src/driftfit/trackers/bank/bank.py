@@ -34,7 +34,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
@@ -357,12 +357,12 @@ class Bank(Tracker):
         kinds = [event.kind for event in told.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
-        faults = int(run._tile["many"][0, FAULTS, run._lane])
+        faults = int(run.state["many"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
-        lane = run.end().state
+        lane = run.state
         return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     @property
