@@ -138,7 +138,7 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
         assert told[1 : 1 + len(judged)] == judged
         assert (told[-1] == "something") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
-    with pytest.raises(KeyError, match="too little"):
+    with pytest.raises(KeyError, match="too short"):
         said["<6>"]
 
 

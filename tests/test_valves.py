@@ -151,7 +151,7 @@ def test_what_several_inputs_cannot_have_is_said():
         track(VALVES, K, y, u[:, :1])
     with pytest.raises(ValueError, match="one entry for each input"):
         HammersteinWiener(1, [2, 1], input=[None, None, None])
-    with pytest.raises(ValueError, match="takes a model with one input"):
+    with pytest.raises(ValueError, match="needs a model with one input"):
         track(VALVES, ExtendedKalman(q=0.0, r=1.0), y, u)
     with pytest.raises(ValueError, match="one input"):
         fit_constant(VALVES, y, u)

@@ -16,8 +16,8 @@ CAUSES: dict[str, str] = {
     ),
     "mixed_rates": (
         "One ladder of drift ratios applies to all parameters, but here one changes fast, one slowly, and two are "
-        "constant. With the fast one in its own group, `AdaptiveKalman(groups=[[0]])` has 0.77 of the error for ARX and "
-        "0.87 for the regression, which is less than every row with one ratio."
+        "constant. With the fast one in its own group, `AdaptiveKalman(groups=[[0]])` has 0.77 of the error for ARX "
+        "and 0.87 for the regression, which is less than every row with one ratio."
     ),
     "missing_data": (
         "This is the cost of learning: with the ratio of the scenario on every rung the error falls by 2.7 %, and with "

@@ -103,7 +103,7 @@ class ManyVerdicts(Printed):
         for row in self.rows:
             if row.key == key:
                 return row
-        raise KeyError(f"there is no verdict of {key!r}.")
+        raise KeyError(f"there is no verdict for {key!r}.")
 
     def ranked(self, by: str = "clearest") -> ManyVerdicts:
         """The same rows in another order: the "clearest" first, or the largest relative "change" first."""

@@ -241,9 +241,9 @@ class AdaptiveKalman(Tracker):
         never = np.isinf(lane["var"])
         if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
             warnings.warn(
-                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, since the regressors "
-                "never moved apart from the others: std is inf. The other parameters are followed all the same; leave "
-                "out a column that stands still, or that repeats another, to be rid of this.",
+                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, because their "
+                "regressors never varied separately from the others: std is inf. The other parameters are not "
+                "affected; to avoid this warning leave out columns that are constant or repeat another.",
                 UserWarning,
                 stacklevel=4,
             )

@@ -48,11 +48,11 @@ def structure_of(owner: str, model: Model) -> Structure:
         )
     structure = model.structure
     if model.m > 1:
-        raise ValueError(f"{owner}: takes a model with one input; follow the products of several with Kalman.")
+        raise ValueError(f"{owner}: needs a model with one input; for several inputs track the products with Kalman.")
     if structure.n == structure.n_x and structure.names != structure.minimal_names:
         raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb[0]} products and minimal parameters are as many "
-            "and cannot be told apart; follow the products with Kalman and separate them."
+            f"{owner}: with na = {structure.na} and nb = {structure.nb[0]} there are as many products as minimal "
+            "parameters, so the two cannot be distinguished; track the products with Kalman and separate them."
         )
     return structure
 
