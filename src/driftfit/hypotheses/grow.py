@@ -25,6 +25,7 @@ from driftfit.hypotheses.forget import KIND, apply
 from driftfit.hypotheses.lags import shift_covariance, widen_by_lags
 from driftfit.hypotheses.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.kernel import Array, core, log, part, sized
+from driftfit.trackers.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
@@ -89,9 +90,13 @@ def correct(
         for i in range(n):
             k = times(gain, load(g, i, l))
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(k, eps)))
-            for j in range(i + 1):
+            for j in range(i):
                 store(B, FIRST + n + entry, at + l, minus(load(C, entry, l), times(k, load(g, j, l))))
                 entry += 1
+            was = load(C, entry, l)
+            left = minus(was, times(k, load(g, i, l)))
+            store(B, FIRST + n + entry, at + l, higher(left, times(fill(LEFT), was)))
+            entry += 1
 
 
 @core
