@@ -7,6 +7,7 @@ import numpy as np
 from driftfit.drivers import TrackerSteps
 from driftfit.hypotheses.advance import bank
 from driftfit.hypotheses.grow import FLOOR
+from driftfit.hypotheses.lags import PLAUSIBLE
 from driftfit.hypotheses.table import (
     ADDRESSES,
     BASE,
@@ -22,6 +23,7 @@ from driftfit.hypotheses.table import (
     IN_Y,
     LEAST,
     MANY,
+    MOST,
     NOW,
     PHI,
     PLACES,
@@ -154,6 +156,7 @@ def tell(s: State, l: int) -> None:
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+    s.now[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
 @kernel
