@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, track
-from driftfit.fleet import Fleet, cores
+from driftfit.run.fleet import Fleet, cores
 
 T, DRIFTING = 400, 0.1
 

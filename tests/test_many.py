@@ -9,8 +9,8 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.judges import many
-from driftfit.judges.many import discoveries, verdicts
+from driftfit.judge import many
+from driftfit.judge.many import discoveries, verdicts
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)
