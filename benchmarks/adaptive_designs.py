@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Regression, track
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.systems import scenarios
 
 BURN = 200

@@ -20,7 +20,7 @@ from rich.table import Table
 from scipy import signal
 
 from driftfit import ARX, Bank, Change, Kalman, Regression, Sensor, Track, track
-from driftfit.judges.onsets import onsets
+from driftfit.judge.alarms.onsets import onsets
 
 T, QUICK = 20_000, 6000
 """Samples a record."""

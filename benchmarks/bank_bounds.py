@@ -30,7 +30,7 @@ def watch() -> tuple[Any, list[str]]:
     from llvmlite import ir
     from numba.core import cgutils
 
-    from driftfit import eights
+    from driftfit.engine import simd
 
     noted, sites = (ctypes.c_int64 * 4096)(), []
     i64 = ir.IntType(64)
@@ -63,13 +63,13 @@ def watch() -> tuple[Any, list[str]]:
         rows, columns = (builder.extract_value(inside.shape, k) for k in (0, 1))
         at = builder.add(builder.mul(row, columns), column)
         size = builder.mul(rows, columns)
-        last = builder.add(at, ir.Constant(i64, eights.WIDTH - 1))
+        last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
         beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
         note(builder, beyond, last, size)
-        return builder.bitcast(builder.gep(inside.data, [at]), eights._EIGHT.as_pointer())
+        return builder.bitcast(builder.gep(inside.data, [at]), simd._EIGHT.as_pointer())
 
     cgutils.do_boundscheck = checked
-    eights._place = place
+    simd._place = place
     return noted, sites
 
 
@@ -147,7 +147,7 @@ def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
 
 def reduction(rng: np.random.Generator, H: int) -> Any:
     """A reduction, at random."""
-    from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+    from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 
     depth, leaves, window = (
         int(x) for x in (rng.integers(1, 5), rng.choice([1, 2, 7, 9, 22, 33, 64, 100]), rng.choice([1, 3, 8, 30]))

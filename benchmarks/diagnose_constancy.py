@@ -22,12 +22,12 @@ from rich.table import Table
 from scipy import signal
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
-from driftfit.compare import errors
-from driftfit.diagnose import MATERIAL, holds_constant
-from driftfit.judges.constancy import constancy
-from driftfit.judges.paired import paired
-from driftfit.judges.regressors import regressors
-from driftfit.result import root_mean_square
+from driftfit.judge.compare import errors
+from driftfit.judge.diagnose import MATERIAL, holds_constant
+from driftfit.judge.regressors import regressors
+from driftfit.judge.statistics.constancy import constancy
+from driftfit.judge.statistics.paired import paired
+from driftfit.run.result import root_mean_square
 
 TRACKERS = {
     "constant": Kalman(q=0.0, r=1.0), "AdaptiveKalman()": AdaptiveKalman(), "Kalman, q/r = 1e-4": Kalman(q=1e-4, r=1.0),

@@ -13,7 +13,7 @@ import sys
 import numpy as np
 
 from driftfit import Bank, Regression, track
-from driftfit.hypotheses.events import Event
+from driftfit.trackers.bank.results.events import Event
 
 T, AT = 300, 150
 

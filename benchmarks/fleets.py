@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.fleet import Fleet, cores
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
+from driftfit.run.fleet import Fleet, cores
 
 Q, R, P0 = 1e-4, 0.01, 10.0
 TRACKER = Kalman(q=Q, r=R, p0=P0)

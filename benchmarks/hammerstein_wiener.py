@@ -14,11 +14,11 @@ from functools import partial
 import numpy as np
 
 from driftfit import Kalman, Live, Regression, track
-from driftfit.blocks.paths import empty
-from driftfit.blocks.separate import METHODS, separate
-from driftfit.kernel import Array
-from driftfit.models.basis import Legendre, Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.curves.basis import Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.separation.paths import empty
+from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
 from driftfit.systems.hammerstein_wiener import CUBIC, example
 from lab.reproduce.hammerstein_wiener.cost import least
 

@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
-from driftfit.drivers import drivers, known_factors, make_tile, output_type
+from driftfit.engine.drivers import drivers, known_factors, make_tile, output_type
 from lab.bench.machine import installed, machine, times
 
 HERE = Path(__file__).parent

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman
-from driftfit.drivers import WIDTH, drivers, make_tile, output_type
-from driftfit.fleet import BLOCK, lanes
+from driftfit.engine.drivers import WIDTH, drivers, make_tile, output_type
+from driftfit.run.fleet import BLOCK, lanes
 
 TRACKER = Kalman(q=1e-4, r=0.01)
 

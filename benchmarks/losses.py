@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from driftfit import AdaptiveKalman
-from driftfit.trackers import drift_ladder, noise_levels
+from driftfit.trackers.parts import drift_ladder, noise_levels
 from lab.bench.contestants import run
 from lab.bench.records import simulated
 from lab.bench.scores import parameter_error

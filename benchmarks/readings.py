@@ -17,7 +17,7 @@ from contract_table import forms, model_of, ready
 from readings import AFTER, failures
 
 from driftfit import ARX, HammersteinWiener
-from driftfit.models.basis import Polynomial
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.trackers import found
 
 MODELS = {

@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy import signal
 
-from driftfit.judges.attribute import holm
-from driftfit.judges.constancy import constancy
+from driftfit.judge.statistics.attribution import holm
+from driftfit.judge.statistics.constancy import constancy
 
 LEVEL = 0.05
 NOISES = ("steady", "outliers", "heavy tails", "changing noise", "changing noise and inputs", "AR(0.6)", "AR(0.9)")

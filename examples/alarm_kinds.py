@@ -12,7 +12,7 @@ import warnings
 import numpy as np
 
 from driftfit import AdaptiveKalman, Kalman, Regression, track
-from driftfit.detect import Alarms
+from driftfit.judge.alarms.detect import Alarms
 
 T, KNOWN, START, RECORDS, EVERY = 2000, 1000, 1500, 20, 5000.0
 MODEL = Regression(["gain"], intercept=True)

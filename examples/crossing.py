@@ -10,8 +10,8 @@ import sys
 import numpy as np
 
 from driftfit import FLS, AdaptiveKalman, Kalman, Regression, track
-from driftfit.kernel import Array
-from driftfit.result import Track
+from driftfit.engine.kernel import Array
+from driftfit.run.result import Track
 
 T, HORIZON, NOISE = 150, 300, 0.2
 AWAY = 0.5

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from driftfit import Kalman, track
-from driftfit.blocks.hand_off import hand_off
-from driftfit.models.basis import Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
+from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.systems.drift import Ramp, SineOffset
 from driftfit.systems.hammerstein_wiener import simulate
-from driftfit.trackers.output_error import OutputError
 
 FIGURE = Path(__file__).parent.parent / "docs" / "figures" / "hammerstein_wiener_blocks.png"
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from driftfit import ARX, Bank, Change, Decide, Live, Sensor, track
-from driftfit.hypotheses.pictures import plot_tree
-from driftfit.smoothers.piecewise import piecewise
+from driftfit.smooth.piecewise import piecewise
+from driftfit.trackers.bank.results.pictures import plot_tree
 
 
 def simulate(T: int = 400, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:

@@ -12,11 +12,11 @@ import numpy as np
 
 from driftfit import ARX, RLS, Live, track
 from driftfit.checks import check_tracker
-from driftfit.drivers import TrackerSteps, unknown
-from driftfit.kernel import State, kernel, nothing
-from driftfit.settings import numbers
+from driftfit.engine.drivers import TrackerSteps, unknown
+from driftfit.engine.kernel import State, kernel, nothing
+from driftfit.engine.settings import numbers
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import prediction
+from driftfit.trackers.parts.diffuse import prediction
 
 
 @kernel

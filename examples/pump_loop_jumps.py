@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from driftfit import RLS, Bank, Kalman, Regression, Track, track, tune
-from driftfit.hypotheses.reduction import Beam
+from driftfit.trackers.bank.reduction import Beam
 
 REGRESSORS = ["pressure_bar", "current_A"]
 TUNING, REACH = 200, 60

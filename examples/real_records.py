@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, RLS, Kalman, Regression, Track, track
-from driftfit.compare import persistence
-from driftfit.files import read_columns
+from driftfit.data.files import read_columns
+from driftfit.judge.compare import persistence
 from driftfit.models.base import Model
-from driftfit.result import root_mean_square
+from driftfit.run.result import root_mean_square
 
 RATIOS = (0.0, *(10.0 ** np.arange(-7.0, 2.1, 0.5)).tolist())
 """What the drift of one sample adds to the variance of y through one parameter, in units of r; the same for all."""

@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 
 from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.rls import RLS

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track, tune
-from driftfit.smoothers.augmented import augmented
-from driftfit.smoothers.huber import huber
-from driftfit.smoothers.total_variation import total_variation
+from driftfit.smooth.augmented import augmented
+from driftfit.smooth.huber import huber
+from driftfit.smooth.total_variation import total_variation
 
 BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
 SEEDS = 20

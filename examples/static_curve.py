@@ -10,9 +10,9 @@ import warnings
 import numpy as np
 
 from driftfit import FLS, track, tune
-from driftfit.plots import BLUE, GREY, RED, new_figure
-from driftfit.recover import static_curve
+from driftfit.show.plots import BLUE, GREY, RED, new_figure
 from driftfit.systems.time_varying import hammerstein
+from driftfit.use.recover import static_curve
 
 
 def main(picture: str | None = None) -> None:

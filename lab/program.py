@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from driftfit.settings import near
+from driftfit.engine.settings import near
 from lab import same_numbers
 from lab.bench import commands as bench
 from lab.reproduce import found as reproductions

@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from driftfit import Kalman
-from driftfit.drivers import drivers, make_tile, output_type
-from driftfit.kernel import exp, kernel
+from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.engine.kernel import exp, kernel
 from driftfit.trackers.kalman import INDEPENDENT
 
 BAD = (np.nan, np.inf, -np.inf, 1e200, -1e200)

@@ -6,8 +6,8 @@ from support import arx_record, same
 from test_bank import N, R, changes, record
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.hypotheses.reduction import IMM, Beam, Decide, Hybrid
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.reduction import IMM, Beam, Decide, Hybrid
+from driftfit.trackers.bank.sensor import Sensor
 
 JUMPS = (40, 90)
 KNOWN = [Sensor.nominal(R)]

@@ -6,9 +6,9 @@ from support import same
 from test_bank import N, R, record
 
 from driftfit import RLS, Bank, Regression, track
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, FirstFloor
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, FirstFloor
+from driftfit.trackers.bank.sensor import Sensor
 
 Y, U = record(80, 4, (40,))
 Y[50:53], U[60] = np.nan, np.nan

@@ -11,9 +11,9 @@ from support import same
 from test_bank import N, R, changes, record, told
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track, tune
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, Hybrid
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, Hybrid
+from driftfit.trackers.bank.sensor import Sensor
 
 KNOWN = [Sensor.nominal(R)]
 P, DRIFT, JUMP = 0.01, 1e-4, 1.0
@@ -246,16 +246,16 @@ def test_one_fault_code_is_survived(code):
 
 def test_the_bound_of_a_beam_is_found_among_large_numbers():
     """The bits of two numbers above 2 overflow when they are added."""
-    from driftfit.hypotheses import plan
+    from driftfit.trackers.bank.machine import selection
 
     values = np.zeros((1, 72))
     values[0, :66] = np.r_[np.full(40, 4.0), np.linspace(2.0, 3.0, 26)]
     with np.errstate(all="raise"):
         M, low, high = 45, np.int64(1), np.int64(0x7FF0000000000000)
         assert 0 < low + (high - low) // 2 < high
-    from driftfit.kernel import Driver
+    from driftfit.engine.kernel import Driver
 
-    bound = plan.bound
+    bound = selection.bound
 
     @Driver
     def found(V, out):

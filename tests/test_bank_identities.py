@@ -9,11 +9,11 @@ from scipy import integrate, special, stats
 from test_bank import P3, PROBS, N, Q, R, changes, record, state, told
 
 from driftfit import Bank, Regression, track
-from driftfit.hypotheses import lookahead, merge
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.leaves import FIRST, NU, WEIGHT, S
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.machine import lookahead, merge
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide
+from driftfit.trackers.bank.sensor import Sensor
 
 Y, U = record(60, 11, (25,))
 

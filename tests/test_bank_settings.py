@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, Bank, Live, Regression, track
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.trackers.bank.sensor import Sensor
 
 TWO = [Change(0.0), Change(0.5, prob=0.01)]
 KNOWN = [Sensor.nominal(0.1)]

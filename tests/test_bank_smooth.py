@@ -5,11 +5,11 @@ import pytest
 from test_bank import N, R, changes, record
 
 from driftfit import Bank, Kalman, Regression, track
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import Beam
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.hypotheses.smooth import problem_of, solve
-from driftfit.smoothers.piecewise import piecewise
+from driftfit.smooth.piecewise import piecewise
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import Beam
+from driftfit.trackers.bank.results.decided_path import problem_of, solve
+from driftfit.trackers.bank.sensor import Sensor
 
 KNOWN = [Sensor.nominal(R)]
 Y, U = record(120, 5, (40, 90))

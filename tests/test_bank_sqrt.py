@@ -10,14 +10,15 @@ from support import arx_record, damaged, run_lanes, same
 from test_bank import N, R, changes, record
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.hypotheses import leaves, merge, start
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.factored import factorise, widened
-from driftfit.hypotheses.factored import product as multiplied
-from driftfit.hypotheses.leaves import FIRST
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.kernel import exchanged
+from driftfit.engine.kernel import exchanged
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.leaves import leaves
+from driftfit.trackers.bank.leaves.factored import factorise, widened
+from driftfit.trackers.bank.leaves.factored import product as multiplied
+from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.machine import merge, start
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.trackers.bank.sensor import Sensor
 
 T = 90
 Y, U = record(T, 5, (30, 60), (40, 75))

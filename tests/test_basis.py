@@ -8,7 +8,7 @@ from numpy.polynomial import chebyshev, legendre
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from driftfit import Kalman, Track, track
-from driftfit.models.basis import (
+from driftfit.models.hammerstein_wiener.curves.basis import (
     BSpline,
     Chebyshev,
     DeadZone,
@@ -20,7 +20,7 @@ from driftfit.models.basis import (
     Sigmoid,
     basis_of,
 )
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.systems.hammerstein_wiener import simulate
 
 

@@ -11,15 +11,15 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.blocks.constant import fit_constant
-from driftfit.blocks.least_squares import jacobian, refine, residual
-from driftfit.blocks.paths import Groups, minimal, split
-from driftfit.blocks.product_drift import product_drift, renewed, track_products
-from driftfit.blocks.ratios import track_ratios
-from driftfit.blocks.separate import METHODS
-from driftfit.models.basis import Legendre, Polynomial
-from driftfit.models.block_products import Structure
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.curves.basis import Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.products import Structure
+from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
+from driftfit.models.hammerstein_wiener.results.drift_ratios import track_ratios
+from driftfit.models.hammerstein_wiener.results.product_drift import product_drift, renewed, track_products
+from driftfit.models.hammerstein_wiener.separation.least_squares import jacobian, refine, residual
+from driftfit.models.hammerstein_wiener.separation.paths import Groups, minimal, split
+from driftfit.models.hammerstein_wiener.separation.separate import METHODS
 from driftfit.systems.hammerstein_wiener import CUBIC, START, example, simulate
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))

@@ -11,11 +11,11 @@ import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, track
 from driftfit.checks import check_tracker
-from driftfit.drivers import TrackerSteps, nothing_told, unknown
-from driftfit.kernel import kernel, nothing
+from driftfit.engine.drivers import TrackerSteps, nothing_told, unknown
+from driftfit.engine.kernel import kernel, nothing
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import prediction
 from driftfit.trackers.kalman import INDEPENDENT
+from driftfit.trackers.parts.diffuse import prediction
 
 
 def steps(predict, correct) -> TrackerSteps:

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, Live, Track, cli, track
-from driftfit.cli.reading import Part, rows_of
+from driftfit.cli.parts.reading import Part, rows_of
 
 K = Kalman(q=1e-4, r=0.01)
 KALMAN = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]

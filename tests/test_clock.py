@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from driftfit import ARX, Kalman, Live, track
-from driftfit.clock import NEAR, Clock, instant, median_interval
-from driftfit.settings import DataWarning
+from driftfit.data.clock import NEAR, Clock, instant, median_interval
+from driftfit.engine.settings import DataWarning
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 T = 60

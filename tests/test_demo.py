@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from driftfit import demo
-from driftfit.files import read_columns
+from driftfit.data.files import read_columns
+from driftfit.demo import demo
 
 ROOT = demo.resources.files("driftfit")
 

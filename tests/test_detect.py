@@ -8,12 +8,21 @@ from scipy import signal, stats
 from support import Doubtful, arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, HammersteinWiener, Kalman, Regression, track
-from driftfit.detect import Alarms
-from driftfit.judges.alarm_rule import AlarmRule, normal_scores
-from driftfit.judges.calibrate import _begun, _least, innovations, null_records, residuals
-from driftfit.judges.onsets import chance, held, mean_limit, mean_rate, normal_limit, onsets, power_limit, power_rate
-from driftfit.judges.scale import core
-from driftfit.kernel import kernel
+from driftfit.engine.kernel import kernel
+from driftfit.judge.alarms.calibration import _begun, _least, innovations, null_records, residuals
+from driftfit.judge.alarms.detect import Alarms
+from driftfit.judge.alarms.onsets import (
+    chance,
+    held,
+    mean_limit,
+    mean_rate,
+    normal_limit,
+    onsets,
+    power_limit,
+    power_rate,
+)
+from driftfit.judge.alarms.rule import AlarmRule, normal_scores
+from driftfit.judge.statistics.scale import core
 from driftfit.trackers.kalman import INDEPENDENT
 
 K = Kalman(q=1e-3, r=0.01)

@@ -6,9 +6,9 @@ from scipy import stats
 from support import arx_record
 
 from driftfit import ARX, RLS, AdaptiveKalman, AugmentedFLS, Kalman, Regression, track
-from driftfit.compare import errors
-from driftfit.diagnose import holds_constant
-from driftfit.judges.excitation import excitation
+from driftfit.judge.compare import errors
+from driftfit.judge.diagnose import holds_constant
+from driftfit.judge.excitation import excitation
 
 TRUE = Kalman(q=0.0, r=0.01)
 

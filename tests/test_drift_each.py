@@ -8,7 +8,7 @@ from contract_table import model_of, ready
 from support import arx_record
 
 from driftfit import ARX, FLS, RLS, Kalman, Live, Regression, Track, frontier, track, tune
-from driftfit.smoothers.huber import huber
+from driftfit.smooth.huber import huber
 from driftfit.trackers import found
 
 TWO = Regression(2)

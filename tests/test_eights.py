@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from driftfit.eights import (
+from driftfit.engine.kernel import exp, log
+from driftfit.engine.simd import (
     WIDTH,
     below,
     equal,
@@ -21,8 +22,7 @@ from driftfit.eights import (
     store,
     sum_of,
 )
-from driftfit.hypotheses.merge import digamma
-from driftfit.kernel import exp, log
+from driftfit.trackers.bank.machine.merge import digamma
 
 RNG = np.random.default_rng(3)
 

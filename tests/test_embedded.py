@@ -15,11 +15,11 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, Kalman, Live, Regression, trackers
 from driftfit.cli import app
-from driftfit.drivers import TrackerSteps
 from driftfit.embedded import export_c, from_struct, to_struct
 from driftfit.embedded.selftest import record
 from driftfit.embedded.unit import TranslationError
-from driftfit.kernel import kernel
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import kernel
 from driftfit.trackers.base import Tracker
 
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off"]

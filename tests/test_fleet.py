@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
-from driftfit import fleet as fleets
-from driftfit.records import Records
-from driftfit.storage import fields
+from driftfit.data.record import Records
+from driftfit.data.storage import fields
+from driftfit.run import fleet as fleets
 
 KALMAN = Kalman(q=1e-3, r=0.1)
 MODEL = ARX(1, 1)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.smoothers import exact
-from driftfit.smoothers.walk import Walk
+from driftfit.smooth import exact
+from driftfit.smooth.parts.walk import Walk
 
 
 def record(L=40, n=2, seed=0):

@@ -6,8 +6,8 @@ from support import same
 from test_bank import N, R, record
 
 from driftfit import RLS, Bank, Kalman, Regression, track
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.sensor import Sensor
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.sensor import Sensor
 
 LAM = 0.9
 

@@ -8,17 +8,17 @@ import pytest
 from support import same
 
 from driftfit import ARX, RLS, Kalman, Live, Track, track
-from driftfit.blocks.free_run import believed
-from driftfit.drivers import TrackerSteps, unknown
-from driftfit.kernel import kernel, nothing
-from driftfit.models.basis import (
+from driftfit.engine.drivers import TrackerSteps, unknown
+from driftfit.engine.kernel import kernel, nothing
+from driftfit.models.hammerstein_wiener.curves.basis import (
     BSpline,
     DeadZone,
     Legendre,
     PiecewiseLinear,
     Polynomial,
 )
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.free_run import believed
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import CUBIC, NotMonotoneError, example, invert, simulate
 from driftfit.trackers.base import Tracker

@@ -10,9 +10,9 @@ from test_bank import N, R, changes
 from test_bank import record as jumping
 
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
-from driftfit.judges.alarm_rule import AlarmRule
-from driftfit.judges.calibrate import null_records
-from driftfit.live_alarm import LiveAlarm
+from driftfit.judge.alarms.calibration import null_records
+from driftfit.judge.alarms.rule import AlarmRule
+from driftfit.run.live.alarm import LiveAlarm
 
 K = Kalman(q=1e-4, r=0.01)
 T, CUT, FAULT = 900, 500, 700

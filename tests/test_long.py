@@ -6,7 +6,7 @@ from contract_table import SLOW, as_arx, model_of, ready
 from support import THETA, arx_record
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
-from driftfit.result import root_mean_square
+from driftfit.run.result import root_mean_square
 from driftfit.trackers import found
 
 LONG = 100_000

@@ -7,7 +7,7 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.judges.many import discoveries
+from driftfit.judge.many import discoveries
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)

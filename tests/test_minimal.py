@@ -8,16 +8,16 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import Kalman, Live, Regression, track, tune
-from driftfit.blocks.diagnostics import diagnose_blocks
-from driftfit.blocks.free_run import free_run, reflected
-from driftfit.blocks.hand_off import hand_off
-from driftfit.models.basis import DeadZone, Legendre, Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.diagnostics import diagnose_blocks
+from driftfit.models.hammerstein_wiener.results.free_run import free_run, reflected
+from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
+from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
+from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.systems.arc_furnace import THRESHOLDS, A, furnace, length, resistance
 from driftfit.systems.drift import RandomWalk
 from driftfit.systems.hammerstein_wiener import simulate, unstable_in_closed_loop
-from driftfit.trackers.extended_kalman import ExtendedKalman
-from driftfit.trackers.output_error import OutputError
 
 SMALL = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
 K = Kalman(q=1e-5, r=1e-4, p0=1e2, theta0=0.01)

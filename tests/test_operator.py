@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, Track, track
-from driftfit.storage import fields
+from driftfit.data.storage import fields
 
 MODEL = ARX(1, 1)
 KINDS = [Kalman(q=1e-3, r=0.1), RLS(0.98), AugmentedFLS(mu=1.0)]

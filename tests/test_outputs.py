@@ -5,7 +5,7 @@ import pytest
 from support import same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.live_outputs import LiveOutputs
+from driftfit.run.live.outputs import LiveOutputs
 
 NAMES = ["level", "flow"]
 

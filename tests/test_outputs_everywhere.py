@@ -7,9 +7,9 @@ import pytest
 from test_outputs import NAMES, coupled, measured
 
 from driftfit import ARX, FLS, RLS, Kalman, Live, Regression, Track, frontier, track, tune
-from driftfit.live_outputs import LiveOutputs
-from driftfit.outputs import Outputs
-from driftfit.shared_outputs import Shared
+from driftfit.run.live.outputs import LiveOutputs
+from driftfit.run.outputs import Outputs
+from driftfit.run.shared_outputs import Shared
 
 JOINT = ARX(1, 1, ny=NAMES)
 SHARED = Regression(2, ny=2, shared=True)

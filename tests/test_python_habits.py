@@ -26,8 +26,8 @@ from driftfit import (
     track,
     tune,
 )
-from driftfit.detect import detect
-from driftfit.frontier import frontier
+from driftfit.judge.alarms.detect import detect
+from driftfit.tune.frontier import frontier
 
 K = Kalman(q=1e-3, r=0.01)
 Y, U = arx_record(200, 1)

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
 from driftfit.cli import app
-from driftfit.report import page
-from driftfit.report_parts import LONG, svg
+from driftfit.show.page_parts import LONG, svg
+from driftfit.show.report import page
 
 K = Kalman(q=1e-3, r=0.01)
 OPEN = {"meta", "br", "img", "link", "hr"}

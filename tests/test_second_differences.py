@@ -6,7 +6,7 @@ import pytest
 
 from driftfit import ARX, FLS, Live, Regression, Track, frontier, track, tune
 from driftfit.checks import check_tracker
-from driftfit.smoothers.huber import huber
+from driftfit.smooth.huber import huber
 
 TWO = Regression(2)
 

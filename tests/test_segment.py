@@ -5,9 +5,9 @@ import pytest
 from scipy import signal
 
 from driftfit import ARX, RLS, Regression, segment, track
-from driftfit.judges.dates import date_loglik, smallest
-from driftfit.judges.noise import penalty
-from driftfit.judges.partition import partition
+from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.statistics.noise import penalty
+from driftfit.judge.statistics.partition import partition
 
 AT = (133, 266)
 

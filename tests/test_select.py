@@ -7,8 +7,8 @@ from support import arx_record, damaged
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, grid, select, track
 from driftfit.models.base import Model
-from driftfit.models.basis import Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 
 K = Kalman(q=1e-4, r=0.01)
 ORDERS = grid(ARX, na=[1, 2], nb=[1, 2])

@@ -6,10 +6,10 @@ import pytest
 from scipy.optimize import minimize
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, HammersteinWiener, Kalman, Live, Regression, track
-from driftfit.models.basis import Polynomial
-from driftfit.smoothers.augmented import augmented
-from driftfit.smoothers.huber import huber
-from driftfit.smoothers.total_variation import total_variation
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.smooth.augmented import augmented
+from driftfit.smooth.huber import huber
+from driftfit.smooth.total_variation import total_variation
 
 
 def record(L=40, n=2, seed=0):

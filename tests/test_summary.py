@@ -9,7 +9,7 @@ from scipy import stats
 from support import THETA, arx_record, damaged, rows_of, same
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
-from driftfit.compare import compare, persistence
+from driftfit.judge.compare import compare, persistence
 
 K = Kalman(q=1e-3, r=0.1)
 

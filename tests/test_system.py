@@ -6,9 +6,9 @@ from scipy import signal
 from support import arx_record, damaged
 
 from driftfit import ARX, AugmentedFLS, Kalman, Regression, track
-from driftfit.judges.delta import jacobian
-from driftfit.simulate import fit
-from driftfit.system import fieller
+from driftfit.use.delta_method import jacobian
+from driftfit.use.simulate import fit
+from driftfit.use.system import fieller
 
 K = Kalman(q=1e-3, r=0.01)
 

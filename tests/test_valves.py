@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 from support import same
 
 from driftfit import Kalman, Live, track
-from driftfit.blocks.constant import fit_constant
-from driftfit.blocks.free_run import free_run
-from driftfit.blocks.least_squares import refine
-from driftfit.blocks.paths import split
-from driftfit.models.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
+from driftfit.models.hammerstein_wiener.results.free_run import free_run
+from driftfit.models.hammerstein_wiener.separation.least_squares import refine
+from driftfit.models.hammerstein_wiener.separation.paths import split
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)

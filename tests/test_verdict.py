@@ -6,15 +6,15 @@ from scipy import signal, stats
 from support import THETA, arx_record, damaged
 
 from driftfit import ARX, RLS, Kalman, Regression, track
-from driftfit.compare import compare
-from driftfit.judges.attribute import attribute, holm
-from driftfit.judges.constancy import constancy
-from driftfit.judges.constants import constant_least_squares
-from driftfit.judges.paired import newey_west, paired
-from driftfit.judges.quadratic import quantile, tail
-from driftfit.judges.robust import robust_fit
-from driftfit.judges.supremum import scanned, suprema, together
-from driftfit.judges.whiteness import crossing, whiteness
+from driftfit.judge.compare import compare
+from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.statistics.attribution import attribute, holm
+from driftfit.judge.statistics.constancy import constancy
+from driftfit.judge.statistics.paired import newey_west, paired
+from driftfit.judge.statistics.quadratic import quantile, tail
+from driftfit.judge.statistics.robust import robust_fit
+from driftfit.judge.statistics.supremum import scanned, suprema, together
+from driftfit.judge.statistics.whiteness import crossing, whiteness
 
 BRIDGE = 1.0 / (np.pi * np.arange(1, 400)) ** 2
 """Weights of the integral of a squared Brownian bridge."""

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.result import root_mean_square
-from driftfit.settings import near
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+from driftfit.run.result import root_mean_square
 from driftfit.systems import scenarios
 from lab.bench.contestants import KALMAN, PEERS, Contestant, own, present
 from lab.bench.oracle import oracle

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from lab.bench.machine import times
 from lab.bench.peers import silence
 

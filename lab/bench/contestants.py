@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from driftfit import trackers
-from driftfit.kernel import Array
-from driftfit.track import track
+from driftfit.engine.kernel import Array
+from driftfit.run.track import track
 from driftfit.trackers.base import Tracker
 from lab.bench import peers
 from lab.bench.machine import installed

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.kernel import Array, Driver
+from driftfit.engine.kernel import Array, Driver
 from driftfit.models.arx import ARX
 from lab.bench.records import Outcome, Record
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from lab.bench.oracle import DIFFUSE
 from lab.bench.records import Outcome, Record
 

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.compare import persistence
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
+from driftfit.judge.compare import persistence
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.result import root_mean_square
+from driftfit.run.result import root_mean_square
 from driftfit.trackers.rls import RLS
 from lab.bench.accuracy import contestants, entries
 from lab.bench.contestants import run

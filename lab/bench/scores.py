@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.result import root_mean_square
+from driftfit.engine.kernel import Array
+from driftfit.run.result import root_mean_square
 from lab.bench.records import Outcome, Record
 
 BURN = 200

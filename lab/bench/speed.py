@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import IMM, Beam
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.kernel import Array
-from driftfit.live import Live
-from driftfit.models.basis import Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
-from driftfit.track import track
+from driftfit.run.live.live import Live
+from driftfit.run.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
-from driftfit.trackers.bank import Bank
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import IMM, Beam
+from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.plots import BLUE, GREY, new_figure
+from driftfit.engine.kernel import Array
+from driftfit.show.plots import BLUE, GREY, new_figure
 from lab.bench.causes import SPEED_CAUSES
 from lab.bench.contest import SAME, Finish, Line
 from lab.bench.machine import machine, markdown, versions

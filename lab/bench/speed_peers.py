@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from lab.bench.contest import Job, need
 
 Q, R, P0 = 1e-4, 0.01, 10.0

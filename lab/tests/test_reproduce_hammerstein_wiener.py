@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from driftfit.run.track import track
 from driftfit.systems.hammerstein_wiener import example
-from driftfit.track import track
 from driftfit.trackers.kalman import Kalman
 from lab.program import app
 from lab.reproduce import found as reproductions

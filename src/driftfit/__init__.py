@@ -2,29 +2,30 @@
 
 from importlib.metadata import version
 
-from driftfit.fleet import Fleet
-from driftfit.frontier import frontier
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.live import Live
+from driftfit.data import prepare
+from driftfit.engine.settings import DataWarning
+from driftfit.judge.segment import segment
+from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
-from driftfit.models.hammerstein_wiener import HammersteinWiener
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
+from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.regression import Regression
-from driftfit.result import Track
-from driftfit.segment import segment
-from driftfit.select import grid, select
-from driftfit.settings import DataWarning
-from driftfit.track import track
+from driftfit.run.fleet import Fleet
+from driftfit.run.live.live import Live
+from driftfit.run.result import Track
+from driftfit.run.track import track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
-from driftfit.trackers.bank import Bank
-from driftfit.trackers.extended_kalman import ExtendedKalman
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
-from driftfit.trackers.output_error import OutputError
 from driftfit.trackers.rls import RLS
-from driftfit.tune import tune
+from driftfit.tune.frontier import frontier
+from driftfit.tune.tune import tune
 
 __version__ = version("driftfit")
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "Track",
     "frontier",
     "grid",
+    "prepare",
     "segment",
     "select",
     "track",

@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from driftfit.fleet import FEWEST
-from driftfit.kernel import Array
-from driftfit.live import Live
+from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.result import Track, root_mean_square
-from driftfit.track import track
+from driftfit.run.fleet import FEWEST
+from driftfit.run.live.live import Live
+from driftfit.run.result import Track, root_mean_square
+from driftfit.run.track import track
 from driftfit.trackers.base import Tracker
 
 T = 200
@@ -126,7 +126,7 @@ def _lanes(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
         if difference:
             yield (
                 f"A series in a fleet is not what it is alone ({difference}): every field is used at [..., l], and "
-                "exp and log come from driftfit.kernel, because others differ with the number of lanes."
+                "exp and log come from driftfit.engine.kernel, because others differ with the number of lanes."
             )
             return
 
@@ -190,7 +190,7 @@ def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     if not np.allclose(one.theta, each.theta, rtol=1e-6, atol=1e-9):
         yield (
             "It declares drift_each = True, but a drift for each parameter is not what the same drift for all is: give "
-            "its steps told=driftfit.trackers.each.told and multiply q by s.each[i, l] ** 2."
+            "its steps told=driftfit.trackers.parts.varying_drift.told and multiply q by s.each[i, l] ** 2."
         )
 
 
@@ -198,7 +198,10 @@ def _variances(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
     var, cov = run._written("var")[-1], run.cov(-1)
     if not tracker.covariance:
         if not np.isnan(var).all():
-            yield "It declares covariance = False, but reports variances; use driftfit.drivers.unknown as its report."
+            yield (
+                "It declares covariance = False, but reports variances; "
+                "use driftfit.engine.drivers.unknown as its report."
+            )
         return
     if not (np.isfinite(var).all() and (var >= 0.0).all()):
         yield f"Variances of theta are not finite and positive after {T} samples: {var}."

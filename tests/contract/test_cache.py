@@ -52,7 +52,7 @@ print(json.dumps([Count.compiled, run.theta[-1, 0]]))
 )
 
 OWN_PARTS = """
-from driftfit.kernel import kernel
+from driftfit.engine.kernel import kernel
 
 GAIN = 0.5
 
@@ -68,8 +68,8 @@ def twice(x):
 OWN_FILE = """
 from dataclasses import dataclass
 import numpy as np
-from driftfit.drivers import TrackerSteps, unknown
-from driftfit.kernel import kernel, nothing, shared
+from driftfit.engine.drivers import TrackerSteps, unknown
+from driftfit.engine.kernel import kernel, nothing, shared
 from driftfit.trackers.base import Tracker
 from own_parts import gain, twice
 

@@ -1,4 +1,6 @@
-"""Compiled code: two processes at once, layouts, places that cannot be written, memory that is returned, one notice."""
+"""Compiled code: two processes at once, layouts, places that cannot be written, memory that is returned, one
+compile_notice.
+"""
 
 import gc
 import os
@@ -11,16 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from driftfit import disk_cache, kernel, linked, notice
-from driftfit.kernel import Driver
+from driftfit.engine import compile_notice, disk_cache, kernel, linking
+from driftfit.engine.kernel import Driver
 
 SRC = Path(__file__).parents[2] / "src"
 
 FIRST = """
 import sys, time
 import numpy as np
-from driftfit import disk_cache
-from driftfit.kernel import Driver
+from driftfit.engine import disk_cache
+from driftfit.engine.kernel import Driver
 
 def total(y):
     sum = 0.0
@@ -71,8 +73,8 @@ def test_two_processes_that_compile_at_once_do_not_mix_layouts(tmp_path):
 NOWHERE = """
 import warnings
 import numpy as np
-from driftfit import disk_cache
-from driftfit.kernel import Driver
+from driftfit.engine import disk_cache
+from driftfit.engine.kernel import Driver
 
 def plus(y):
     return y[0] + 1.0
@@ -171,11 +173,11 @@ def test_what_only_the_compiler_needs_is_forgotten(own_cache):
     assert Driver(user)(np.ones(1)) == 2.0
     assert len(twice.overloads) == 1
     assert twice(1.0) == 2.0  # from Python it has code of its own
-    kept = list(linked._recent)
-    linked.forget(0)
+    kept = list(linking._recent)
+    linking.forget(0)
     assert len(twice.overloads) == 0
     assert Driver(user)(np.ones(1, "f4")) == 2.0
-    linked._recent.update(dict.fromkeys(kept))
+    linking._recent.update(dict.fromkeys(kept))
 
 
 def test_files_are_whole_or_not_used_and_are_pruned(own_cache):
@@ -196,10 +198,10 @@ def test_files_are_whole_or_not_used_and_are_pruned(own_cache):
 
 WAITS = """
 import time
-from driftfit import notice
-notice.PATIENCE = 0.05
+from driftfit.engine import compile_notice
+compile_notice.PATIENCE = 0.05
 for _ in range(2):
-    with notice.compiling():
+    with compile_notice.compiling():
         time.sleep(0.3)
 print("done")
 """
@@ -214,10 +216,10 @@ def test_compiling_is_said_once_and_only_where_somebody_looks():
     process = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=theirs, text=True, check=True)
     os.close(theirs)
     assert process.stdout == "done\n"
-    assert os.read(ours, 1000).decode().split("\r\n") == [notice.TEXT, ""]
+    assert os.read(ours, 1000).decode().split("\r\n") == [compile_notice.TEXT, ""]
     os.close(ours)
 
 
 def test_compilers_are_called_in_three_files_only():
     used = {path.name for path in (SRC / "driftfit").rglob("*.py") if "njit(" in path.read_text()}
-    assert used == {"kernel.py", "linked.py", "machine_code.py"}
+    assert used == {"kernel.py", "linking.py", "machine_code.py"}

@@ -7,7 +7,7 @@ import pytest
 from support import arx_record, damaged, run_lanes, same
 
 from driftfit import Live, track
-from driftfit.drivers import known_factors
+from driftfit.engine.drivers import known_factors
 
 T = 300
 
@@ -74,7 +74,7 @@ def test_lanes_do_not_touch_each_other(model, tracker):
 def test_chunks_do_not_show(model, tracker, monkeypatch):
     y, u = damaged(*arx_record(T, 4))
     whole = track(model, tracker, y, u, **factors(1))
-    monkeypatch.setattr(sys.modules["driftfit.track"], "CHUNK", 37)
+    monkeypatch.setattr(sys.modules["driftfit.run.track"], "CHUNK", 37)
     assert_same_run(whole, track(model, tracker, y, u, **factors(1)))
 
 

@@ -19,11 +19,11 @@ from rich.console import Console
 from rich.progress import track as progress
 from rich.table import Table
 
-from driftfit.kernel import Array
-from driftfit.result import root_mean_square as rms
-from driftfit.smoothers.augmented import augmented
+from driftfit.engine.kernel import Array
+from driftfit.run.result import root_mean_square as rms
+from driftfit.run.track import track
+from driftfit.smooth.augmented import augmented
 from driftfit.systems.time_varying import EXAMPLES, MU, Simulated, example
-from driftfit.track import track
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
 

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 import numpy as np
 from rich.console import Console
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.result import root_mean_square as rms
-from driftfit.smoothers.augmented import augmented
+from driftfit.run.result import root_mean_square as rms
+from driftfit.run.track import track
+from driftfit.smooth.augmented import augmented
 from driftfit.systems.time_varying import MU, Simulated, example, hammerstein, sinusoids, switching
-from driftfit.track import track
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
-from driftfit.tune import tune
+from driftfit.tune.tune import tune
 from lab.reproduce import Claim
 from lab.reproduce.fls import METHODS
 from lab.reproduce.fls.verdicts import (

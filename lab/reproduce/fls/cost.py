@@ -16,11 +16,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from scipy import linalg
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.plots import new_figure
-from driftfit.result import Track
-from driftfit.track import track
+from driftfit.run.result import Track
+from driftfit.run.track import track
+from driftfit.show.plots import new_figure
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
 

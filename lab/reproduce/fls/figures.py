@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.plots import BLUE, GREY, RED, new_figure
+from driftfit.engine.kernel import Array
+from driftfit.show.plots import BLUE, GREY, RED, new_figure
 from driftfit.systems.time_varying import MU, Simulated, example
 from lab.reproduce.fls import Fit, fits
 

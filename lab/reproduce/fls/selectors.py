@@ -15,12 +15,12 @@ from rich.progress import track as progress
 from rich.table import Table
 
 from driftfit.models.regression import Regression
-from driftfit.result import root_mean_square as rms
+from driftfit.run.result import root_mean_square as rms
+from driftfit.run.track import track
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import MU, Simulated, example
-from driftfit.track import track
 from driftfit.trackers.fls import FLS
-from driftfit.tune import Tuned, tune
+from driftfit.tune.tune import Tuned, tune
 
 METHODS = ("ml", "loo", "gcv")
 SEEDS = {"sinusoids": 100, "rational": 60, "switching": 25, "exp-ar": 40}

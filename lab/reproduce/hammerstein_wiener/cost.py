@@ -10,12 +10,12 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from driftfit.blocks.paths import empty
-from driftfit.blocks.separate import METHODS, separate
-from driftfit.kernel import Array
-from driftfit.models.basis import Legendre
-from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.track import track
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.curves.basis import Legendre
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.separation.paths import empty
+from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
+from driftfit.run.track import track
 from driftfit.trackers.kalman import Kalman
 
 ORDERS = ((2, 2, 3, 3), (3, 3, 3, 4), (4, 4, 5, 5))

@@ -12,23 +12,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.blocks.constant import fit_constant, regression
-from driftfit.blocks.free_run import free_run
-from driftfit.blocks.hand_off import hand_off
-from driftfit.blocks.paths import Groups, minimal, split
-from driftfit.blocks.product_drift import track_products
-from driftfit.blocks.ratios import track_ratios
-from driftfit.kernel import Array
-from driftfit.models.basis import DeadZone, Legendre, Polynomial
-from driftfit.models.hammerstein_wiener import HammersteinWiener
-from driftfit.models.hammerstein_wiener_forward import Inverse
-from driftfit.result import Track
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, Legendre, Polynomial
+from driftfit.models.hammerstein_wiener.forward import Inverse
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant, regression
+from driftfit.models.hammerstein_wiener.results.drift_ratios import track_ratios
+from driftfit.models.hammerstein_wiener.results.free_run import free_run
+from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
+from driftfit.models.hammerstein_wiener.results.product_drift import track_products
+from driftfit.models.hammerstein_wiener.separation.paths import Groups, minimal, split
+from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
+from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.run.result import Track
+from driftfit.run.track import track
 from driftfit.systems.arc_furnace import THRESHOLDS, A, B, Furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, WALK, Simulated, example
-from driftfit.track import track
-from driftfit.trackers.extended_kalman import ExtendedKalman
 from driftfit.trackers.kalman import Kalman
-from driftfit.trackers.output_error import OutputError
 
 PAPER = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
 FAST = ExtendedKalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)

@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import track as progress
 from rich.table import Table
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.systems.arc_furnace import furnace
 from lab.reproduce.hammerstein_wiener import runs
 from lab.reproduce.hammerstein_wiener.runs import Errors, FurnaceRun

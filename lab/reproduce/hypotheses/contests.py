@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
-from driftfit.hypotheses.results import Hypotheses
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.systems.jumps import Jumping
-from driftfit.trackers.bank import Bank
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid, Reduction
+from driftfit.trackers.bank.results.results import Hypotheses
+from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS

@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from driftfit.hypotheses.reduction import Beam, Decide
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.hypotheses.smooth import problem_of, solve
-from driftfit.kernel import Array
-from driftfit.result import Track
-from driftfit.smoothers.piecewise import piecewise
+from driftfit.engine.kernel import Array
+from driftfit.run.result import Track
+from driftfit.run.track import track
+from driftfit.smooth.piecewise import piecewise
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
-from driftfit.track import track
-from driftfit.trackers.bank import Bank
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.reduction import Beam, Decide
+from driftfit.trackers.bank.results.decided_path import problem_of, solve
+from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
 from lab.reproduce.hypotheses.contests import CHANGES, P0, R, bank
 from lab.reproduce.hypotheses.scores import pooled

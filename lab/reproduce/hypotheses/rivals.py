@@ -10,8 +10,8 @@ from functools import cache
 
 import numpy as np
 
+from driftfit.run.track import track
 from driftfit.systems.jumps import MODEL, SIGMA, START, jumping
-from driftfit.track import track
 from driftfit.trackers.rls import RLS
 
 RECORDS, P0 = 20, 2.0

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.result import Track
+from driftfit.run.result import Track
+from driftfit.run.track import track
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
-from driftfit.track import track
-from driftfit.trackers.bank import Bank
+from driftfit.trackers.bank.bank import Bank
 from lab.reproduce.hypotheses.contests import Contest, Entry
 
 REACH, QUIET = 20, 50

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from driftfit.hypotheses.change import Change
-from driftfit.hypotheses.reduction import GPB, IMM, Beam, Decide, Reduction
-from driftfit.hypotheses.sensor import Sensor
-from driftfit.trackers.bank import Bank
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, Reduction
+from driftfit.trackers.bank.sensor import Sensor
 from lab.reproduce.hypotheses.contests import P0, Contest, Entry, R
 from lab.reproduce.hypotheses.references import sensitivity
 from lab.reproduce.hypotheses.scores import measure

@@ -1,7 +1,7 @@
 """Command line: one file a command; `driftfit --help` lists them, docs/command_line.md shows each at work."""
 
 from driftfit.cli import cache, demo, detect, export, forecast, select, smooth, track, trackers, tune, verdict, warm
-from driftfit.cli.program import app, main
+from driftfit.cli.parts.program import app, main
 
 __all__ = [
     "app", "cache", "demo", "detect", "export", "forecast", "main", "select", "smooth", "track", "trackers", "tune",

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.program import app, helpful, say
-from driftfit.disk_cache import contents, prune
-from driftfit.summary import facts
+from driftfit.cli.parts.program import app, helpful, say
+from driftfit.engine.disk_cache import contents, prune
+from driftfit.show.summary import facts
 
 
 @app.command()

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.program import app, helpful, out, progress
+from driftfit.cli.parts.program import app, helpful, out, progress
 
 
 @app.command()
@@ -15,7 +15,7 @@ def demo(
     plot: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("driftfit-demo.png"),
 ) -> None:
     """Follow the US demand for money from 1959 to 2009."""
-    from driftfit.demo import show
+    from driftfit.demo.demo import show
 
     with helpful():
         show(out, progress, plot)

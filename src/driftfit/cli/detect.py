@@ -10,13 +10,13 @@ import polars as pl
 import typer
 from rich.text import Text
 
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, say
-from driftfit.cli.reading import moment, stretch
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, say
+from driftfit.cli.parts.reading import moment, stretch
 from driftfit.cli.track import Plot, Report
-from driftfit.detect import Alarms
-from driftfit.report import check_path
-from driftfit.result import Track
+from driftfit.judge.alarms.detect import Alarms
+from driftfit.run.result import Track
+from driftfit.show.report import check_path
 
 
 @app.command()

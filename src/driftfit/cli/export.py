@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.arguments import parse_model, parse_tracker
-from driftfit.cli.program import app, helpful, say
-from driftfit.summary import facts
+from driftfit.cli.parts.arguments import parse_model, parse_tracker
+from driftfit.cli.parts.program import app, helpful, say
+from driftfit.show.summary import facts
 
 export = typer.Typer(no_args_is_help=True, help="Write a tracker in another language.")
 app.add_typer(export, name="export")

@@ -11,12 +11,12 @@ import polars as pl
 import typer
 from rich.text import Text
 
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, say
-from driftfit.cli.reading import Part, rows_of
-from driftfit.kernel import Array
-from driftfit.result import Track
-from driftfit.summary import table_of
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, say
+from driftfit.cli.parts.reading import Part, rows_of
+from driftfit.engine.kernel import Array
+from driftfit.run.result import Track
+from driftfit.show.summary import table_of
 
 SHOWN = 40
 """Rows that are printed."""

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.arguments import listed
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, progress, say
+from driftfit.cli.parts.arguments import listed
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 
 
@@ -21,7 +21,7 @@ def select(
     plot: Plot = None,
 ) -> None:
     """Compare models (repeat --model), or the regressors of one, by how well they predict."""
-    from driftfit.select import select as compare
+    from driftfit.judge.structures.select import select as compare
 
     models = given.models()
     with progress.status("comparing"):

@@ -10,12 +10,12 @@ import polars as pl
 import typer
 from rich.text import Text
 
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, progress, say
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
-from driftfit.settings import missing_settings
-from driftfit.summary import facts, table_of
-from driftfit.tune import tune
+from driftfit.engine.settings import missing_settings
+from driftfit.show.summary import facts, table_of
+from driftfit.tune.tune import tune
 
 PLACES = 5
 """Samples that are printed."""

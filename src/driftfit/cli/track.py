@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, say
-from driftfit.export import check_ending, write
-from driftfit.result import Track
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, say
+from driftfit.data.export import check_ending, write
+from driftfit.run.result import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ def track(
     if write_to is not None and check_ending(write_to) == ".npz" and given.by:
         raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
     if report is not None:
-        from driftfit.report import check_path
+        from driftfit.show.report import check_path
 
         check_path(report)
     if plot is not None and given.by and len(given.outputs) > 1:

@@ -8,11 +8,11 @@ import numpy as np
 import typer
 from rich.text import Text
 
-from driftfit.cli.arguments import given_fields
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, progress, say
+from driftfit.cli.parts.arguments import given_fields
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
-from driftfit.summary import facts, shortened, table_of
+from driftfit.show.summary import facts, shortened, table_of
 
 
 @app.command()
@@ -28,7 +28,7 @@ def tune(
     plot: Plot = None,
 ) -> None:
     """Find the settings that a tracker was left without: --tracker kalman finds q and r."""
-    from driftfit.tune import tune as find
+    from driftfit.tune.tune import tune as find
 
     models, shared = given.models(), groups.split(",") if groups and groups != "each" else groups
     with progress.status("tuning"):

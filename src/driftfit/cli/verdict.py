@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from driftfit.cli.given import Given, reads
-from driftfit.cli.program import app, say
+from driftfit.cli.parts.options import Given, reads
+from driftfit.cli.parts.program import app, say
 from driftfit.cli.track import Report
 
 

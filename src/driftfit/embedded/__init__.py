@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from driftfit.data.signals import check_ready
 from driftfit.embedded.project import files_of, record_bytes, write
-from driftfit.live import Live
 from driftfit.models.base import Model
-from driftfit.signals import check_ready
+from driftfit.run.live.live import Live
+from driftfit.run.warm_start import fresh_tile
 from driftfit.trackers.base import Tracker
-from driftfit.warm import fresh_tile
 
 
 def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from driftfit import eights, kernel
 from driftfit.embedded.unit import TranslationError, Unit
 from driftfit.embedded.values import RANK, Value, begin_of, field, joined, lifted, number, view
+from driftfit.engine import kernel, simd
 
 ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
 BITS = {ast.BitAnd: "&", ast.BitOr: "|"}
 COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
-FOUR = {eights.fill_four: "four_of", eights.load_four: "four_at", eights.plus: "four_plus", eights.times: "four_times"}
+FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_plus", simd.times: "four_times"}
 
 
 class Expressions:
@@ -215,7 +215,7 @@ class Expressions:
         arguments = [self.value(one) for one in node.args]
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
-        if function in FOUR or function is eights.reached:
+        if function in FOUR or function is simd.reached:
             return self._of_four(function, arguments)
         if hasattr(function, "py_func"):
             return self.called(function.py_func, arguments, statement)
@@ -276,11 +276,11 @@ class Expressions:
 
     def _of_four(self, function: Any, arguments: list[Value]) -> Value:
         """Four numbers at once are a structure of four."""
-        self.ops[-1]["multiply" if function is eights.times else "add"] += 4
-        if function is eights.reached:
+        self.ops[-1]["multiply" if function is simd.times else "add"] += 4
+        if function is simd.reached:
             one, other = arguments
             return Value("long", f"four_reached({one.text}, {other.text})", most=4)
-        if function is eights.load_four:
+        if function is simd.load_four:
             array, row, _ = arguments
             return Value("four", f"four_at({view(array, [row, range(4)]).text})")
         return Value("four", f"{FOUR[function]}({', '.join(one.text for one in arguments)})")

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import drivers
+from driftfit.data.storage import fields
 from driftfit.embedded.selftest import selftest
 from driftfit.embedded.statements import translate
 from driftfit.embedded.unit import Function, Unit
 from driftfit.embedded.values import Value, number
-from driftfit.kernel import Array
+from driftfit.engine.drivers import drivers
+from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.storage import fields
 from driftfit.trackers.base import Tracker
 
 HEADER = """\

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.live import Live
+from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.live.live import Live
 from driftfit.trackers.base import Tracker
 
 SAMPLES = 200

@@ -3,8 +3,9 @@
 The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
 Whole numbers, tables and functions that are known become constants of the text; branches that a constant closes are
 left out; a function is written once for each set of shapes that it is called with. What a step may use is what
-`driftfit.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so that the
-double build gives the same bits as the compiled steps where the C compiler neither contracts nor reorders them.
+`driftfit.engine.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so
+that the double build gives the same bits as the compiled steps where the C compiler neither contracts nor reorders
+them.
 
 The number of operations is counted along the way: loops at their longest, the dearer of two branches.
 """

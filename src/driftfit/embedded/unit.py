@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.embedded.values import joined, lifted
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 
 TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "four": "four"}
 """Kinds of numbers as C writes them."""

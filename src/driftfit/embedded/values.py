@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 
 RANK = {"bool": 0, "int": 1, "long": 2, "real": 3, "four": 4}
 """Kinds of numbers, the wider the higher."""

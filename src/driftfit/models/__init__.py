@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from driftfit.engine.settings import classes_in
 from driftfit.models.base import Model
-from driftfit.settings import classes_in
 
 
 def found() -> dict[str, type[Model]]:

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, Step, kernel
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.settings import input_names, one_of, output_names, whole
 from driftfit.models.base import Model
-from driftfit.settings import input_names, one_of, output_names, whole
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import ModelSteps
-from driftfit.kernel import Array, Step
-from driftfit.settings import Settings
+from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.kernel import Array, Step
+from driftfit.engine.settings import Settings
 
 
 class Model(Settings, ABC):
@@ -54,7 +54,7 @@ class Model(Settings, ABC):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs; several are followed by `driftfit.outputs`."""
+        """Names of the outputs; several are followed by `driftfit.run.outputs`."""
         return ("y",)
 
     @property

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import LARGEST, ModelSteps
-from driftfit.kernel import Array, State, kernel
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.arx import ARX, GAP
 
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.drivers import ModelSteps
-from driftfit.kernel import Array, State, kernel, nothing
+from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.kernel import Array, State, kernel, nothing
+from driftfit.engine.settings import input_names, output_names, whole
 from driftfit.models.base import Model
-from driftfit.settings import input_names, output_names, whole
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.systems.drift import Ramp
 
 A = (-1.637, 1.044, -0.4066)

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 
 
 class Law(ABC):

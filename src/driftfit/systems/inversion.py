@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array
-from driftfit.models.basis import Basis, Polynomial
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial
 
 LIMIT = 1e3
 """Outputs beyond which the inversion gives up."""

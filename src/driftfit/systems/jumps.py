@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 
 SIGMA, DRIFT, JUMPS, START = 0.3, 0.002, 0.01, 30

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
 
 T_DEFAULT = 1000
 NOISE = 0.3

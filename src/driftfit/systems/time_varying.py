@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.kernel import Array
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.settings import one_of
 
 
 class Simulated(NamedTuple):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from driftfit.settings import classes_in
+from driftfit import models
+from driftfit.engine.settings import classes_in
 from driftfit.trackers.base import Tracker
 
 
 def found() -> dict[str, type[Tracker]]:
-    """Every tracker that this folder holds, by class name."""
-    return classes_in(__name__, __path__, Tracker)
+    """Every tracker of the package by class name: those of this folder, and those that only one model can use."""
+    everywhere = classes_in(__name__, __path__, Tracker) | classes_in(models.__name__, models.__path__, Tracker)
+    return dict(sorted(everywhere.items()))

@@ -26,11 +26,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps, unknown
-from driftfit.kernel import State, kernel, nothing
-from driftfit.settings import numbers, vector
+from driftfit.engine.drivers import TrackerSteps, unknown
+from driftfit.engine.kernel import State, kernel, nothing
+from driftfit.engine.settings import numbers, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import prediction
+from driftfit.trackers.parts.diffuse import prediction
 
 
 @kernel

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps
-from driftfit.kernel import Array, Step
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import Array, Step
+from driftfit.engine.settings import Settings
 from driftfit.models.base import Model
-from driftfit.settings import Settings
-from driftfit.trackers.each import roots
-from driftfit.trackers.information import widen
+from driftfit.trackers.parts.information import widen
+from driftfit.trackers.parts.varying_drift import roots
 
 
 class RandomWalk(NamedTuple):
@@ -55,7 +55,7 @@ class Tracker(Settings, ABC):
     noted: ClassVar[tuple[str, ...]] = ()
     """Fields of the record that `varying` needs of every sample; ``steps.note`` stores them when a run is replayed."""
     drift_each: ClassVar[bool] = False
-    """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.each`)."""
+    """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.parts.varying_drift`)."""
     adapts: ClassVar[bool] = False
     """Whether it finds drift and noise as it goes, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""

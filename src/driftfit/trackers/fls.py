@@ -21,8 +21,9 @@ Use it when one number for "how smooth" is all that is wanted; `tune` finds it. 
 `AugmentedFLS` is cheaper and carries no covariance. `run.smooth()` gives the whole path that minimises J.
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
-this is in covariance form. Departures: an exact diffuse start (`driftfit.trackers.diffuse`), which needs no penalty on
-the first point and no large matrix; the minimum-norm answer about theta0 until the regressors span. Cost: O(n^2).
+this is in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
+penalty on the first point and no large matrix; the minimum-norm answer about theta0 until the regressors span. Cost:
+O(n^2).
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import Array, State, kernel
+from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
-from driftfit.settings import covariance, matrix, numbers, plain, vector
-from driftfit.trackers import second_differences
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
-from driftfit.trackers.each import told
-from driftfit.trackers.resolution import resolution, resolve
+from driftfit.trackers.parts import second_differences
+from driftfit.trackers.parts.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.parts.varying_drift import told
 from driftfit.trackers.rls import correct, learn_scale, no_scale
 
 
@@ -98,7 +99,7 @@ class FLS(Tracker):
         Covariance of theta at the first sample, in units of the noise variance. None: nothing is known.
     differences : 1 or 2
         2 prices changes of the slope, theta_{k+1} - 2 theta_k + theta_{k-1}, in the place of changes of theta, so that
-        a straight line costs nothing (`driftfit.trackers.second_differences`); it starts from no knowledge.
+        a straight line costs nothing (`driftfit.trackers.parts.second_differences`); it starts from no knowledge.
 
     Raises
     ------

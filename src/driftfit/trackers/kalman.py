@@ -11,11 +11,13 @@ with w the weight of the sample and d known factors of the drift, 1 unless given
 Use it when the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` carries no
 covariance. Without excitation P grows by exactly q per sample: finite and honest.
 
-form="sqrt" keeps the square root of the information instead (`driftfit.trackers.square_root`): the same numbers for
-ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r, at O(n^3).
+form="sqrt" keeps the square root of the information instead (`driftfit.trackers.parts.square_root`): the same numbers
+for ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r, at
+O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: one triangle of P is kept; an exact diffuse start (`driftfit.trackers.diffuse`). Cost per sample: O(n^2).
+Departures: one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`). Cost per sample:
+O(n^2).
 """
 
 from __future__ import annotations
@@ -26,15 +28,23 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import State, kernel
+from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.kernel import State, kernel
+from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
-from driftfit.settings import covariance, matrix, numbers, one_of, vector
-from driftfit.trackers import square_root
 from driftfit.trackers.base import RandomWalk, Tracker
-from driftfit.trackers.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, measurement, spanned_variance
-from driftfit.trackers.each import told
-from driftfit.trackers.information import triangular_root
+from driftfit.trackers.parts import square_root
+from driftfit.trackers.parts.diffuse import (
+    MACHINES,
+    drifted,
+    enter,
+    knowing,
+    knowing_nothing,
+    measurement,
+    spanned_variance,
+)
+from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.parts.varying_drift import told
 
 
 @kernel

@@ -6,7 +6,7 @@
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated as it goes: sum(e^2 / s) / count over the samples after the start, and not below
-what coarse readings allow (`driftfit.trackers.resolution`).
+what coarse readings allow (`driftfit.trackers.parts.resolution`).
 
 Use it when all parameters drift alike and nothing is known of noise and drift. Without excitation exponential
 forgetting would blow P up; it stops where a variance is ``c_max`` times what it was when the regressors first had full
@@ -33,11 +33,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.drivers import TrackerSteps, diagonal
-from driftfit.kernel import State, exp, kernel, nothing
-from driftfit.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.kernel import State, exp, kernel, nothing
+from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.diffuse import (
+from driftfit.trackers.parts.diffuse import (
     MACHINES,
     enter,
     hand_over,
@@ -49,7 +49,7 @@ from driftfit.trackers.diffuse import (
     take_in,
     wander,
 )
-from driftfit.trackers.resolution import resolution, resolve, unresolved
+from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 
 @kernel

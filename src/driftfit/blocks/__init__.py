@@ -1,1 +1,0 @@
-"""The blocks of a Hammerstein-Wiener model: separation, gauges, free runs, diagnostics, pictures."""

@@ -1,0 +1,208 @@
+"""What every command that reads data takes: files and columns, the part of them to use, the model and the tracker."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import MISSING, Field, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+import typer
+
+from driftfit.cli.parts.arguments import listed, parse_interval, parse_model, parse_tracker, parse_units
+from driftfit.cli.parts.program import helpful, progress
+from driftfit.cli.parts.reading import Part, Rows, rows_of
+from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
+
+Names = list[str] | None
+
+
+@dataclass(frozen=True)
+class Given:
+    """The options that commands share, as they were typed."""
+
+    file: Annotated[
+        list[str],
+        typer.Argument(
+            help="CSV files with a header line, or Parquet files, or patterns such as 'runs/*.csv'; - is stdin."
+        ),
+    ]
+    y: Annotated[
+        list[str],
+        typer.Option(
+            help="Column of the output; repeat it, or separate names by commas, for several (ARX, Regression)."
+        ),
+    ]
+    u: Annotated[Names, typer.Option(help="Column of an input; repeat it, or separate names by commas.")] = None
+    model: Annotated[
+        Names,
+        typer.Option(
+            help="Model and its settings by place or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
+            "arx:2,2/1,nk=0/1; regression:intercept. Default: arx:2,2,intercept, without inputs arx:2,0,intercept."
+        ),
+    ] = None
+    tracker: Annotated[
+        str, typer.Option(help="Tracker, as `driftfit trackers` lists them; the default needs no settings.")
+    ] = "adaptive-kalman"
+    p: Annotated[
+        Names, typer.Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")
+    ] = None
+    time: Annotated[str | None, typer.Option(help="Column of the time: numbers or dates.")] = None
+    by: Annotated[
+        Names, typer.Option(help="Column that tells the series of a fleet apart, or `file`; repeat it for several.")
+    ] = None
+    unit: Annotated[Names, typer.Option(help="Unit of a column: flow=l/min; repeat it.")] = None
+    own: Annotated[
+        str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own, from a module here.")
+    ] = None
+    dt: Annotated[
+        str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
+    ] = None
+    first: Annotated[str | None, typer.Option("--from", help="First time to use, with --time.")] = None
+    last: Annotated[str | None, typer.Option("--to", help="Last time to use, with --time.")] = None
+    rows: Annotated[
+        str | None,
+        typer.Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500."),
+    ] = None
+    separator: Annotated[
+        str | None, typer.Option(help="What separates cells: , ; tab or another sign; found from the header otherwise.")
+    ] = None
+    decimal: Annotated[str, typer.Option(help="Decimal sign of the numbers: . or ,")] = "."
+    limits: Annotated[
+        Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
+    ] = None
+    exclude: Annotated[
+        Names, typer.Option(help="Stretch to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+    ] = None
+    start: Annotated[
+        Path | None, typer.Option(help="Begin where a saved run (.npz) or live state ended; its model and tracker.")
+    ] = None
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the outputs."""
+        names = listed(self.y)
+        if not names:
+            raise ValueError("--y names no column.")
+        if len(set(names)) < len(names):
+            raise ValueError(f"--y {','.join(names)}: an output is named once.")
+        return names
+
+    @property
+    def inputs(self) -> list[str]:
+        """Names of the inputs."""
+        return listed(self.u)
+
+    def models(self) -> list[Model]:
+        """The models, each bound to the inputs."""
+        default = [f"arx:2,{2 if self.inputs else 0},intercept"]
+        found = [parse_model(text, self.outputs) for text in self.model or default]
+        several = len(found) > 1  # then one of them may leave the inputs out
+        alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
+        return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
+
+    def chosen_tracker(self) -> Tracker:
+        """The tracker with its settings."""
+        return parse_tracker(self.tracker, self.p or [], self.own)
+
+    def part(self) -> Part:
+        """Which part of the files is used, and how it is read."""
+        names = [*self.outputs, *self.inputs]
+        return Part.of(self.first, self.last, self.rows, self.separator, self.decimal, self.limits, self.exclude, names)
+
+    def signals(self, rows: Rows | None = None) -> dict[str, Any]:
+        """What `track` takes beside model and tracker; ``rows`` are the data where they were read."""
+        outputs = self.outputs
+        if rows is None and (not self.part().whole or "-" in self.file):
+            rows = self.read()
+        data: Any = self.file if rows is None else rows.table(self.time, self.by or [])
+        signals = {"y": outputs if len(outputs) > 1 else outputs[0], "u": self.inputs, "data": data, "time": self.time}
+        signals |= self.part().restrictions(self.time is not None)
+        return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
+
+    def read(self, *more: str) -> Rows:
+        """The columns of the part that is used, and more of them."""
+        return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
+
+    def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
+        """The run that the options ask for: a Track, an Outputs or a fleet."""
+        from driftfit.run.track import track
+
+        model, chosen, before = self._begun()
+        signals: Any = self.signals(rows)
+        more: Any = {} if before is None else {"warm_start": before}
+        with progress.status("tracking"):
+            return track(model, tracker or chosen, **signals, **more)
+
+    def _begun(self) -> tuple[Model, Tracker, Any]:
+        """(model, tracker, the run to begin from, or None); those of the saved run where one is given."""
+        models = self.models()
+        if len(models) > 1:
+            raise ValueError("--model: one model is followed at a time; `driftfit select` compares several.")
+        if self.start is None:
+            return models[0], self.chosen_tracker(), None
+        if self.model or self.p or self.own or self.tracker != "adaptive-kalman":
+            raise ValueError(
+                f"--start {self.start}: model and tracker are those of the file; leave out --model, -p ..."
+            )
+        if self.by or len(self.outputs) > 1:
+            raise ValueError(f"--start {self.start}: the file holds one run of one output; leave out --by.")
+        before = saved(self.start)
+        return before.model, before.tracker, before
+
+    def arrays(self) -> dict[str, Any]:
+        """One series in order of time, as `tune` and `select` take it."""
+        outputs = self.outputs
+        if self.by or len(outputs) > 1 or self.start is not None:
+            raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
+        read = self.read()
+        order = read.order()
+        u = np.stack([read.numbers[name][order] for name in self.inputs], axis=1) if self.inputs else None
+        time = None if read.time is None else read.time[order]
+        restrictions = self.part().restrictions(time is not None)
+        places: dict[str, Any] = {name: j for j, name in enumerate(self.inputs)} | {outputs[0]: "y"}
+        if restrictions["limits"]:
+            restrictions["limits"] = {places[name]: one for name, one in restrictions["limits"].items()}
+        known = {"y": read.numbers[outputs[0]][order], "u": u, "time": time, "dt": parse_interval(self.dt)}
+        return known | restrictions
+
+
+def saved(path: Path) -> Any:
+    """A run, or a live state, from a file."""
+    from driftfit.run.live.live import Live
+    from driftfit.run.result import Track
+
+    try:
+        return Track.load(path)
+    except ValueError as error:
+        if "state" not in str(error):
+            raise
+    return Live.load(path)
+
+
+def reads(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose first argument is what `Given` holds, with all its options on the command line."""
+    hints = get_type_hints(Given, include_extras=True)
+    shared = [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=_default(f), annotation=hints[f.name])
+        for f in fields(Given)
+    ]
+    own = list(inspect.signature(command, eval_str=True).parameters.values())[1:]
+    own = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in own]
+
+    def run(**typed: Any) -> None:
+        with helpful():
+            command(Given(**{f.name: typed.pop(f.name) for f in fields(Given)}), **typed)
+
+    vars(run)["__signature__"] = inspect.Signature([*shared, *own])
+    run.__annotations__ = {one.name: one.annotation for one in (*shared, *own)}
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    return run
+
+
+def _default(field: Field[Any]) -> Any:
+    return inspect.Parameter.empty if field.default is MISSING else field.default

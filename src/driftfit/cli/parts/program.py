@@ -1,0 +1,66 @@
+"""The program: its name, where it prints, and how it says what a user got wrong.
+
+What a user got wrong ends in one line on stderr and exit code 2; a traceback is always a fault of the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from driftfit import __version__
+from driftfit.show.summary import WIDTH
+
+app = typer.Typer(
+    no_args_is_help=True, add_completion=False, help="Follow the parameters of a system while they change.",
+    rich_markup_mode=None,
+)  # fmt: skip
+progress = Console(stderr=True)
+
+
+def _output() -> Console:
+    """Tables as wide as they are printed from Python, or as the terminal where that is narrower."""
+    seen = Console()
+    return Console(width=min(WIDTH, seen.width) if seen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
+
+
+out = _output()
+
+
+def say(what: Any, **options: Any) -> None:
+    """Print something as it is: names of parameters hold brackets, and nothing is cut."""
+    out.print(what, markup=False, crop=False, **options)
+
+
+def main() -> None:
+    """The program that the package installs."""
+    app()
+
+
+@contextmanager
+def helpful() -> Iterator[None]:
+    """Turn what a user can put right into one line and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        typer.echo(f"driftfit: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(2) from None
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"driftfit {__version__}")
+        raise typer.Exit
+
+
+@app.callback(help="Follow the parameters of a system while they change.")
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    pass

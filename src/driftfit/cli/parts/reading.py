@@ -1,0 +1,231 @@
+"""Parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and stretches left out.
+
+Rows are counted from 1 after the header, as in messages about cells, and ranges hold both their ends. Valid ranges and
+stretches are handed on as they are (`driftfit.data.limits`).
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import narwhals as nw
+import numpy as np
+import polars as pl
+
+from driftfit.data.columns import Columns, Wanted, convert
+from driftfit.data.files import FILE, _paths
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Part:
+    """What is used of the files, and how they are read."""
+
+    first: str | None = None
+    last: str | None = None
+    rows: tuple[int, int | None] = (1, None)
+    separator: str | None = None
+    decimal: str = "."
+    limits: tuple[tuple[str, Range], ...] = ()
+    exclude: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(
+        cls, first: str | None, last: str | None, rows: str | None, separator: str | None, decimal: str,
+        limits: Sequence[str] | None, exclude: Sequence[str] | None, names: Sequence[str],
+    ) -> Part:  # fmt: skip
+        """From what was typed."""
+        if decimal not in (".", ","):
+            raise ValueError(f"--decimal {decimal}: the sign is a point or a comma.")
+        sign = "\t" if separator in ("tab", "\\t") else separator
+        if sign is not None and len(sign) != 1:
+            raise ValueError(f"--separator {separator}: one sign, such as ';', or tab.")
+        ranges = tuple(_limits(entry, names) for entry in limits or [])
+        return cls(first, last, _rows(rows), sign, decimal, ranges, tuple(map(stretch, exclude or [])))
+
+    @property
+    def whole(self) -> bool:
+        """Whether the files are read as they are."""
+        return self == Part(limits=self.limits, exclude=self.exclude)
+
+    def restrictions(self, timed: bool) -> dict[str, Any]:
+        """limits= and exclude= of `track`; without time stretches are rows, which it numbers from 0."""
+        exclude: list[tuple[Any, Any]] = list(self.exclude)
+        if not timed:
+            exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
+        return {"limits": dict(self.limits) or None, "exclude": exclude or None}
+
+    def _sample(self, row: str) -> int:
+        """The sample of a row."""
+        if not row.isdigit():
+            raise ValueError(f"--exclude: without --time a stretch is given in rows, such as 100..120; got {row!r}.")
+        return int(row) - self.rows[0]
+
+
+class Rows(NamedTuple):
+    """The chosen rows of all files: numbers (N,), times (N,) or None, and the columns that tell series apart."""
+
+    numbers: dict[str, Array]
+    time: Array | None
+    zone: str | None
+    by: list[list[Any]]
+
+    def table(self, time: str | None, by: Sequence[str]) -> pl.DataFrame:
+        """As a table that `track` reads."""
+        columns: dict[str, Any] = dict(self.numbers)
+        if time is not None and self.time is not None:
+            columns[time] = self.time
+        table = pl.DataFrame({**columns, **dict(zip(by, self.by, strict=True))})
+        if self.zone is not None and time is not None:
+            table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(self.zone))
+        return table
+
+    def order(self) -> Array:
+        """Rows that become samples of a single series: in order of time, and of rows at one time the first."""
+        if self.time is None:
+            return np.arange(len(next(iter(self.numbers.values()))))
+        order = np.argsort(self.time, kind="stable")
+        timeless = np.isnat(self.time) if self.time.dtype.kind == "M" else ~np.isfinite(self.time)
+        order = order[~timeless[order]]
+        again = np.append(False, self.time[order][1:] == self.time[order][:-1])
+        return np.asarray(order[~again])
+
+
+def _limits(entry: str, names: Sequence[str]) -> tuple[str, Range]:
+    """``flow=0:80`` as a name and its range."""
+    name, _, bounds = entry.partition("=")
+    low, colon, high = bounds.partition(":")
+    try:
+        found = float(low or "-inf"), float(high or "inf")
+    except ValueError:
+        colon = ""
+    if not colon or not found[0] <= found[1]:
+        raise ValueError(f"--limits {entry}: a valid range is given as column=low:high, such as --limits flow=0:80.")
+    if name.strip() not in names:
+        raise ValueError(f"--limits {entry}: no signal has the name {name.strip()!r}; {near(name.strip(), names)}")
+    return name.strip(), found
+
+
+def stretch(entry: str, option: str = "--exclude") -> tuple[str, str]:
+    """``2024-03-01..2024-03-04`` as its ends."""
+    first, dots, last = entry.partition("..")
+    if not (dots and first.strip() and last.strip()):
+        raise ValueError(f"{option} {entry}: a stretch is given as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
+    return first.strip(), last.strip()
+
+
+def _rows(text: str | None) -> tuple[int, int | None]:
+    if text is None:
+        return 1, None
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.strip().isdigit() or not part.strip() for part in (first, last)):
+        raise ValueError(f"--rows {text}: rows are counted from 1, as in --rows 100:500, 100: or :500.")
+    a, b = int(first or 1), int(last) if last.strip() else None
+    if a < 1 or (b is not None and b < a):
+        raise ValueError(f"--rows {text}: there is no such row; rows are counted from 1 and the first comes first.")
+    return a, b
+
+
+def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Rows:
+    """Read columns of files, in the order of the files."""
+    if (part.first or part.last) and time is None:
+        raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
+    wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by))
+    read = [_one(path, wanted, part) for path in (["-"] if "-" in files else _paths(list(files)))]
+    if len({one.time.dtype.kind for one in read if one.time is not None}) > 1:
+        raise ValueError("the times of some files are numbers, those of others are dates.")
+    found = Rows(
+        {name: np.concatenate([one.numbers[name] for one in read]) for name in wanted.numbers},
+        None if time is None else np.concatenate([one.time for one in read if one.time is not None]),
+        read[0].zone,
+        [[value for one in read for value in one.by[k]] for k in range(len(by))],
+    )
+    return _between(found, part)
+
+
+def _one(path: str, wanted: Wanted, part: Part) -> Columns:
+    """The chosen rows of one file."""
+    where = "stdin" if path == "-" else path
+    frame = _frame(path, where, part)
+    if FILE in wanted.by and FILE not in frame.columns:
+        frame = frame.with_columns(pl.lit(path).alias(FILE))
+    first, last = part.rows
+    count = None if last is None else last - first + 1
+    frame = frame.slice(first - 1, count)
+    if frame.height == 0:
+        raise ValueError(f"{where} has no row {first}.")
+    if part.decimal == ",":
+        frame = frame.with_columns(_points(frame, wanted))
+    return convert(nw.from_native(frame, eager_only=True), wanted, where, first)
+
+
+def _frame(path: str, where: str, part: Part) -> pl.DataFrame:
+    """A file as a table; cells of CSV as text."""
+    try:
+        with open(path, "rb") if path != "-" else sys.stdin.buffer as file:
+            data = file.read()
+        if data[:4] == b"PAR1":
+            return pl.read_parquet(io.BytesIO(data))
+        lines = data.decode("utf-8", errors="replace").splitlines()
+        header = next((line for line in lines if not line.startswith("#")), "")
+        sign = part.separator or max(";\t" if part.decimal == "," else ",;\t", key=header.count)
+        return pl.read_csv(io.BytesIO(data), infer_schema=False, comment_prefix="#", separator=sign)
+    except pl.exceptions.PolarsError as error:
+        raise ValueError(f"{where} cannot be read: {' '.join(str(error).split())}") from None
+
+
+def _points(frame: pl.DataFrame, wanted: Wanted) -> list[pl.Series]:
+    """Columns of numbers with a point for the comma; a point that groups thousands goes."""
+    text = [name for name in wanted.names if name in frame.columns and frame[name].dtype == pl.String]
+    number = r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?\s*$"
+    made = []
+    for name in text:
+        cells = frame[name]
+        plain = cells.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+        made.append(plain.zip_with(cells.str.contains(number).fill_null(False), cells))
+    return made
+
+
+def _between(rows: Rows, part: Part) -> Rows:
+    """The rows between the first and last time."""
+    if rows.time is None or (part.first is None and part.last is None):
+        return rows
+    axis = rows.time
+    keep = np.ones(len(axis), bool)
+    if part.first is not None:
+        keep &= axis >= moment(part.first, axis, rows.zone)
+    if part.last is not None:
+        keep &= axis <= moment(part.last, axis, rows.zone, end=True)
+    if not keep.any():
+        raise ValueError(f"no row is between --from {part.first or '...'} and --to {part.last or '...'}.")
+    by = [[value for value, kept in zip(column, keep.tolist(), strict=True) if kept] for column in rows.by]
+    return Rows({name: column[keep] for name, column in rows.numbers.items()}, axis[keep], rows.zone, by)
+
+
+def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
+    """A time as typed, of the kind of ``axis``: a number, or a date in its zone; ``end``: the last instant of a day."""
+    if axis.dtype.kind != "M":
+        try:
+            return float(text)
+        except ValueError:
+            raise ValueError(f"{text!r} is not a number, but the times of the record are.") from None
+    try:
+        found = pl.Series([text.strip()]).str.to_datetime(time_unit="us")
+    except pl.exceptions.PolarsError:
+        raise ValueError(f"{text!r} is not a date; write 2024-01-31 or '2024-01-31 12:00:00'.") from None
+    if zone is not None:
+        found = (
+            found.dt.replace_time_zone(zone, ambiguous="earliest")
+            .dt.convert_time_zone("UTC")
+            .dt.replace_time_zone(None)
+        )
+    instant = found.to_numpy()[0]
+    whole_day = end and len(text.strip()) <= len("2024-01-31")
+    return instant + np.timedelta64(1, "D") - np.timedelta64(1, "us") if whole_day else instant

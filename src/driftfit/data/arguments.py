@@ -1,0 +1,64 @@
+"""Which argument is the model and which the tracker: said plainly where they are classes, or have changed places."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from inspect import signature
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.settings import Settings
+from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
+
+ARTICLE = {Model: "a model, such as ARX(2, 2) or Regression(3)", Tracker: "a tracker, such as AdaptiveKalman()"}
+
+
+def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> None:
+    """Raise TypeError unless ``model`` is a `Model` and ``tracker`` a `Tracker` (``several``: or a list or mapping).
+
+    The message says what was passed, and what to write instead.
+    """
+    if _is(model, Tracker) and _is(tracker, Model):
+        raise TypeError(
+            f"{owner}: model and tracker have changed places; the model comes first: "
+            f"{owner}({_called(tracker)}, {_called(model)}, ...)."
+        )
+    check_role(owner, "model", model, Model)
+    given = tracker.values() if isinstance(tracker, Mapping) else tracker
+    listed = several and isinstance(given, Sequence | type({}.values())) and not isinstance(given, str)
+    for one in given if listed else [tracker]:
+        check_role(owner, "tracker", one, Tracker)
+
+
+def check_role(owner: str, name: str, value: Any, kind: type[Settings]) -> None:
+    """Raise TypeError unless ``value`` is an instance of ``kind``."""
+    if isinstance(value, kind):
+        return
+    if isinstance(value, type) and issubclass(value, kind):
+        raise TypeError(f"{owner}: {name} is the class {value.__name__} itself; make one of it: {_called(value)}.")
+    raise TypeError(f"{owner}: {name} must be {ARTICLE[kind]}; got {_shown(value)}.")
+
+
+def _is(value: Any, kind: type) -> bool:
+    return isinstance(value, kind) or (isinstance(value, type) and issubclass(value, kind))
+
+
+def _called(value: Any) -> str:
+    """An instance as it was made; a class with the settings that it asks for."""
+    if not isinstance(value, type):
+        return repr(value)
+    needed = [p.name for p in signature(value).parameters.values() if p.default is p.empty]
+    needed += [name for name in getattr(value, "required", ()) if name not in needed]
+    return f"{value.__name__}({', '.join(f'{name}=...' for name in needed)})"
+
+
+def _shown(value: Any) -> str:
+    """What was passed, in a few words."""
+    if value is None:
+        return "None"
+    if isinstance(value, np.ndarray) or hasattr(value, "shape"):
+        return f"an array of shape {tuple(value.shape)}"
+    text = repr(value)
+    return f"{text if len(text) < 60 else f'{text[:57]}...'}, a {type(value).__name__}"

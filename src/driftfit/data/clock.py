@@ -1,0 +1,402 @@
+"""Time: how many nominal intervals, dt, lie between two samples.
+
+    dt = 10                                         numbers: in the unit of ``time``, 1 by default
+    dt = "10ms" "1s" "15min" "1h" "30d" "2w"        durations; also timedelta, numpy.timedelta64, pandas offsets
+    dt = "month" "quarter" "year" "3 months"        steps of the calendar, however many days they have
+    dt = "business day"                             Monday to Friday; "business day except 2024-12-25, 2024-12-26" with
+                                                    holidays, which pandas' CustomBusinessDay(holidays=..) brings too
+    dt = "label"                                    times are labels: samples are one step apart, whatever they say
+
+A month is counted from its first day, with the part of it that has passed: 31 January to 28 February is 0.997 months. A
+number of steps within a tenth of a whole one counts as whole, so that the last day, or the last trading day, of every
+month are one step apart; days and months are those of the zone of the times. A weekend has no business time: from
+Saturday to Monday 0 steps pass. Everything depends on a sample and the one before it alone, so a stream counts as its
+record does.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from typing import Any, NoReturn
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
+from driftfit.models.arx import GAP
+
+LABEL = "label"
+CALENDARS = ("month", "business")
+MONTHS = {
+    **dict.fromkeys(("month", "months", "MS", "ME", "BMS", "BME", "CBMS", "CBME"), 1),
+    **dict.fromkeys(("quarter", "quarters", "Q", "QS", "QE", "BQS", "BQE"), 3),
+    **dict.fromkeys(("year", "years", "Y", "YS", "YE", "BYS", "BYE"), 12),
+}
+"""Calendar steps in months, with the codes of pandas."""
+
+BUSINESS = ("business day", "business days", "B", "C")
+DURATIONS = {
+    **dict.fromkeys(("ns", "us", "ms"), 1),
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1),
+    **dict.fromkeys(("min", "minute", "minutes"), 60),
+    **dict.fromkeys(("h", "hour", "hours"), 3600),
+    **dict.fromkeys(("d", "day", "days"), 86400),
+    **dict.fromkeys(("w", "week", "weeks"), 604800),
+}
+"""Seconds of a unit, or 1 where NumPy has a unit of that name."""
+
+NEAR = 0.1
+"""So close to a whole number of calendar steps counts as that number."""
+
+LOOK = 20
+"""After so many samples a stream says that most of them cannot be used."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """One nominal interval: ``count`` of a ``kind``, "number", "month" or "business", or a ``duration``, or a "label".
+
+    "unset" is what holds while nobody has said: 1 for numbers, refused for dates.
+    """
+
+    kind: str
+    count: float = 1.0
+    duration: np.timedelta64 | None = None
+    holidays: tuple[str, ...] = ()
+    zone: str | None = None
+    """Where days and months begin, for times in UTC."""
+
+    @classmethod
+    def of(cls, dt: Any, zone: str | None = None) -> Clock:
+        """What ``dt`` stands for, for times that are shown in a zone; ValueError where it is nothing of the kind."""
+        clock = cls._of(dt)
+        return replace(clock, zone=zone) if clock.kind in CALENDARS and zone is not None else clock
+
+    @classmethod
+    def _of(cls, dt: Any) -> Clock:
+        if isinstance(dt, Clock):
+            return dt
+        if dt is None:
+            return cls("unset")
+        if isinstance(dt, str):
+            return _of_text(dt)
+        if isinstance(dt, np.timedelta64 | timedelta):
+            return _of_duration(dt.to_timedelta64() if hasattr(dt, "to_timedelta64") else np.timedelta64(dt), dt)
+        if isinstance(dt, int | float | np.number) and not isinstance(dt, bool):
+            if not (dt > 0.0 and np.isfinite(dt)):
+                raise ValueError(f"dt must be positive; got {dt!r}.")
+            return cls("number", float(dt))
+        if hasattr(dt, "freqstr"):
+            return _of_offset(dt)
+        _refuse(dt)
+
+    @property
+    def plain(self) -> float | str | None:
+        """What `of` makes this clock of again, as plain data."""
+        if self.kind in ("unset", LABEL):
+            return None if self.kind == "unset" else LABEL
+        if self.kind == "number":
+            return self.count
+        if self.duration is not None:
+            return _written(self.duration)
+        name = "month" if self.kind == "month" else "business day"
+        text = name if self.count == 1.0 else f"{self.count:g} {name}s"
+        return f"{text} except {', '.join(self.holidays)}" if self.holidays else text
+
+    def between(self, last: Array, time: Array) -> Array:
+        """Nominal intervals from times ``last`` to ``time``, elementwise."""
+        self._fits(time)
+        if self.kind == LABEL:
+            return np.ones(np.shape(time))
+        if self.kind in ("number", "unset"):
+            return np.asarray((time - last) / self.count)
+        if self.duration is not None:
+            return np.asarray((time - last) / self.duration)
+        place = self._months if self.kind == "month" else self._business_days
+        steps = (place(self._local(time)) - place(self._local(last))) / self.count
+        nearest = np.rint(steps)
+        return np.where((nearest >= 1.0) & (np.abs(steps - nearest) < NEAR), nearest, steps)
+
+    def _fits(self, time: Array) -> None:
+        """ValueError where times of this kind cannot be counted so."""
+        dates = np.asarray(time).dtype.kind == "M"
+        if self.kind == "unset" and dates:
+            raise ValueError(
+                "with datetimes dt must be given: the nominal interval, such as dt=timedelta(hours=1), '1h', 'month', "
+                "or 'label' where samples are one step apart whatever their dates say."
+            )
+        if self.kind == "number" and dates:
+            raise ValueError(
+                f"dt={self.count:g} has no unit, and time is dates; say which, as in dt='{self.count:g}s'."
+            )
+        if self.kind not in ("number", "unset", LABEL) and not dates:
+            raise ValueError(f"dt={self.plain!r} is for dates, but time is numbers: give dt in the unit of time.")
+
+    def at(self, time: Any) -> Clock:
+        """This clock, its days and months those of the zone of a time that has one."""
+        known = self.zone is not None or self.kind not in CALENDARS or getattr(time, "tzinfo", None) is None
+        return self if known else replace(self, zone=zone_name(time.tzinfo))
+
+    def _local(self, time: Array) -> Array:
+        """Times in UTC as the wall clock of the zone shows them."""
+        if self.zone is None:
+            return time
+        import polars as pl
+
+        series = pl.Series(np.atleast_1d(time).astype("datetime64[us]")).dt.replace_time_zone("UTC")
+        shown = series.dt.convert_time_zone(self.zone).dt.replace_time_zone(None).to_numpy()
+        return np.asarray(shown.reshape(np.shape(time)))
+
+    def _in_utc(self, time: Array) -> Array:
+        """The inverse; NaT where the wall clock skips a time."""
+        if self.zone is None:
+            return time
+        import polars as pl
+
+        series = pl.Series(time.astype("datetime64[us]"))
+        zoned = series.dt.replace_time_zone(self.zone, ambiguous="earliest", non_existent="null")
+        return np.asarray(zoned.dt.convert_time_zone("UTC").dt.replace_time_zone(None).to_numpy())
+
+    def _months(self, time: Array) -> Array:
+        """Months since 1970, with the part of the month that has passed."""
+        month = time.astype("datetime64[M]")
+        start, end = (m.astype("datetime64[us]") for m in (month, month + 1))
+        return np.asarray(month.astype(np.int64) + (time - start) / (end - start))
+
+    def _business_days(self, time: Array) -> Array:
+        """Business days since 1970, with the part of the day that has passed."""
+        day = time.astype("datetime64[D]")
+        part = (time - day) / np.timedelta64(1, "D")
+        whole = np.busday_count(np.datetime64("1970-01-01"), day, busdaycal=self._calendar)
+        return np.asarray(whole + np.where(np.is_busday(day, busdaycal=self._calendar), part, 0.0))
+
+    @cached_property
+    def _calendar(self) -> Any:
+        return np.busdaycalendar(holidays=np.array(self.holidays, dtype="datetime64[D]"))
+
+    def steps(self, time: Array) -> Array:
+        """Nominal intervals (T,) since the sample before; 1 at the first."""
+        gaps = np.ones(len(time))
+        if len(time):
+            self._fits(time)
+            gaps[1:] = self.between(time[:-1], time[1:])
+        return gaps
+
+    def since(self, last: Any, time: Any) -> float:
+        """Nominal intervals from one instant to another; 1 where there is none before, NaN where time stands still."""
+        self._fits(time)
+        if last is None:
+            return 1.0
+        return float(self.between(np.asarray(last), np.asarray(time))) if time > last else float("nan")
+
+    def ahead(self, last: Any, h: int) -> Array | None:
+        """The times (h,) of the nominal samples after ``last``; None where times are only labels."""
+        return self.moved(last, np.arange(1, h + 1))
+
+    def moved(self, last: Any, k: Array) -> Array | None:
+        """The times k nominal intervals after ``last``, negative ones before it; None where times are only labels."""
+        if self.kind == LABEL or last is None:
+            return None
+        if self.kind in ("number", "unset"):
+            return np.asarray(last + k * self.count)
+        if self.duration is not None:
+            return np.asarray(last + k * self.duration)
+        k = np.rint(k).astype(np.int64)
+        local = self._local(last)
+        day = local.astype("datetime64[D]")
+        part, jump = local - day, k * int(self.count)
+        if self.kind == "business":
+            days = np.busday_offset(day, jump, roll="backward", busdaycal=self._calendar)
+            return self._in_utc(np.asarray(days + part))
+        month = local.astype("datetime64[M]")
+        first, after = (m.astype("datetime64[D]") for m in (month + jump, month + jump + 1))
+        ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays that
+        there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
+        return self._in_utc(np.asarray(there + part))
+
+
+def instant(time: Any) -> Any:
+    """One time as a float, or as datetime64 in UTC where it is a date."""
+    if isinstance(time, int | float | np.number) and not isinstance(time, np.timedelta64):
+        return float(time)
+    if hasattr(time, "to_datetime64"):  # of pandas, in UTC where it has a zone
+        return time.to_datetime64()
+    if isinstance(time, datetime) and time.tzinfo is not None:
+        time = time.astimezone(UTC).replace(tzinfo=None)
+    return _by_days(np.asarray(time, dtype="datetime64" if isinstance(time, np.datetime64) else "datetime64[us]"))[()]
+
+
+def instants(time: Any) -> tuple[Array, str | None]:
+    """(times (T,) as floats or as datetime64 in UTC, their zone) from an array or a sequence."""
+    axis = np.asarray(time)
+    if axis.dtype.kind in "iuf":
+        return axis.astype(float), None
+    if axis.dtype.kind == "M":
+        return _by_days(axis), None
+    if axis.dtype.kind == "O" and axis.size and isinstance(axis.flat[0], datetime) and axis.flat[0].tzinfo is not None:
+        zone = zone_name(axis.flat[0].tzinfo)
+        flat = [one.astimezone(UTC).replace(tzinfo=None) for one in axis.flat]
+        return np.array(flat, dtype="datetime64[us]").reshape(axis.shape), zone
+    return np.asarray(time, dtype="datetime64[us]"), None
+
+
+def zone_name(zone: Any) -> str:
+    """The name of a time zone, of a tzinfo or as text; a fixed offset of whole hours has one too, others are UTC."""
+    name = next((str(getattr(zone, key)) for key in ("key", "zone") if getattr(zone, key, None)), str(zone))
+    try:
+        ZoneInfo(name)
+        return name
+    except (ValueError, OSError, KeyError):  # nothing of that name
+        pass
+    offset = re.fullmatch(r"(?:UTC)?([+-]\d\d):00", name)
+    return f"Etc/GMT{-int(offset[1]):+d}" if offset and int(offset[1]) else "UTC"
+
+
+def _by_days(axis: Array) -> Array:
+    """Dates in days at least: nothing can be divided by a month."""
+    coarse = np.datetime_data(axis.dtype)[0] in ("Y", "M", "W", "generic")
+    return axis.astype("datetime64[D]") if coarse else axis
+
+
+def _of_duration(length: np.timedelta64, given: Any) -> Clock:
+    if not length > np.timedelta64(0):
+        raise ValueError(f"dt must be positive; got {given!r}.")
+    if np.datetime_data(length.dtype)[0] in ("Y", "M", "generic"):
+        raise ValueError(f"dt={given!r} has no fixed length; give dt='month', dt='year', or a unit, as in dt='1s'.")
+    return Clock("duration", duration=length)
+
+
+def _of_text(text: str) -> Clock:
+    """A count and a unit; codes of pandas may carry the month or weekday that they are anchored to."""
+    if text.strip() == LABEL:
+        return Clock(LABEL)
+    words, _, holidays = text.partition(" except ")
+    match = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)?\s*([A-Za-z]+(?: [a-z]+)?)(?:-[A-Z]+)?\s*", words)
+    count, unit = (float(match[1] or 1), match[2]) if match else (0.0, "")
+    known = unit if unit in MONTHS or unit in BUSINESS else unit.lower()
+    days = tuple(day.strip() for day in holidays.split(",") if day.strip())
+    if not count or (days and known not in BUSINESS):
+        _refuse(text)
+    if known in BUSINESS:
+        return Clock("business", _whole(text, count), holidays=days)
+    if known in MONTHS:
+        return Clock("month", _whole(text, count) * MONTHS[known])
+    if known not in DURATIONS or unit in ("M", "m"):
+        _refuse(text)
+    scale, size = (1, str(known)) if known in ("ns", "us", "ms") else (10**9, "ns")
+    ticks = count * DURATIONS[known] * scale
+    if ticks != round(ticks):
+        raise ValueError(f"dt={text!r} is no whole number of nanoseconds.")
+    if scale > 1 and round(ticks) % 1000 == 0:  # dates of the far past or future do not fit nanoseconds
+        ticks, size = ticks / 1000, "us"
+    return Clock("duration", duration=_delta(round(ticks), size))
+
+
+def _delta(count: int, unit: str) -> np.timedelta64:
+    """A duration of so many units that NumPy knows."""
+    return np.timedelta64(count, unit)  # type: ignore[arg-type, call-overload, no-any-return, unused-ignore]
+
+
+def _whole(text: str, count: float) -> float:
+    if count != int(count):
+        raise ValueError(f"dt={text!r}: steps of the calendar come in whole numbers.")
+    return count
+
+
+def _of_offset(offset: Any) -> Clock:
+    """An offset of pandas, known by its attributes."""
+    kwds = {name: value for name, value in getattr(offset, "kwds", {}).items() if name.endswith("s")}
+    months = 12 * kwds.pop("years", 0) + kwds.pop("months", 0)
+    kwds.pop("holidays", None)
+    if months and not kwds:
+        return Clock("month", float(months * offset.n))
+    if kwds and not months:
+        return Clock.of(timedelta(**kwds) * offset.n)
+    clock, calendar = _of_text(offset.freqstr), getattr(offset, "calendar", None)
+    if clock.kind == "business" and isinstance(calendar, np.busdaycalendar):
+        if calendar.weekmask.tolist() != [True] * 5 + [False] * 2:
+            raise ValueError("dt: business days are Monday to Friday; for another week give dt='label'.")
+        return replace(clock, holidays=tuple(map(str, calendar.holidays)))
+    return clock
+
+
+def _refuse(given: Any) -> NoReturn:
+    raise ValueError(
+        f"dt={given!r} is no interval; give a number in the unit of time, a duration ('10ms', '1s', '15min', '1h', "
+        "'30d', '2w', a timedelta), a step of the calendar ('business day', 'month', 'quarter', 'year', '3 months'; "
+        "'m' could be minutes or months, so write 'min' or 'month'), or 'label' where times are only labels."
+    )
+
+
+def _written(length: np.timedelta64) -> str:
+    """A duration in the largest unit of which it is a whole number."""
+    for name, one in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
+        if length % np.timedelta64(one, "s") == np.timedelta64(0, "s"):
+            return f"{length // np.timedelta64(one, 's')}{name}"
+    size = next(size for size in ("ms", "us", "ns") if length % _delta(1, size) == _delta(0, size))
+    return f"{length // _delta(1, size)}{size}"
+
+
+def median_interval(time: Array, zone: str | None = None) -> tuple[str, str]:
+    """(the median interval of a record in words, the dt that fits it best)."""
+    middle = np.sort(np.diff(time))[(len(time) - 1) // 2]
+    if time.dtype.kind != "M":
+        return f"{middle:g}", f"dt={middle:g}"
+    best, name = max(0.9, float(np.mean(np.abs(np.diff(time) / middle - 1.0) < 1e-3))), _written(middle)
+    for step in ("business day", "month", "quarter", "year"):
+        fit = float(np.mean(Clock.of(step, zone).steps(time)[1:] == 1.0))
+        best, name = (fit, step) if fit > best else (best, name)
+    return _written(middle), f"dt={name!r}"
+
+
+def broken(gaps: Array, first: Array, reach: int) -> Array:
+    """Which samples have a gap within the ``reach`` intervals that their lags span; series begin at ``first``."""
+    total, places = np.concatenate([[0], np.cumsum(gaps > GAP)]), np.arange(len(gaps))
+    begin = np.repeat(first, np.diff(np.append(first, len(gaps))))
+    return np.asarray(total[places + 1] > total[np.maximum(places + 1 - reach, begin)])
+
+
+def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: int, zone: str | None = None) -> None:
+    """Say it where most samples cannot be used because of dt, or where weekends cost a record of working days.
+
+    ``time`` and ``gaps`` (N,) hold one series after the other, each from its ``first`` sample on.
+    """
+    N = len(gaps)
+    if reach * int(np.count_nonzero(gaps > GAP)) <= 0.1 * N:
+        return
+    lost = int(broken(gaps, first, reach).sum())
+    longest = int(np.argmax(np.diff(np.append(first, N))))
+    axis = time[first[longest] : np.append(first, N)[longest + 1]]
+    middle, better = median_interval(axis, zone)
+    weekdays = "business" in better and clock.kind == "duration"
+    if lost > 0.5 * N or weekdays:
+        warn(
+            f"{lost} of {N} samples cannot be used: the median interval is {middle}, dt is "
+            f"{1 if clock.plain is None else clock.plain}, and lags do not reach across gaps above {GAP} dt. "
+            f"Give {better}, or dt='label' where samples are one step apart whatever their times say."
+        )
+
+
+class Pace:
+    """Counts the gaps of a stream, and says once that most of its samples cannot be used because of dt."""
+
+    def __init__(self, clock: Clock, reach: int) -> None:
+        self._clock, self._reach = clock, reach
+        self._count = self._gaps = 0
+
+    def see(self, interval: float) -> None:
+        """Take the nominal interval before a sample in."""
+        if not self._reach or self._count > LOOK:
+            return
+        self._count += 1
+        self._gaps += interval > GAP
+        if self._count == LOOK and self._gaps > LOOK // 2:
+            warn(
+                f"{self._gaps} of the first {LOOK} samples came after a gap: the last interval is {interval:g} times "
+                f"dt={1 if self._clock.plain is None else self._clock.plain}, and lags do not reach across gaps above "
+                f"{GAP} dt. Give dt= the interval between samples, or dt='label' where times are only labels."
+            )

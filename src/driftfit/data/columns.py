@@ -1,0 +1,133 @@
+"""Columns of tables as arrays: what is a number, what is a time, what is missing, whatever the table is made of.
+
+Missing is what is null, NaN, infinite, empty, or says NA, N/A, NaN, null or None. Anything else that is not a number is
+the user's to put right: it is named with its row and its text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import narwhals as nw
+import numpy as np
+import polars as pl
+
+from driftfit.data.clock import zone_name
+from driftfit.data.signals import as_numbers
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+
+MISSING = ("", "na", "n/a", "nan", "null", "none")
+"""What people write in a cell that has no value, in lower case."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The columns to read: numbers, perhaps a time, and what tells series apart."""
+
+    numbers: tuple[str, ...]
+    time: str | None = None
+    by: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys([*self.numbers, *([self.time] if self.time else []), *self.by]))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The chosen columns of one table: numbers (N,), times (N,) or None with their zone, and one list per ``by``."""
+
+    numbers: Mapping[str, Array]
+    time: Array | None
+    zone: str | None
+    by: Sequence[Sequence[Any]]
+    rows: int
+
+
+def convert(frame: nw.DataFrame[Any], wanted: Wanted, where: str, base: int) -> Columns:
+    """The wanted columns of one table as arrays; ``base`` is the number of its first row."""
+    for name in wanted.names:
+        if name not in frame.columns:
+            raise ValueError(f"{where} has no column {name!r}: {near(name, frame.columns)}")
+    time, zone = (None, None) if wanted.time is None else times_of_column(frame[wanted.time], where, base)
+    numbers = {name: numbers_of(frame[name], where, base) for name in wanted.numbers}
+    return Columns(numbers, time, zone, [_units(frame[name]) for name in wanted.by], len(frame))
+
+
+def _is_text(series: nw.Series[Any]) -> bool:
+    return series.dtype in (nw.String, nw.Categorical) or isinstance(series.dtype, nw.Enum)
+
+
+def _as_text(series: nw.Series[Any]) -> pl.Series:
+    """Cells without surrounding blanks; null where they say that there is no value."""
+    cells = [cell if isinstance(cell, str) else None for cell in series.cast(nw.String).to_list()]
+    text = pl.Series(series.name, cells, dtype=pl.String).str.strip_chars()
+    return text.zip_with(~text.str.to_lowercase().is_in(MISSING), pl.Series([None], dtype=pl.String))
+
+
+def numbers_of(series: nw.Series[Any], where: str, base: int) -> Array:
+    """A column as floats, NaN where it has no value."""
+    if _is_text(series):
+        return _numbers_of_text(_as_text(series), where, base)
+    if series.dtype == nw.Object:  # decimals, None and whatever else Python holds, in one column
+        return as_numbers(f"{where}, column {series.name!r}", series.to_list())
+    if not (series.dtype.is_numeric() or series.dtype == nw.Boolean):
+        raise ValueError(f"{where}: column {series.name!r} is of type {series.dtype}, which is not a number.")
+    return np.asarray(series.cast(nw.Float64).to_numpy(), dtype=float)
+
+
+def _numbers_of_text(text: pl.Series, where: str, base: int) -> Array:
+    values = text.cast(pl.Float64, strict=False)
+    wrong = (values.is_null() & text.is_not_null()).arg_true()
+    if len(wrong):
+        raise ValueError(
+            f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is not a number "
+            f"({len(wrong)} such cells); leave a cell empty where there is no value."
+        )
+    return np.array(values.fill_null(np.nan).to_numpy())
+
+
+def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Array, str | None]:
+    """(numbers or datetime64 in UTC, zone); NaN or NaT where a row has no time."""
+    if _is_text(series):
+        text = _as_text(series)
+        if text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
+            return _numbers_of_text(text, where, base), None
+        series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
+    native: Any = series.to_native()
+    if hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None:  # narwhals lacks zones that pandas has
+        return np.asarray(native.dt.tz_convert(None).to_numpy()), zone_name(native.dtype.tz)
+    if series.dtype == nw.Date:
+        series = series.cast(nw.Datetime("us"))
+    if not isinstance(series.dtype, nw.Datetime):
+        return numbers_of(series, where, base), None
+    zone = series.dtype.time_zone
+    if zone is not None:
+        series = series.dt.convert_time_zone("UTC").dt.replace_time_zone(None)
+    return np.asarray(series.to_numpy()), None if zone is None else zone_name(zone)
+
+
+def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
+    try:
+        dates = text.str.to_datetime(time_unit="us", strict=False)
+    except pl.exceptions.ComputeError:  # no date among the first cells to learn the format from
+        dates = pl.Series(text.name, [None] * len(text), dtype=pl.Datetime("us"))
+    wrong = (dates.is_null() & text.is_not_null()).arg_true()
+    if len(wrong):
+        raise ValueError(
+            f"{where}, row {wrong[0] + base} of column {text.name!r} holds {text[wrong[0]]!r}, which is neither a "
+            "number nor a date in the form of the column's first cells (2024-01-31 or 2024-01-31 12:00:00)."
+        )
+    return dates
+
+
+def _units(series: nw.Series[Any]) -> list[Any]:
+    """The unit of every row; None where there is none. Text that reads as whole numbers becomes whole numbers."""
+    if not _is_text(series):
+        return [None if value is None or value != value else value for value in series.to_list()]
+    text = _as_text(series)
+    whole = text.cast(pl.Int64, strict=False)
+    return (whole if whole.cast(pl.String).eq_missing(text).all() else text).to_list()

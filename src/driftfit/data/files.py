@@ -1,0 +1,136 @@
+"""Files: CSV and Parquet, one or many, read with polars.
+
+CSV is read as text, so that a cell that is no number can be named; lines that begin with # are comments, and the header
+says whether cells are separated by comma, semicolon or tab. Of several files those that cannot be read are left out,
+with a warning, and kept with their reasons: one damaged file does not cost the others.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import warnings
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import narwhals as nw
+import numpy as np
+import polars as pl
+
+from driftfit.data.columns import Columns, Wanted, convert
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+
+FILE = "file"
+"""The name under which ``by`` may ask for the file that a row comes from."""
+
+
+def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str | None = None) -> dict[str, Array]:
+    """Columns of a CSV or Parquet file as arrays (T,): floats, and for ``time`` perhaps datetime64 (in UTC).
+
+    Raises
+    ------
+    ValueError
+        For a column that the file does not have (with the nearest names), and for a cell that is not a number (with
+        its row, counted from 1 after the header, and its text).
+    OSError
+        Where the file cannot be read.
+    """
+    wanted = Wanted(tuple(names), time)
+    columns = convert(_file(os.fspath(path), wanted), wanted, os.fspath(path), 1)
+    return {**columns.numbers, **({time: columns.time} if time is not None and columns.time is not None else {})}
+
+
+def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
+    """The wanted columns of a table, a file, or several files one after the other."""
+    if not isinstance(data, str | os.PathLike | list | tuple):
+        return convert(_frame(data), wanted, "the table", 0), {}
+    paths = _paths(data)
+    if len(paths) == 1:
+        return convert(_file(paths[0], wanted), wanted, paths[0], 1), {}
+    parts: dict[str, Columns] = {}
+    failed: dict[Hashable, str] = {}
+    for path in paths:
+        try:
+            frame = _file(path, wanted)
+        except (ValueError, OSError) as error:
+            failed[path] = str(error)
+            continue
+        parts[path] = convert(frame, wanted, path, 1)
+    if not parts:
+        raise ValueError(f"none of the {len(paths)} files can be read; the first: {failed[paths[0]]}")
+    if failed:
+        warnings.warn(
+            f"{len(failed)} of {len(paths)} files cannot be read: {next(iter(failed.values()))}", stacklevel=4
+        )
+    return _together(parts), failed
+
+
+def _frame(data: Any) -> nw.DataFrame[Any]:
+    try:
+        frame = nw.from_native(data)
+    except TypeError:
+        raise ValueError(
+            f"data must be a table (pandas, polars, pyarrow) or a path; got a {type(data).__name__}."
+        ) from None
+    return frame.collect() if isinstance(frame, nw.LazyFrame) else frame
+
+
+def _paths(data: Any) -> list[str]:
+    """The files that a path, a pattern, or a list of both stands for, in order of their names."""
+    paths: list[str] = []
+    for entry in data if isinstance(data, list | tuple) else [data]:
+        text = os.fspath(entry)
+        found = sorted(glob.glob(text, recursive=True)) if glob.has_magic(text) else [text]
+        if not found:
+            raise ValueError(f"no file matches {text}.")
+        paths += found
+    return paths
+
+
+def _file(path: str, wanted: Wanted) -> nw.DataFrame[Any]:
+    """The wanted columns of one file."""
+    parquet = Path(path).suffix.lower() in (".parquet", ".pq")
+    try:
+        if parquet:
+            names = list(pl.read_parquet_schema(path))
+            frame = pl.read_parquet(path, columns=[name for name in names if name in wanted.names])
+        else:
+            names, frame = _csv(path, wanted)
+    except (pl.exceptions.PolarsError, UnicodeDecodeError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"{path} cannot be read as {'Parquet' if parquet else 'CSV'}: {text}") from None
+    for name in (name for name in wanted.names if name not in names and not (name == FILE and FILE in wanted.by)):
+        raise ValueError(f"{path} has no column {name!r}: {near(name, names)}")
+    if FILE in wanted.by and FILE not in names:
+        frame = frame.with_columns(pl.lit(path).alias(FILE))
+    if frame.height == 0:
+        raise ValueError(f"{path} has a header but no rows.")
+    return nw.from_native(frame, eager_only=True)
+
+
+def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
+    """(all column names, the wanted columns as text); separated by comma, semicolon or tab, as the header says."""
+    with open(path, encoding="utf-8", errors="replace") as file:
+        header = next((line for line in file if not line.startswith("#")), "")
+    separator = max(",;\t", key=header.count)
+    options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
+    names = pl.read_csv(path, n_rows=0, **options).columns
+    return names, pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
+
+
+def _together(parts: Mapping[str, Columns]) -> Columns:
+    """Files one after the other; their times must be of one kind."""
+    times = {path: part.time for path, part in parts.items() if part.time is not None}
+    kinds = {time.dtype.kind: path for path, time in times.items()}
+    if len(kinds) > 1:
+        raise ValueError(f"the times of {kinds['f']} are numbers, but those of {kinds['M']} are dates.")
+    first = next(iter(parts.values()))
+    return Columns(
+        {name: np.concatenate([part.numbers[name] for part in parts.values()]) for name in first.numbers},
+        np.concatenate(list(times.values())) if times else None,
+        first.zone,
+        [[value for part in parts.values() for value in part.by[k]] for k in range(len(first.by))],
+        sum(part.rows for part in parts.values()),
+    )

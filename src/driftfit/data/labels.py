@@ -1,0 +1,165 @@
+"""Series and data frames that are handed over as arrays: their numbers, their names, their index.
+
+Whatever narwhals reads (pandas, polars, pyarrow), and mappings from name to column. Columns go to the inputs of a model
+by name where both have names. Rows go together by place: where two indices of pandas differ the rows do not belong
+together, which is refused. An index of dates becomes the labels of the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.data.clock import instants, zone_name
+from driftfit.data.signals import as_inputs
+from driftfit.engine.kernel import Array
+
+
+class Held(NamedTuple):
+    """What a user handed over: values for an array, names of its columns (empty: none), its index (None: none)."""
+
+    values: Any
+    names: tuple[str, ...] = ()
+    index: Any = None
+
+
+def held(what: str, given: Any) -> Held:
+    """Values (T,) or (T, m) with what they are called, from anything that a user hands over."""
+    if given is None or isinstance(given, np.ndarray | list | tuple | float | int):
+        return Held(given)
+    if isinstance(given, Mapping):
+        parts = {str(name): held(f"{what}[{name!r}]", column) for name, column in given.items()}
+        together(**parts)
+        index = next((part.index for part in parts.values() if part.index is not None), None)
+        return Held(np.column_stack([part.values for part in parts.values()]), tuple(parts), index)
+    import narwhals as nw  # takes as long to import as all the rest
+
+    try:
+        frame = nw.from_native(given, pass_through=True, allow_series=True)
+    except nw.exceptions.DuplicateError as error:
+        raise ValueError(f"{what}: columns are told apart by their names. {error}") from None
+    if isinstance(frame, nw.LazyFrame):
+        frame = frame.collect()
+    if not isinstance(frame, nw.Series | nw.DataFrame):
+        return Held(given)
+    from driftfit.data.columns import numbers_of
+
+    index = getattr(given, "index", None) if frame.implementation.is_pandas_like() else None
+    if isinstance(frame, nw.Series):
+        return Held(numbers_of(frame, what, 0), _names([frame.name]), index)
+    columns = [numbers_of(frame[:, j], what, 0) for j in range(frame.shape[1])]
+    return Held(np.column_stack([np.zeros((len(frame), 0)), *columns]), _names(frame.columns), index)
+
+
+def _names(given: Sequence[Any]) -> tuple[str, ...]:
+    """Names of columns; none where one is not text, as the numbers that pandas gives to columns without names."""
+    return tuple(given) if all(isinstance(name, str) and name for name in given) else ()
+
+
+def together(**parts: Held) -> None:
+    """ValueError where the indices of signals of one length differ: their rows do not belong together."""
+    with_index = [(name, part) for name, part in parts.items() if part.index is not None]
+    for name, part in with_index[1:]:
+        first, other = with_index[0]
+        if len(part.index) != len(other.index) or part.index.equals(other.index):
+            continue
+        row = int(np.argmax(np.asarray(part.index != other.index)))
+        same = part.index.sort_values().equals(other.index.sort_values())
+        way = f"{name} = {name}.loc[{first}.index]" if same else f"{first}, {name} = {first}.align({name}, 'inner', 0)"
+        raise ValueError(
+            f"the rows of {first} and {name} do not belong together: their indices differ, at row {row} "
+            f"{other.index[row]} beside {part.index[row]}. Put them together by label with {way}, or by place with "
+            f"{name}.to_numpy()."
+        )
+
+
+class Times(NamedTuple):
+    """When the samples of a record were taken: times (T,) or None, their zone and name, and whether they only label."""
+
+    axis: Array | None = None
+    zone: str | None = None
+    name: str | None = None
+    labels: bool = False
+
+
+def times_of(time: Any, parts: Sequence[Held]) -> Times:
+    """The times that a user gave, or the first index of dates among the signals."""
+    if time is None:
+        index = next((part.index for part in parts if _dated(part.index)), None)
+        return Times() if index is None else _dates(index)._replace(labels=True)
+    if _dated(time):
+        return _dates(time)
+    if isinstance(time, np.ndarray | list | tuple):
+        return Times(*instants(time))
+    import narwhals as nw
+
+    series = nw.from_native(time, pass_through=True, allow_series=True)
+    if not isinstance(series, nw.Series):
+        return Times(*instants(time))
+    from driftfit.data.columns import times_of_column
+
+    axis, zone = times_of_column(series, "time", 0)
+    return Times(axis, zone, (_names([series.name]) or (None,))[0])
+
+
+def _dated(index: Any) -> bool:
+    """Whether it is an index of dates or of periods."""
+    return hasattr(index, "to_series") and (hasattr(index, "to_timestamp") or getattr(index.dtype, "kind", "") == "M")
+
+
+def _dates(index: Any) -> Times:
+    stamps = index.to_timestamp() if hasattr(index, "to_timestamp") else index
+    zone = getattr(stamps, "tz", None)
+    return Times(
+        np.asarray(stamps.tz_convert(None) if zone is not None else stamps),
+        None if zone is None else zone_name(zone),
+        index.name if isinstance(index.name, str) else None,
+    )
+
+
+def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str = "inputs") -> list[int]:
+    """Where each wanted name stands among the given ones; ValueError where the two are not the same names."""
+    letter = "u" if what == "inputs" else "y"
+    absent = [name for name in wanted if name not in given]
+    more = [name for name in given if name not in wanted]
+    if not absent and not more:
+        return [list(given).index(name) for name in wanted]
+    said = [f"{absent[0]!r} is missing"] if absent else []
+    said += [f"{more[0]!r} is none of them"] if more else []
+    raise ValueError(
+        f"{owner} has the {what} {', '.join(wanted)}, but {letter} has the columns {', '.join(given)}; "
+        f"{'; '.join(said)}. Signals with names are matched by them: rename or choose columns, or give {letter} as an "
+        "array, by place."
+    )
+
+
+def ordered(model: Any, u: Array, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+    """The columns of u (T, m), and their names, in the order of the inputs of a model, where both have names."""
+    wanted = model.input_names
+    if not wanted or not names or tuple(names) == wanted:
+        return u, tuple(names)
+    return np.ascontiguousarray(u[:, order_of(type(model).__name__, wanted, names)]), wanted
+
+
+def inputs_for(model: Any, u: Any, T: int) -> Array:
+    """Inputs (T, m) in the order of a model, from an array, a data frame or a mapping."""
+    given = held("u", u)
+    return ordered(model, as_inputs(given.values, T), given.names)[0]
+
+
+def by_name(model: Any, u: Any) -> Any:
+    """One sample of inputs in the order of the model: a mapping or a labelled row by its names, others as they are."""
+    if not hasattr(u, "keys"):
+        return u
+    given = tuple(u.keys())
+    if not all(isinstance(name, str) for name in given):
+        return np.asarray(u)
+    if not model.input_names:
+        raise ValueError(
+            f"u names its values ({', '.join(given)}), but the inputs of the model have no names; give them, as in "
+            "ARX(2, 1, inputs=[..]) or Regression([..]), or give u as numbers in order."
+        )
+    order_of(type(model).__name__, model.input_names, given)
+    return [u[name] for name in model.input_names]

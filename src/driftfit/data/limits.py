@@ -1,0 +1,183 @@
+"""Valid ranges of signals, and stretches to leave out: what is outside becomes missing, and is counted.
+
+    limits = {"flow": (0, 80), "pressure": (None, 16)}     a number outside its range was never measured
+    exclude = [("2024-03-01", "2024-03-04"), (500, 620)]   from, to: both belong to the stretch, None has no end
+
+Names are those of columns; for arrays "y", the names of the outputs or inputs of the model, "u" for every input, and
+"u1", "u2", .. or 0, 1, .. for one of them. Stretches are given in times, or in sample numbers where there is no time; a
+day, a month or a year as the end of one ("2024-03-04", a date) is that whole day, month or year, and dates without a
+zone are in the zone of the table.
+
+A sample of a stretch is neither used nor looked at: its output and its inputs are missing, so that nothing of it
+reaches a lag, and the samples after it whose lags reach into it are skipped as well. (Where the signals of a stretch
+are true and only nothing is to be learned from it, give ``weights`` of 0: then lags go on.)
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from datetime import date, datetime
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from driftfit.data.clock import instant
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near
+
+
+class Limits:
+    """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite where there is none."""
+
+    def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
+        self.ny = len(outputs)
+        self.names = (*outputs, *(inputs or (f"u{j + 1}" for j in range(m))))
+        self.low, self.high = np.full(self.ny + m, -np.inf), np.full(self.ny + m, np.inf)
+        for key, bounds in limits.items():
+            low, high = _bounds(key, bounds)
+            for place in self._places(key, m):
+                self.low[place], self.high[place] = low, high
+
+    def _places(self, key: Any, m: int) -> list[int]:
+        """Which signals a key of the mapping means."""
+        if isinstance(key, int | np.integer) and 0 <= key < m:
+            return [self.ny + int(key)]
+        if key in self.names:
+            return [place for place, name in enumerate(self.names) if name == key]
+        plain = {f"u{j + 1}": [self.ny + j] for j in range(m)} | {"u": list(range(self.ny, self.ny + m))}
+        plain |= {"y": [0]} if self.ny == 1 else {}
+        if plain.get(key):
+            return plain[key]
+        raise ValueError(f"limits: there is no signal {key!r}; {near(str(key), self.names)}")
+
+    def outside(self, y: Array, u: Array) -> tuple[Array, Array]:
+        """Which values of y (.., ny) and u (.., m) are outside their ranges."""
+        ny = self.ny
+        out_y = (y < self.low[:ny]) | (y > self.high[:ny])
+        return out_y, (u < self.low[ny:]) | (u > self.high[ny:])
+
+
+class Gate:
+    """Valid ranges of a stream: passes samples on, NaN for what is outside, and counts."""
+
+    def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
+        self.given = dict(limits)
+        self._limits = Limits(limits, outputs, inputs, m)
+        self._counts = np.zeros(len(self._limits.names), dtype=np.int64)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many numbers were outside, by signal."""
+        found = zip(self._limits.names, self._counts.tolist(), strict=True)
+        return {name: count for name, count in found if count}
+
+    def sample(self, y: Array, u: Array) -> tuple[Array, Array]:
+        """Outputs (ny,) and inputs (.., m) of one sample, counted."""
+        out_y, out_u = self._limits.outside(y, u)
+        self._counts += np.concatenate([out_y, out_u.reshape(-1, u.shape[-1]).sum(axis=0)])
+        return np.where(out_y, np.nan, y), np.where(out_u, np.nan, u)
+
+    def inputs(self, u: Array) -> Array:
+        """Inputs (.., m) that are asked about, not counted."""
+        low, high = self._limits.low[self._limits.ny :], self._limits.high[self._limits.ny :]
+        return np.where((u < low) | (u > high), np.nan, u)
+
+    def plain(self) -> list[Any]:
+        """Ranges and counts as plain data; `restore` takes the counts."""
+        return [list(self.given.items()), self._counts.tolist()]
+
+    def restore(self, counts: Sequence[int]) -> None:
+        self._counts[:] = counts
+
+
+def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
+    """(low, high) of one signal."""
+    try:
+        low, high = (end if end is None else float(end) for end in bounds)
+    except (TypeError, ValueError):
+        raise ValueError(f"limits: {key!r} takes (low, high), None where there is no limit; got {bounds!r}.") from None
+    found = (-np.inf if low is None else low, np.inf if high is None else high)
+    if not found[0] < found[1]:
+        raise ValueError(f"limits: of {key!r} the low end must be below the high one; got {bounds!r}.")
+    return found
+
+
+def within(stretches: Any, time: Array | None, number: Array, zone: str | None = None) -> Array:
+    """Which samples lie in one of the stretches; ``number`` (N,) counts the samples of each series."""
+    inside = np.zeros(len(number), dtype=bool)
+    axis = number if time is None else time
+    for stretch in stretches:
+        if isinstance(stretch, str) or not isinstance(stretch, Sequence | np.ndarray) or len(stretch) != 2:
+            raise ValueError(f"exclude: a stretch is (from, to), in a list of them; got {stretch!r}.")
+        low, high = (_end(one, axis, zone, upper) for upper, one in enumerate(stretch))
+        if low is not None and high is not None and not low <= high:
+            raise ValueError(f"exclude: a stretch ends at or after its beginning; got {stretch!r}.")
+        inside |= (True if low is None else axis >= low) & (True if high is None else axis <= high)
+    return inside
+
+
+def within_each(
+    exclude: Any, keys: Sequence[Any], owner: Array, time: Array | None, number: Array, zone: str | None
+) -> Array:
+    """Which samples of series one after the other are excluded: a list of stretches for all, or one for each key."""
+    if not isinstance(exclude, Mapping):
+        return within(exclude or (), time, number, zone)
+    absent = [key for key in exclude if key not in keys]
+    if absent:
+        raise ValueError(f"exclude: there is no series {absent[0]!r}; {near(str(absent[0]), list(map(str, keys)))}")
+    inside = np.zeros(len(number), dtype=bool)
+    for k, key in enumerate(keys):
+        if key in exclude:
+            rows = owner == k
+            inside[rows] = within(exclude[key], None if time is None else time[rows], number[rows], zone)
+    return inside
+
+
+def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
+    """One end of a stretch in the kind of the axis; a day or longer, as the upper end, is taken to its last moment."""
+    if given is None:
+        return None
+    try:
+        if axis.dtype.kind != "M":
+            return float(given)
+        stamp = _stamp(given)
+        coarse = isinstance(stamp, np.datetime64) and np.datetime_data(stamp.dtype)[0] in ("Y", "M", "W", "D")
+        moment = _in_utc((stamp + upper).astype("datetime64[us]") if coarse else instant(stamp), stamp, zone)
+        return moment - np.timedelta64(1, "us") if coarse and upper else moment
+    except (TypeError, ValueError):
+        kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"
+        raise ValueError(f"exclude: with this record an end of a stretch is {kind}, or None; got {given!r}.") from None
+
+
+def _stamp(given: Any) -> Any:
+    """Text and days as datetime64 in the resolution in which they were given; text with a zone as a datetime."""
+    if isinstance(given, date) and not isinstance(given, datetime):
+        return np.datetime64(given)
+    if not isinstance(given, str):
+        return given
+    zoned = re.search(r"\d\d:\d\d.*([+-]\d\d:?\d\d|Z)$", given.strip())
+    return datetime.fromisoformat(given) if zoned else np.datetime64(given)
+
+
+def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
+    """A moment that was given without a zone is in that of the table."""
+    if zone is None or getattr(given, "tzinfo", None) is not None:
+        return moment
+    local = moment.astype("datetime64[us]").item().replace(tzinfo=ZoneInfo(zone))
+    return instant(local)
+
+
+def marked(
+    keys: Sequence[Any], owner: Array, outside: Mapping[str, Array], excluded: Array
+) -> dict[Any, dict[str, int]]:
+    """Counts by key and by reason; ``owner`` (N,) is the number of each sample's series."""
+    reasons = {f"of {name} outside its limits": flags for name, flags in outside.items()}
+    reasons |= {"excluded": excluded}
+    counts: dict[Any, dict[str, int]] = {}
+    for reason, flags in reasons.items():
+        found = np.bincount(owner[flags], minlength=len(keys))
+        for k in np.flatnonzero(found).tolist():
+            counts.setdefault(keys[k], {})[reason] = int(found[k])
+    return counts

@@ -1,0 +1,245 @@
+"""Records: many series one after the other in flat arrays, and what their signals are called.
+
+This is what every fleet runs on, whether it came from a table, from rows of an array, or from one series under many
+settings: a lane reads from ``first`` on, for ``length`` samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from driftfit.data.clock import LABEL, Clock, instants, warn_of_gaps
+from driftfit.data.labels import held, ordered, times_of, together
+from driftfit.data.limits import Limits, marked, within_each
+from driftfit.data.signals import as_inputs, as_numbers, as_output, factor, intervals, noise_of
+from driftfit.engine.drivers import known_factors
+from driftfit.engine.kernel import Array
+from driftfit.models.base import Model
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the signals of a series are called, in which units they are, and what was left out of it.
+
+    ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
+    counts rows that never became samples, ``missing`` what was taken as missing though a number stood there, by
+    reason. ``by`` names what tells the series of a fleet apart. ``dt`` is the nominal interval as
+    `driftfit.data.clock.Clock.of` takes it.
+    """
+
+    y: str = "y"
+    u: tuple[str, ...] = ()
+    time: str | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    zone: str | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    by: tuple[str, ...] = ("series",)
+    missing: Mapping[str, int] = field(default_factory=dict)
+    dt: float | str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("u", "by"):  # lists, after a passage through JSON
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+
+    def unit(self, power: int, j: int | None) -> str:
+        """The unit of y to the power 0 or 1, over that of input j; empty where it is not known, or 1."""
+        top = self.units.get(self.y, "") if power else ""
+        bottom = "" if j is None or j >= len(self.u) else self.units.get(self.u[j], "")
+        if (power and not top) or (j is not None and not bottom) or top == bottom:
+            return ""
+        top, bottom = (f"({unit})" if "/" in unit and bottom else unit for unit in (top or "1", bottom))
+        return f"{top}/{bottom}" if bottom else top
+
+
+PLAIN = Labels()
+
+
+def time_text(time: Any, zone: str | None) -> str:
+    """A time as text, dates in a time zone."""
+    if not isinstance(time, np.datetime64):
+        return f"{time:g}"
+    text = time.astype("datetime64[us]").item()
+    if zone is None:
+        return f"{text:%Y-%m-%d %H:%M:%S}"
+    return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How signals are to be read: what `driftfit.track.track` is given beside them, see there."""
+
+    time: Any = None
+    dt: Any = None
+    weights: Any = 1.0
+    drift: Any = 1.0
+    units: Mapping[str, str] | None = None
+    limits: Mapping[Any, Any] | None = None
+    exclude: Any = None
+
+
+@dataclass(frozen=True)
+class Records:
+    """Series in flat arrays of N samples.
+
+    ``y`` (N,), ``u`` (N, m), ``known`` (N, 3) or (1, 3), ``time`` (N,) or None; series k is ``length[k]`` samples from
+    ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that never became
+    samples and numbers that were taken as missing. ``drifts`` (N, k) are factors of the drift for each parameter or
+    change, until the tracker has made columns of ``known`` of them.
+    """
+
+    keys: tuple[Hashable, ...]
+    first: Array
+    length: Array
+    y: Array
+    u: Array
+    known: Array
+    time: Array | None = None
+    labels: Labels = PLAIN
+    dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+    drifts: Array | None = None
+    missing: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+
+    def part(self, k: int) -> tuple[Array, Array, Array | None, Array]:
+        """(y, u, time, known) of series k, as views."""
+        rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
+        known = self.known if len(self.known) == 1 else self.known[rows]
+        return self.y[rows], self.u[rows], None if self.time is None else self.time[rows], known
+
+    def repeated(self, keys: tuple[Hashable, ...]) -> Records:
+        """The only series under several keys, without copying it."""
+        dropped, missing = (
+            {key: counts.get(self.keys[0], {}) for key in keys} for counts in (self.dropped, self.missing)
+        )
+        first, length = np.repeat(self.first, len(keys)), np.repeat(self.length, len(keys))
+        return replace(self, keys=keys, first=first, length=length, dropped=dropped, missing=missing)
+
+    def labels_of(self, k: int) -> Labels:
+        """The labels of series k."""
+        key = self.keys[k]
+        counted = {"dropped": self.dropped.get(key), "missing": self.missing.get(key)}
+        return replace(self.labels, **{name: counts for name, counts in counted.items() if counts})  # type: ignore[arg-type]
+
+    def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
+        """Inputs in the order of a model with named inputs, valid ranges and stretches taken into account.
+
+        Warns where most samples cannot be used because of dt, lags going back ``reach`` samples, or the model's.
+        """
+        u, names = ordered(model, self.u, self.labels.u)
+        found = replace(self, u=u, labels=replace(self.labels, u=names))
+        found = found._restricted(names or model.input_names, reading)
+        if self.time is not None and len(self.known) > 1:
+            clock, zone = Clock.of(self.labels.dt), self.labels.zone
+            warn_of_gaps(clock, self.time, self.known[:, 0], self.first, reach or model.reach, zone)
+        return found
+
+    def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
+        """With NaN for what is outside valid ranges or in a stretch to leave out, counted."""
+        if not reading.limits and not reading.exclude:
+            return self
+        y, u, keys = self.y.copy(), self.u.copy(), self.keys
+        owner = np.repeat(np.arange(len(keys)), self.length)
+        limits = Limits(reading.limits or {}, (self.labels.y,), inputs, u.shape[1])
+        out_y, out_u = limits.outside(y[:, None], u)
+        number = np.arange(len(y)) - self.first[owner]
+        excluded = within_each(reading.exclude, keys, owner, self.time, number, self.labels.zone)
+        flags = np.hstack([out_y, out_u]) & ~excluded[:, None]
+        missing = marked(keys, owner, dict(zip(limits.names, flags.T, strict=True)), excluded)
+        y[out_y[:, 0] | excluded] = np.nan
+        u[out_u | excluded[:, None]] = np.nan
+        return replace(self, y=y, u=u, missing=missing)
+
+
+def one_series(y: Any, u: Any, reading: Reading) -> Records:
+    """One series; y (T,), u (T,), (T, m) or None."""
+    signals = {"y": held("y", y), "u": held("u", u)}
+    beside = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    together(**signals, **beside)
+    output = as_output(signals["y"].values)
+    T = len(output)
+    times = times_of(reading.time, list(signals.values()))
+    dt = LABEL if times.labels and reading.dt is None else reading.dt
+    axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
+    drift = beside["drift"].values
+    common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
+    known = known_factors(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
+    labels = Labels(
+        (signals["y"].names or ("y",))[0], signals["u"].names, times.name, zone=times.zone, dt=Clock.of(dt).plain
+    )
+    inputs = as_inputs(signals["u"].values, T)
+    return Records((0,), np.array([0]), np.array([T]), output, inputs, known, axis, labels, drifts=drifts)
+
+
+def rows(y: Any, u: Any, reading: Reading) -> Records:
+    """Series as rows: y (units, T), u (units, T), (units, T, m) or None, time (T,) or (units, T) or None."""
+    time, dt, weights, drift = reading.time, reading.dt, reading.weights, reading.drift
+    output = as_numbers("y", y)
+    if output.ndim != 2 or output.size == 0:
+        raise ValueError(f'by="row": y must be (units, T), not empty; got shape {output.shape}.')
+    units, T = output.shape
+    each = as_numbers("drift", drift) if np.ndim(drift) == 3 else None
+    if each is not None and each.shape[:2] != (units, T):
+        raise ValueError(
+            f'by="row": drift with a column for each parameter must be ({units}, {T}, n); got shape {each.shape}.'
+        )
+    known, axis = _known_of_rows(units, T, time, dt, weights, drift if each is None else 1.0)
+    return Records(
+        tuple(range(units)), np.arange(units) * T, np.full(units, T), output.ravel(),
+        _inputs_of_rows(u, units, T), known, axis, Labels(dt=Clock.of(dt).plain),
+        drifts=None if each is None else each.reshape(units * T, -1),
+    )  # fmt: skip
+
+
+def _inputs_of_rows(u: Any, units: int, T: int) -> Array:
+    """u as (units * T, m)."""
+    if u is None:
+        return np.zeros((units * T, 0))
+    inputs = as_numbers("u", u)
+    if inputs.ndim == 2:
+        inputs = inputs[:, :, None]
+    if inputs.ndim != 3 or inputs.shape[:2] != (units, T):
+        raise ValueError(
+            f'by="row": y is {units} units of {T} samples, so u must be ({units}, {T}) or ({units}, {T}, m); '
+            f"got shape {np.shape(u)}."
+        )
+    return inputs.reshape(units * T, inputs.shape[2])
+
+
+def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Array, Array | None]:
+    """known (units * T, 3) or (1, 3), and time (units * T,) or None."""
+    shape = (units, T)
+    axis: Array | None = None
+    gaps: Any = 1.0
+    if time is not None:
+        given, zone = instants(time)
+        dt = Clock.of(dt, zone)
+        if given.ndim == 1:
+            axis, gaps = intervals(given, dt, T)
+            axis = np.broadcast_to(axis, shape)
+        elif given.shape == shape:
+            axis, gaps = (np.stack(part) for part in zip(*(intervals(row, dt, T) for row in given), strict=True))
+        else:
+            raise ValueError(f'by="row": time must be ({T},) or {shape}; got shape {given.shape}.')
+    factors = [gaps, _per_row("weights", weights, shape, noise_of), _per_row("drift", drift, shape, drift_of)]
+    flat = [np.broadcast_to(f, shape).ravel() if np.ndim(f) else f for f in factors]
+    return known_factors(*flat), None if axis is None else axis.ravel()
+
+
+def drift_of(value: Any, T: int | None = None) -> Array:
+    """Known factors of the drift."""
+    return factor("drift", value, T)
+
+
+def _per_row(name: str, value: Any, shape: tuple[int, int], convert: Any) -> Array:
+    """A factor given as one number, (T,) for all rows, or (units, T)."""
+    array = np.asarray(value)
+    if array.ndim < 2:
+        return np.asarray(convert(value, shape[1]))
+    if array.shape != shape:
+        raise ValueError(f'by="row": {name} must be a number, ({shape[1]},) or {shape}; got shape {array.shape}.')
+    return np.asarray(convert(array.ravel(), array.size)).reshape(shape)

@@ -1,0 +1,103 @@
+"""Signals as users hand them over: arrays of numbers, times, and settings that must be complete."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.data.clock import Clock, instants
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import missing_settings
+
+if TYPE_CHECKING:
+    from driftfit.trackers.base import Tracker
+
+
+def check_ready(tracker: Tracker) -> Tracker:
+    """Refuse a tracker whose settings are not all numbers yet."""
+    missing = missing_settings(tracker)
+    if missing:
+        name = type(tracker).__name__
+        raise ValueError(
+            f"{name}: {', '.join(missing)} must be given: {name}({', '.join(f'{m}=...' for m in missing)})."
+        )
+    return tracker
+
+
+def as_numbers(name: str, values: Any) -> Array:
+    """Values as floats; None and masked entries become NaN, text is named with its place."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(float), np.nan)
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        pass
+    given = np.asarray(values, dtype=object)
+    out = np.empty(given.shape)
+    for place, value in np.ndenumerate(given):
+        try:
+            out[place] = np.nan if value is None or value == "" else float(value)
+        except (TypeError, ValueError):
+            where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
+            raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
+    return out
+
+
+def as_output(y: Any) -> Array:
+    """y as (T,)."""
+    array = as_numbers("y", y)
+    if array.ndim == 2 and array.shape[1] == 1:
+        array = array[:, 0]
+    if array.ndim != 1:
+        hint = " Several outputs are for a model with ny=; elsewhere take one column." if array.ndim == 2 else ""
+        raise ValueError(f"y must have one axis, (T,); got shape {array.shape}.{hint}")
+    if len(array) == 0:
+        raise ValueError("y is empty: there is nothing to track.")
+    return array
+
+
+def as_inputs(u: Any, T: int) -> Array:
+    """u as (T, m); None is no input."""
+    if u is None:
+        return np.zeros((T, 0))
+    array = as_numbers("u", u)
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise ValueError(f"u must be (T,) or (T, m); got shape {array.shape}.")
+    if len(array) != T:
+        hint = f" u.T has shape {array.T.shape}." if array.shape[1] == T else ""
+        raise ValueError(f"y has {T} samples but u has shape {array.shape}: the first axis must be time.{hint}")
+    return array
+
+
+def factor(name: str, value: Any, T: int | None = None) -> Array:
+    """A known factor of a variance: finite and not negative, one number or one per sample."""
+    array = as_numbers(name, value)
+    if array.ndim > 1 or (array.ndim == 1 and len(array) != T):
+        raise ValueError(f"{name} must be one number or one per sample ({T}); got shape {array.shape}.")
+    if not (np.isfinite(array) & (array >= 0.0)).all():
+        raise ValueError(f"{name} must be finite and not negative everywhere.")
+    return array
+
+
+def noise_of(weights: Any, T: int | None = None) -> Array:
+    """Factor of the noise variance, 1 / w; a weight of 0 makes it infinite, which makes the sample unusable."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / factor("weights", weights, T))
+
+
+def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
+    """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise."""
+    axis, _ = instants(time)
+    if axis.shape != (T,):
+        raise ValueError(f"time has shape {axis.shape}, but y has {T} samples.")
+    bad = np.flatnonzero(~(axis[1:] > axis[:-1])) + 1
+    if bad.size:
+        i = int(bad[0])
+        raise ValueError(
+            f"time must increase: time[{i - 1}] = {axis[i - 1]} is followed by time[{i}] = {axis[i]}; "
+            "sort the record and drop repeated times first."
+        )
+    return axis, Clock.of(dt).steps(axis)

@@ -1,0 +1,169 @@
+"""Files of states and results: one .npz each, arrays and a header of plain JSON, no pickle.
+
+A file is written beside its place and moved there in one step, so it is complete or absent. Classes are named by module
+and class; loading imports that module, so load only files from people whose code you would run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from datetime import datetime, timedelta
+from importlib import import_module
+from io import BytesIO
+from os import PathLike
+from typing import Any, ClassVar, Self, cast
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import Settings
+from driftfit.trackers.base import Tracker
+
+FORMAT = 1
+
+
+def describe(settings: Settings) -> dict[str, Any]:
+    """A model or tracker as plain data."""
+    return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": settings.settings()}
+
+
+def rebuild(description: Mapping[str, Any], kind: type) -> Any:
+    """The inverse of `describe`; the class must be of the given kind."""
+    module, _, name = str(description["class"]).partition(":")
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError):
+        raise ValueError(
+            f"the file needs the class {name} of the module {module}, which cannot be imported here."
+        ) from None
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise ValueError(f"the file names {module}:{name} as its {kind.__name__.lower()}, which it is not.")
+    assert issubclass(found, Settings)
+    try:
+        return found.from_settings(dict(description["settings"]))
+    except TypeError as error:  # a setting that this version does not know
+        raise ValueError(f"the file was written by another version: {error}.") from None
+
+
+def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    """Write a header and arrays, all or nothing."""
+    target = os.path.abspath(os.fspath(path))
+    name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
+    file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
+    try:
+        with file:
+            _put(file, header, arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, target)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of a file that holds a ``kind`` ("state" or "track"); ValueError where it does not."""
+    with open(path, "rb") as handle:
+        return _take(handle, os.fspath(path), kind)
+
+
+def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    text = json.dumps({"format": FORMAT, **header}, default=_encode)
+    np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
+
+
+def _take(file: Any, name: str, kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
+    except Exception as error:  # damage has many faces: zipfile, NumPy and JSON raise a dozen kinds
+        raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
+    if header.get("format", 0) > FORMAT:
+        raise ValueError(
+            f"{name} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
+        )
+    if header.get("kind") != kind:
+        raise ValueError(f"{name} holds a {header.get('kind')}, not a {kind}.")
+    return header, arrays
+
+
+class Kept(ABC):
+    """A stream that is saved, or sent as bytes, and goes on as if it had never stopped."""
+
+    _kind: ClassVar[str]
+
+    @abstractmethod
+    def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """Header and arrays."""
+
+    @classmethod
+    @abstractmethod
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        """The inverse of `_written`; ``source`` is for the message of an error."""
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write model, settings and state to one file, without pickle; complete or not at all."""
+        write(path, *self._written())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Continue from a file as if never stopped."""
+        return cls._read(os.fspath(path), *read(path, cls._kind))
+
+    def to_bytes(self) -> bytes:
+        """What `save` writes, for a queue or a database."""
+        file = BytesIO()
+        _put(file, *self._written())
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """The inverse of `to_bytes`."""
+        return cls._read("what was given", *_take(BytesIO(data), "what was given", cls._kind))
+
+
+def _encode(value: Any) -> Any:
+    """What JSON does not know: times and intervals."""
+    if isinstance(value, datetime):
+        return {"datetime": value.isoformat()}
+    if isinstance(value, timedelta):
+        return {"seconds": value.total_seconds()}
+    if isinstance(value, np.datetime64 | np.timedelta64):
+        return {"numpy": [value.dtype.str, int(value.astype(np.int64))]}
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"cannot write {value!r}, a {type(value).__name__}, as plain data")
+
+
+def _decode(value: dict[str, Any]) -> Any:
+    if value.keys() == {"datetime"}:
+        return datetime.fromisoformat(value["datetime"])
+    if value.keys() == {"seconds"}:
+        return timedelta(seconds=value["seconds"])
+    if value.keys() == {"numpy"}:
+        kind, count = value["numpy"]
+        return np.array([count], dtype=np.int64).view(kind)[0]
+    return value
+
+
+def restore(
+    source: str | PathLike[str], tracker: Tracker, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
+) -> None:
+    """Write stored arrays into the fields of a record; ValueError where one is missing or of another shape."""
+    for name, field in into.items():
+        stored = arrays.get(prefix + name)
+        if stored is None or stored.shape != field.shape:
+            raise ValueError(
+                f"{os.fspath(source)} does not fit {type(tracker).__name__} in this version: field {name!r}."
+            )
+        field[...] = stored
+
+
+def fields(tile: Array) -> list[str]:
+    """Names of the fields that hold state."""
+    return [name for name in tile.dtype.names or () if name != "pad"]

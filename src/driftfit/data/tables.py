@@ -1,0 +1,127 @@
+"""Tables: columns of data frames and files as records for the lanes.
+
+Anything that narwhals reads is a table: pandas, polars, pyarrow, and lazy frames; so are files (`driftfit.data.files`).
+
+Rows belong to units (``by``), are put in order of time within each unit, and of rows at the same time the first
+stands. Rows without a unit or without a time never become samples; they are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from driftfit.data.clock import Clock
+from driftfit.data.columns import Columns, Wanted
+from driftfit.data.files import read
+from driftfit.data.record import Labels, Reading, Records, drift_of
+from driftfit.data.signals import noise_of
+from driftfit.engine.drivers import known_factors
+from driftfit.engine.kernel import Array
+
+
+def read_records(
+    data: Any, y: str, u: str | Sequence[str] | None, by: str | Sequence[str] | None, reading: Reading
+) -> tuple[Records, dict[Hashable, str]]:
+    """Columns of a table as records, and the reasons of units and files that gave none.
+
+    Raises
+    ------
+    ValueError
+        A column that is not there (with near matches), a cell that is not a number (with row and value), a file that
+        cannot be read, a table without a usable row.
+    """
+    inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
+    axis = None if time is None else _name("time", time)
+    each = () if isinstance(drift, str) or np.ndim(drift) == 0 else _names("drift", drift)
+    factors = [*(name for name in (weights, drift) if isinstance(name, str)), *each]
+    wanted = Wanted(tuple(dict.fromkeys([_name("y", y), *inputs, *factors])), axis, _names("by", by))
+    columns, failed = read(data, wanted)
+    keys, code = _codes(columns)
+    dropped: dict[Hashable, dict[str, int]] = {}
+    order, times = _order(columns.time, code, keys, dropped)
+    length = np.bincount(code[order], minlength=len(keys))
+    failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
+    there = np.flatnonzero(length)
+    if not there.size:
+        raise ValueError(f"there is nothing to track: the {columns.rows} rows have no unit or no time.")
+    first = (np.cumsum(length) - length)[there]
+    values = {name: column[order] for name, column in columns.numbers.items()}
+    clock = Clock.of(reading.dt, columns.zone)
+    known = known_factors(
+        1.0 if times is None else _gaps(times, first, clock),
+        _factor(weights, values, noise_of),
+        _factor(1.0 if each else drift, values, drift_of),
+    )
+    drifts = np.stack([_factor(name, values, drift_of) for name in each], axis=1) if each else None
+    signals = np.stack([values[name] for name in inputs], axis=1) if inputs else np.zeros((len(order), 0))
+    labels = Labels(y, inputs, axis, dict(reading.units or {}), columns.zone, {}, wanted.by, dt=clock.plain)
+    named = tuple(keys[k] for k in there)
+    return Records(named, first, length[there], values[y], signals, known, times, labels, dropped, drifts), failed
+
+
+def _name(argument: str, value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"with data=, {argument} is the name of a column; got a {type(value).__name__}.")
+    return value
+
+
+def _names(argument: str, value: Any) -> tuple[str, ...]:
+    given = () if value is None else (value,) if isinstance(value, str) else tuple(value)
+    return tuple(_name(argument, name) for name in given)
+
+
+def _codes(columns: Columns) -> tuple[list[Hashable], Array]:
+    """(keys in order of appearance, the number of each row's key, -1 without one)."""
+    if not columns.by:
+        return [0], np.zeros(columns.rows, dtype=np.int64)
+    index: dict[Hashable, int] = {}
+    rows: Iterator[Hashable] = iter(columns.by[0]) if len(columns.by) == 1 else _tuples(columns.by)
+    code = np.fromiter((-1 if key is None else index.setdefault(key, len(index)) for key in rows), np.int64)
+    return list(index), code
+
+
+def _tuples(by: Sequence[Sequence[Any]]) -> Iterator[Hashable]:
+    for row in zip(*by, strict=True):
+        yield None if None in row else row
+
+
+def _order(
+    time: Array | None, code: Array, keys: Sequence[Hashable], dropped: dict[Hashable, dict[str, int]]
+) -> tuple[Array, Array | None]:
+    """(the rows that become samples, unit by unit in order of time; their times); counts the others."""
+    _count(dropped, [None], np.zeros(int((code < 0).sum()), dtype=np.int64), "without a unit")
+    if time is None:
+        order = np.argsort(code, kind="stable")
+        return order[code[order] >= 0], None
+    timeless = np.isnat(time) if time.dtype.kind == "M" else ~np.isfinite(time)
+    _count(dropped, keys, code[timeless & (code >= 0)], "without a time")
+    order = np.lexsort((time, code))
+    order = order[(code[order] >= 0) & ~timeless[order]]
+    repeated = np.zeros(len(order), dtype=bool)
+    repeated[1:] = (np.diff(code[order]) == 0) & (time[order][1:] == time[order][:-1])
+    _count(dropped, keys, code[order[repeated]], "at a repeated time")
+    order = order[~repeated]
+    return order, time[order]
+
+
+def _count(dropped: dict[Hashable, dict[str, int]], keys: Sequence[Hashable], code: Array, reason: str) -> None:
+    for k, count in zip(*np.unique(code, return_counts=True), strict=True):
+        dropped.setdefault(keys[k], {})[reason] = int(count)
+
+
+def _gaps(time: Array, first: Array, clock: Clock) -> Array:
+    """Nominal intervals since the last sample of the same unit; 1 at its first."""
+    gaps = clock.steps(time)
+    gaps[first] = 1.0
+    return gaps
+
+
+def _factor(given: Any, values: Mapping[str, Array], convert: Any) -> Array:
+    """A known factor that is one number or the name of a column; a cell without a value is 1."""
+    if not isinstance(given, str):
+        return np.asarray(convert(given))
+    column = np.where(np.isfinite(values[given]), values[given], 1.0)
+    return np.asarray(convert(column, len(column)))

@@ -1,0 +1,1 @@
+"""The first command of the README, and its data."""

@@ -1,0 +1,61 @@
+"""Says that the compiler is at work, where a user waits for it: one line on stderr after two seconds, once a process.
+
+Only where somebody looks: on a terminal, or in a notebook. What goes to a file or a program stays as it is.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+PATIENCE = 2.0
+"""Seconds of compiling before it is said."""
+
+TEXT = "driftfit: compiling once for this computer ..."
+TEXT_IN_MEMORY = "driftfit: compiling; no folder can be written to keep the code ..."
+
+_lock = threading.RLock()
+_spent = 0.0
+_depth = 0
+_said = False
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Around what compiles; of nested ones the outermost counts."""
+    global _depth, _spent
+    with _lock:
+        _depth += 1
+        timer = None
+        if _depth == 1 and not _said and watched():
+            timer = threading.Timer(max(PATIENCE - _spent, 0.0), say)
+            timer.daemon = True
+            timer.start()
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        if timer is not None:
+            timer.cancel()
+        with _lock:
+            _depth -= 1
+            if _depth == 0:
+                _spent += time.perf_counter() - start
+
+
+def watched() -> bool:
+    """Whether a user sees stderr."""
+    return "ipykernel" in sys.modules or bool(sys.stderr and sys.stderr.isatty())
+
+
+def say() -> None:
+    """Say it, once."""
+    global _said
+    from driftfit.engine.disk_cache import folder
+
+    if not _said:
+        _said = True
+        print(TEXT if folder() else TEXT_IN_MEMORY, file=sys.stderr, flush=True)

@@ -1,0 +1,203 @@
+"""Compiled code on disk: one file for each function and signature, found by a name made of all that it depends on.
+
+Numba keeps the signatures of a function in one index and numbers its files by what the index held when it was read: two
+processes that compile different layouts at the same moment may store both under one number, and a third runs the wrong
+code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the processor,
+and the versions of everything that makes code, so that two processes can only ever write the same content; a file
+appears at once or not at all, and one that was damaged is compiled anew.
+
+The folder is ``NUMBA_CACHE_DIR`` where that is set, else ``__pycache__`` of the package, else the user's cache folder.
+Code is found in any of them, as in an image that was filled by ``driftfit warm`` and can only be read, and written to
+the first that can be written. Where none can, it is compiled in memory, in every process anew, and a warning says so
+once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import platform
+import sys
+import tempfile
+import time
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite
+import numba
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+from numba.core.registry import cpu_target
+from numba.core.serialize import dumps
+
+PACKAGE = Path(__file__).parent
+ENDING = ".compiled"
+MAKERS = ("kernel.py", "linking.py", "machine_code.py", "simd.py")
+"""Files that decide what becomes of a function, beside its own code."""
+
+
+@cache
+def folders() -> tuple[Path, ...]:
+    """Where compiled code may be kept, the first choice first."""
+    given = numba.config.CACHE_DIR
+    if given:
+        return (Path(given) / "driftfit",)
+    own = PACKAGE / "__pycache__" / "compiled"
+    home = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return (own,) if home.startswith("~") else (own, Path(home) / "driftfit")  # ~: nobody knows whose home
+
+
+@cache
+def folder() -> Path | None:
+    """Where compiled code goes: the first folder that can be written, or None."""
+    for place in folders():
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=place).close()
+        except OSError:
+            continue
+        return place
+    return None
+
+
+@cache
+def makers() -> str:
+    """What decides how code is made: versions, processor, and the files that emit code by hand."""
+    build = hashlib.sha256()
+    for name in MAKERS:
+        build.update((PACKAGE / name).read_bytes())
+    versions = platform.python_version(), numba.__version__, llvmlite.__version__
+    return f"{versions}{sys.byteorder}{cpu_target.target_context.codegen().magic_tuple()}{build.hexdigest()}"
+
+
+def name_of(function: str, identity: str, signature: Any) -> str:
+    """The name of a file: the function's, and a digest of all that its code depends on."""
+    digest = hashlib.sha256("\n".join((identity, str(signature), makers())).encode()).hexdigest()
+    return f"{function}-{hashlib.sha256(makers().encode()).hexdigest()[:8]}-{digest[:40]}{ENDING}"
+
+
+def read(name: str) -> Any:
+    """What was kept under a name, in any of the folders; None where there is nothing, or nothing whole."""
+    for place in folders():
+        try:
+            data = (place / name).read_bytes()
+            if hashlib.sha256(data[32:]).digest() != data[:32]:
+                continue
+            found = pickle.loads(data[32:])
+        except (OSError, EOFError, pickle.UnpicklingError, ImportError, AttributeError):
+            continue
+        _touch(place / name)
+        return found
+    return None
+
+
+def _touch(path: Path) -> None:
+    """Note that a file was used, for `prune`; once a day is enough."""
+    try:
+        if time.time() - path.stat().st_mtime > 86400.0:
+            os.utime(path)
+    except OSError:
+        pass
+
+
+def write(name: str, content: Any) -> None:
+    """Keep something under a name, if there is a place for it."""
+    place = folder()
+    if place is None:
+        _say_nothing_is_kept()
+        return
+    data = dumps(content)
+    try:
+        with tempfile.NamedTemporaryFile(dir=place, prefix=f"{name}.", suffix=".tmp", delete=False) as file:
+            file.write(hashlib.sha256(data).digest() + data)
+        try:
+            os.chmod(file.name, 0o644)
+            os.replace(file.name, place / name)
+        except OSError:
+            os.unlink(file.name)
+            raise
+    except OSError:  # a full disk, or a folder that was taken away
+        _say_nothing_is_kept()
+
+
+@cache
+def _say_nothing_is_kept() -> None:
+    tried = ", ".join(map(str, folders()))
+    warnings.warn(
+        f"driftfit: compiled code cannot be kept, because none of these folders can be written: {tried}. It is "
+        "compiled anew in every process. Set NUMBA_CACHE_DIR to a folder that can be written.",
+        stacklevel=2,
+    )
+
+
+class Kept(_Cache):
+    """The cache that a dispatcher of Numba asks, for functions that are kept by themselves."""
+
+    def __init__(self, function: str, identity: str) -> None:
+        self._function, self._identity = function, identity
+
+    @property
+    def cache_path(self) -> str:
+        return str(folder())
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        target_context.refresh()
+        found = read(name_of(self._function, self._identity, sig))
+        return None if found is None else CompileResult._rebuild(target_context, *found)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if not data.lifted and not data.library.has_dynamic_globals:
+            write(name_of(self._function, self._identity, sig), data._reduce())
+
+    def enable(self) -> None:
+        """Always."""
+
+    def disable(self) -> None:
+        """Never."""
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+
+class Contents(NamedTuple):
+    """What is kept on disk."""
+
+    place: Path | None
+    files: int
+    size: int
+    """Bytes."""
+    usable: int
+    """Files made by the versions and for the processor of this process."""
+
+
+def contents() -> Contents:
+    """What is kept on disk."""
+    files = [(path, path.stat()) for path in _files()]
+    usable = sum(_mine(path) for path, _ in files)
+    return Contents(_place(), len(files), sum(stat.st_size for _, stat in files), usable)
+
+
+def prune(days: float) -> int:
+    """Remove what other versions made, and what was not used for so many days; returns how many files."""
+    oldest = time.time() - 86400.0 * days
+    gone = [path for path in _files() if not _mine(path) or path.stat().st_mtime <= oldest]
+    for path in gone:
+        path.unlink(missing_ok=True)
+    return len(gone)
+
+
+def _place() -> Path | None:
+    """The folder that is written, or that can be read at least."""
+    return folder() or next((place for place in folders() if place.is_dir()), None)
+
+
+def _files() -> list[Path]:
+    place = _place()
+    return [] if place is None else sorted(path for path in place.iterdir() if path.name.endswith((ENDING, ".tmp")))
+
+
+def _mine(path: Path) -> bool:
+    return f"-{hashlib.sha256(makers().encode()).hexdigest()[:8]}-" in path.name and path.name.endswith(ENDING)

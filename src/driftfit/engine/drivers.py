@@ -1,0 +1,358 @@
+"""Drivers: the one loop that runs a model's and a tracker's steps, on records, in fleets and live.
+
+For every sample a driver does, in this order,
+
+    read      y, u, dt into the record
+    regress   signals -> phi (model)            clean   what is missing becomes 0 (only here is NaN known)
+    predict   what time does (tracker)          correct what the data say (tracker)
+    report    s.var, the variance of theta      push    the model's lags
+    write     theta, var, y_hat, e, s, ok out of the record
+
+Fields that every record has: ``phi`` (n,), the signals ``y``, ``u`` (m,), ``dt`` (nominal intervals since the last
+sample; 0 means that nothing may happen), ``noise`` and ``drift`` (known factors of the noise variance and of the drift
+at this sample, 1 unless given), ``valid`` (phi is complete), ``seen`` (y is there), ``ok`` (both), the results
+``y_hat``, ``e``, ``s``, ``var`` (n,), and ``scale``, the estimate of the noise variance where P is relative to it (1
+elsewhere). Models and trackers add their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numba import types
+
+from driftfit.engine.kernel import Array, Driver, State, Step, kernel, routine
+
+WIDTH = 32
+"""Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
+
+LARGEST = 1e38
+"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+
+SMALLEST = 1e-38
+"""Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
+regressor, a covariance that earlier regressors left, and an innovation overflows."""
+
+
+INPUTS = types.Array(types.float64, 1, "A", readonly=True)
+"""The compiler's type of the inputs of one sample."""
+
+
+def no_preparation(L: int) -> None:
+    """Steps that call nothing by symbol need none."""
+
+
+class ModelSteps(NamedTuple):
+    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
+
+    ``ready(L)`` brings what they call by symbol within reach, before a tile of L lanes is driven for the first time.
+    """
+
+    regress: Step
+    push: Step
+    ready: Callable[[int], None] = no_preparation
+
+
+@kernel
+def clean(s: State, l: int) -> None:
+    """Decide what can be used, and make everything that trackers read finite.
+
+    Entries of phi and y are cleaned by themselves: zeroing all of phi when only y is missing would make an ARX model's
+    own prediction zero and so bias its lags.
+    """
+    valid = 1.0
+    for i in range(s.phi.shape[0]):
+        x = s.phi[i, l]
+        finite = abs(x) < LARGEST
+        s.phi[i, l] = x if finite & (abs(x) > SMALLEST) else 0.0
+        valid = valid if finite else 0.0
+    y, noise = s.y[l], s.noise[l]
+    finite = abs(y) < LARGEST
+    s.y[l] = y if finite & (abs(y) > SMALLEST) else 0.0
+    s.valid[l] = valid
+    s.seen[l] = 1.0 if finite else 0.0
+    s.ok[l] = valid if finite & (noise < np.inf) else 0.0
+
+
+@kernel
+def diagonal(s: State, l: int) -> None:
+    """Report the diagonal of P, times the estimated noise variance where the tracker carries one."""
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
+
+
+@kernel
+def unknown(s: State, l: int) -> None:
+    """Report that the tracker carries no covariance."""
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = np.nan
+
+
+@kernel
+def nothing_more(o: State, s: State, l: int) -> None:
+    """Store nothing beside the common fields."""
+
+
+@kernel
+def nothing_told(s: State, known: Array, t: int, l: int) -> None:
+    """Take nothing from further columns of what is known."""
+
+
+class TrackerSteps(NamedTuple):
+    """What a tracker compiles.
+
+    ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
+    happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
+    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
+    that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
+    symbol. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
+    ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval,
+    noise and drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)`` copies what
+    the tracker's ``noted`` names when a run is replayed for a smoother.
+    """
+
+    predict: Step
+    correct: Step
+    report: Step = diagonal
+    begin: Step | None = None
+    store: Any = nothing_more
+    told: Any = nothing_told
+    note: Any = nothing_more
+    machines: tuple[Any, ...] = ()
+
+
+def _common(n: int, m: int) -> dict[str, Any]:
+    """Fields that every record has, with their values before the first sample."""
+    zero = 0.0
+    return {
+        "phi": np.zeros(n), "y": zero, "u": np.zeros(max(m, 1)), "dt": 1.0, "noise": 1.0, "drift": 1.0, "interval": 1.0,
+        "valid": zero, "seen": zero, "ok": zero, "y_hat": zero, "e": zero, "s": zero, "var": np.zeros(n), "scale": 1.0,
+    }  # fmt: skip
+
+
+def known_factors(dt: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Array:
+    """What is known beside the signals, (T, 3) or (1, 3): interval, factors of the noise variance and of the drift."""
+    return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, float)) for v in (dt, noise, drift))), axis=1)
+
+
+def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:
+    """A tile of ``len(trackers)`` lanes: an array of one record, its fields set to the given starts.
+
+    ``model`` and each entry of ``trackers`` map field names to start values without the lane axis; the shapes of the
+    values are the shapes of the fields. All trackers must have the same fields.
+    """
+    L = len(trackers)
+    # Common fields come last, so that no record is the beginning of another: it would be taken for its subtype.
+    starts = [{**start, **model, **_common(n, m), **model, **start} for start in trackers]
+    fields: list[Any] = []
+    for name, value in starts[0].items():
+        kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
+        fields.append((name, kind, (*np.shape(value), L)))
+    size = np.dtype(fields).itemsize
+    # whole cache lines, so that no vector load of a lane block straddles two
+    fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
+    tile = _aligned(np.dtype(fields, align=True), 1)
+    for l, start in enumerate(starts):
+        for name, value in start.items():
+            tile[name][0, ..., l] = value
+    return tile
+
+
+def repeat_tile(tile: Array, count: int) -> Array:
+    """``count`` copies of a tile, aligned like it: ``tiles[k : k + 1]`` is a tile."""
+    tiles = _aligned(tile.dtype, count)
+    tiles[...] = tile
+    return tiles
+
+
+def _aligned(dtype: np.dtype[Any], count: int) -> Array:
+    """``count`` records, all zero, the first at the start of a cache line."""
+    raw = np.zeros(dtype.itemsize * count + 64, np.uint8)
+    offset = -raw.ctypes.data % 64
+    records: Array = raw[offset : offset + dtype.itemsize * count].view(dtype)
+    return records
+
+
+def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std") -> np.dtype[Any]:
+    """The record that a driver writes for one sample of a tile.
+
+    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok. What is
+    not common comes first: Numba takes a record that continues another one for the same type, with a warning.
+    """
+    n, L = tile["theta"].shape[1:]
+    names = (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    fields: list[Any] = [("P", np.float64, (n, n, L))] if keep == "cov" else []
+    fields += [(name, tile[name].dtype, tile[name].shape[1:]) for name in names]
+    return np.dtype(fields, align=True)
+
+
+@kernel
+def covariance(o: State, s: State, l: int) -> None:
+    """Store both triangles of the covariance."""
+    for i in range(s.theta.shape[0]):
+        o.P[i, i, l] = s.var[i, l]
+        for j in range(i):
+            o.P[i, j, l] = s.P[i, j, l] * s.scale[l]
+            o.P[j, i, l] = s.P[i, j, l] * s.scale[l]
+
+
+class Drivers(NamedTuple):
+    """The compiled ways to drive one (model, tracker) pair; see `drivers`."""
+
+    run: Any
+    update: Any
+    update_one: Any
+
+
+def _advance(tracker: TrackerSteps) -> Any:
+    """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
+    predict, correct, report, begin, *_ = tracker
+
+    @kernel
+    def advance(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            predict(s, l)
+            correct(s, l)
+        for l in range(s.theta.shape[1]):
+            report(s, l)
+
+    if begin is None:
+        return advance
+
+    @routine
+    def start(s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            if s.root[l] > 0:
+                begin(s, l)
+            else:
+                predict(s, l)
+                correct(s, l)
+                report(s, l)
+
+    @kernel
+    def advance_or_start(s: State) -> None:
+        some = 0
+        for l in range(s.theta.shape[1]):
+            some = max(some, s.root[l])
+        if some > 0:
+            start(s)
+        else:
+            advance(s)
+
+    return advance_or_start
+
+
+@lru_cache(maxsize=256)
+def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Drivers:
+    """Build the drivers of a (model, tracker) pair.
+
+    ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
+    every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
+    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u; both take what is known from
+    the fields ``interval``, ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
+    """
+    regress, push, ready = model
+    ready(1)
+    for machine in tracker.machines:
+        machine.load()
+    told = tracker.told
+    store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
+    advance = _advance(tracker)
+
+    @kernel
+    def sample(s: State) -> None:
+        L = s.theta.shape[1]
+        for l in range(L):
+            regress(s, l)
+            clean(s, l)
+        advance(s)
+        for l in range(L):
+            push(s, l)
+        for l in range(L):
+            y_hat, v, e, valid = s.y_hat[l], s.s[l], s.e[l], s.valid[l] > 0.0
+            s.y_hat[l] = y_hat if valid else np.nan
+            s.s[l] = v if valid else np.nan
+            s.e[l] = e if s.ok[l] > 0.0 else np.nan
+
+    @Driver
+    def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        s = tile[0]
+        n, L = s.theta.shape
+        given = u.shape[1] > 0
+        changing = 1 if known.shape[0] > 1 else 0
+        for t in range(y.shape[0]):
+            for l in range(L):
+                s.y[l] = y[t, l]
+            for l in range(L):
+                s.dt[l] = known[t * changing, 0, l]
+                s.noise[l] = known[t * changing, 1, l]
+                s.drift[l] = known[t * changing, 2, l]
+            if known.shape[1] > 3:
+                for l in range(L):
+                    told(s, known, t, l)
+            if given:
+                for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
+                    for l in range(L):
+                        s.u[j, l] = u[t, j, l]
+            sample(s)
+            o = out[t]
+            for i in range(n):
+                for l in range(L):
+                    o.theta[i, l] = s.theta[i, l]
+            for i in range(n):
+                for l in range(L):
+                    o.var[i, l] = s.var[i, l]
+            for l in range(L):
+                o.y_hat[l] = s.y_hat[l]
+                o.e[l] = s.e[l]
+                o.s[l] = s.s[l]
+                o.ok[l] = s.ok[l]
+            for l in range(L):
+                store(o, s, l)
+                keep_more(o, s, l)
+
+    @Driver
+    def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
+        s = tile[0]
+        s.y[0] = y
+        s.dt[0] = s.interval[0]
+        for j in range(u.shape[0]):
+            s.u[j, 0] = u[j]
+        sample(s)
+        return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
+
+    @Driver
+    def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
+        s = tile[0]
+        s.y[0] = y
+        s.dt[0] = s.interval[0]
+        s.u[0, 0] = u
+        sample(s)
+        return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
+
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        inputs = {"y": y, "u": u, "known": known}
+        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
+        _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
+        run(tile, *inputs.values(), out)
+
+    return Drivers(checked, update, update_one)
+
+
+def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:
+    m, L = tile["u"].shape[1:]
+    wanted = (T, L), (T, m if u.shape[1:2] != (0,) else 0, L), (1 if len(known) == 1 else T, max(3, known.shape[1]), L)
+    given = y.shape, u.shape, known.shape
+    if given != wanted:
+        raise ValueError(f"run: y, u and known have shapes {given}, but this tile and {T} samples need {wanted}.")
+
+
+def tile_type(tile: Array) -> types.Type:
+    """The compiler's type of a tile."""
+    return numba.typeof(tile)

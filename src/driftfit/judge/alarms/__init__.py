@@ -1,0 +1,1 @@
+"""Alarms at a set rate of false alarms."""

@@ -1,0 +1,279 @@
+"""Detect: alarms from a run, with a rate of false alarms that is set and not tuned.
+
+    "band"          a parameter has left its reference band:      max((theta - high) / std, (low - theta) / std) > z
+    "innovation"    the last W innovations are too large, or too one-sided, for what the run expects
+    "probability"   the probability of a change, from a tracker that carries hypotheses (`Bank`), is above a limit
+
+``every`` is the number of samples in which one false alarm may begin (an alarm that stays on counts once).
+
+* band: z such that a Gaussian sequence begins to exceed it once in ``every`` times c samples, for c parameters watched.
+  Successive errors of an estimate have the correlation 1 / (1 + d), d = mean (theta_t - theta_(t-1))^2 / var_t, since
+  a step of the filter has the variance that it takes away. The rate holds for a parameter that stands at the very edge
+  of its band, where the run's std is right; inside the band alarms are rarer.
+* innovation: g = e / s; limits of the windowed sums of g^2 and of g from their exact rate of onsets
+  (`driftfit.judge.alarms.onsets`), half of the rate for each. With ``reference`` the g are normal scores of the
+  innovations among those of the reference, so that outliers and tails that were normal there are normal later.
+* probability: the limit is found by simulation. Records with constant parameters are made from the run (its inputs,
+  its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
+  rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
+
+What was found stands in ``said.rule`` (`driftfit.judge.alarms.rule.AlarmRule`), a small frozen object: `Live.detect`
+watches a stream by it, and ``other.detect(said.rule)`` another record.
+
+Which kind when: docs/alarms.md. A tracker that finds its own drift follows a fault, and takes it for drift: its
+innovations are soon normal again, so that "innovation" rings, if at all, in the first samples of the fault.
+
+``p`` is the chance that a record without a fault gets as extreme as this one: from the same rates (the least of the
+columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
+
+Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many
+runs as 50 every / T for a calibration.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import numbers, one_of, whole
+from driftfit.judge.alarms.calibration import limit_of, null_records
+from driftfit.judge.alarms.onsets import held, onsets
+from driftfit.judge.alarms.reference import burn, in_samples
+from driftfit.judge.alarms.rule import KINDS, AlarmRule, check_fits, value_text
+from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of
+from driftfit.judge.verdict import p_text
+from driftfit.run.result import Track
+from driftfit.show.summary import Printed, facts, table_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Score(NamedTuple):
+    """Alarms against labels of what was wrong."""
+
+    events: int
+    """Stretches of samples with a true label."""
+    found: int
+    """Stretches in which an alarm began."""
+    delay: float
+    """Median samples from the beginning of a found stretch to its first alarm."""
+    false: int
+    """Alarms that began outside all stretches, also those that were still on when the next one began."""
+    normal: int
+    """Samples outside all stretches that were judged."""
+
+
+@dataclass(frozen=True)
+class Alarms(Printed):
+    """What `Track.detect` returns; printing it shows a table.
+
+    Attributes
+    ----------
+    rule : AlarmRule
+        What is compared with which limits; `Live.detect` takes it, and `Track.detect` of other runs.
+    active : (T,) bool
+        An alarm is on.
+    onsets : (k,) int
+        Samples at which one begins.
+    statistic : (T, c)
+        What is compared; NaN where there is nothing to judge.
+    start : int
+        First sample that is judged; what comes before is the start of the run, or the reference.
+    p : number
+        Chance of an extreme like the largest here without a fault; NaN where nothing was judged.
+    """
+
+    rule: AlarmRule
+    active: Array
+    onsets: Array
+    statistic: Array
+    start: int
+    p: float
+    run: Track = field(repr=False, compare=False)
+
+    @property
+    def kind(self) -> str:
+        """Kind of alarm."""
+        return self.rule.kind
+
+    @property
+    def every(self) -> float:
+        """Samples in which one false alarm may begin."""
+        return self.rule.every
+
+    @property
+    def limits(self) -> Array:
+        """What the columns are compared with, (c,)."""
+        return np.array(self.rule.limits)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the columns are: parameters, "power" and "mean" of the innovations, or "probability"."""
+        return self.rule.names
+
+    def cause(self, t: int) -> str:
+        """The column that is furthest beyond its limit at sample t."""
+        return self.names[self.rule.cause(self.statistic[t])]
+
+    def score(self, labels: Any) -> Score:
+        """Compare with labels (T,), true where something is wrong; ValueError for another length."""
+        wrong = np.asarray(labels).astype(bool)
+        if wrong.shape != self.active.shape:
+            raise ValueError(f"score: labels have shape {wrong.shape}, but the record has {len(self.active)} samples.")
+        first = onsets(wrong)
+        last = np.array([t + int(np.argmin(np.append(wrong[t:], False))) for t in first], int)
+        delays = []
+        for a, b in zip(first, last, strict=True):
+            begun = self.onsets[(self.onsets >= a) & (self.onsets < b)]
+            delays += [int(begun[0] - a)] if len(begun) else []
+        delay = float(np.median(delays)) if delays else float("nan")
+        false, normal = int(np.sum(~wrong[self.onsets])), int(np.sum(~wrong[self.start :]))
+        return Score(len(first), len(delays), delay, false, normal)
+
+    def span(self, t: int) -> tuple[str, str]:
+        """First and last time of the alarm that began at t."""
+        return self.run.time_text(t), self.run.time_text(self._end(t) - 1)
+
+    def _end(self, t: int) -> int:
+        """The sample after the alarm that began at t."""
+        return t + int(np.argmin(np.append(self.active[t:], False)))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        judged = len(self.active) - self.start
+        expected = judged / self.every
+        chance = "that a record without a fault gets as extreme as this one"
+        limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))
+        yield facts(
+            ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
+            ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
+            ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
+            ("Alarms", f"{len(self.onsets)}"),
+            *([] if np.isnan(self.p) else [("Chance", f"{p_text(self.p)} {chance}")]),
+        )
+        table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
+        for t in self.onsets[:20]:
+            j = self.names.index(self.cause(int(t)))
+            numbers = (value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j))
+            table.add_row(*self.span(int(t)), Text(self.names[j]), *numbers)
+        yield table
+        if len(self.onsets) > 20:
+            yield Text(f" and {len(self.onsets) - 20} more", "dim")
+
+    def plot(self, labels: Any = None) -> Figure:
+        """Statistics over their limits, alarms marked; labels (T,) are shaded."""
+        from driftfit.judge.plots import plot_alarms
+
+        return plot_alarms(self, labels)
+
+
+def detect(
+    run: Track,
+    kind: str | AlarmRule = "band",
+    *,
+    every: float = 10_000.0,
+    reference: Reference = None,
+    window: int = 50,
+    hold: int = 0,
+    calibrate: bool = False,
+    at: int = -1,
+    seed: int = 0,
+    start: int | None = None,
+) -> Alarms:
+    """Find alarms in a run.
+
+    Parameters
+    ----------
+    run : Track
+        What is watched.
+    kind : "band", "innovation" or "probability", or an AlarmRule
+        See the module. A rule, ``said.rule`` of another run, brings limits and settings with it.
+    every : number
+        Samples in which one false alarm may begin.
+    reference : mapping from names to (low, high), a number of samples, or (from, to)
+        For "band": where the parameters belong; or a stretch of the record, whose range after the start of the run is
+        the band. For "innovation": a stretch that is normal. A stretch is so many first samples, or from one time up to
+        but not including another: dates where the record has them, numbers as in ``run.time`` (without times:
+        samples). It is not judged, nor is what comes before it.
+    window : int
+        Samples in the sums of "innovation", at least 4.
+    hold : int
+        An alarm stays on for so many samples after what caused it.
+    calibrate : bool
+        Find the limits by simulation from the run instead of from theory ("probability" always does).
+    at : int
+        The sample whose parameters are true in that simulation.
+    seed : int
+        Of that simulation.
+    start : int or None
+        With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
+
+    Warns
+    -----
+    UserWarning
+        For "innovation" of a tracker that finds its own drift (`AdaptiveKalman`), which follows a fault away.
+
+    Raises
+    ------
+    ValueError
+        For a kind that is unknown, a reference that does not fit, or a tracker that has not what the kind needs.
+    """
+    if not isinstance(run, Track):
+        raise TypeError(f"detect: the run comes first, as in detect(run, 'band'); got {run!r}.")
+    if isinstance(kind, AlarmRule):
+        return judged(run, kind, start)
+    one_of("detect", "kind", kind, KINDS)
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
+    reference = in_samples(run, reference)
+    rule, first = rule_of(run, asked, reference)
+    if kind == "innovation" and run.tracker.adapts:
+        _warn_of_following(run)
+    if not calibrate and kind != "probability":
+        return judged(run, rule, first)
+    made = []
+    for null in null_records(run, every, at, seed):
+        own, begin = rule_of(null, asked, reference)
+        made.append((statistic_of(null, own, begin), begin))
+    limits = limit_of(made, every)
+    said = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
+    extreme = _highest(said.statistic, first)
+    as_far = [np.max(_highest(*one) / limits) >= np.max(extreme / limits) for one in made]
+    p = (1.0 + sum(as_far)) / (1.0 + len(made)) if np.isfinite(extreme).any() else float("nan")
+    return replace(said, p=p)
+
+
+def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
+    """Alarms of a run by a rule; ``start`` as for `detect`."""
+    check_fits(rule, run.tracker, run.names)
+    if start is None:
+        start = burn(run) if run._start is None else 0
+    statistic = statistic_of(run, rule, start)
+    count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
+    p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")
+    active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
+    return Alarms(rule, active, onsets(active), statistic, start, p, run)
+
+
+def _highest(statistic: Array, start: int) -> Array:
+    """The largest value of each column, (c,), over the samples that are judged; -inf where there is none."""
+    part = statistic[start:]
+    return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))
+
+
+def _warn_of_following(run: Track) -> None:
+    """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
+    warnings.warn(
+        f"detect: {type(run.tracker).__name__} finds its own drift and noise, so it follows a fault away: its "
+        "innovations are soon normal again, and a slow fault hardly shows in them. Watch where the parameters are, "
+        'detect("band", reference=...), or track with numbers that are fitted to the reference and then stay, '
+        "tune(model, Kalman(), ...).tracker.",
+        UserWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,178 @@
+"""Alarms of many runs at once: a fleet, or the outputs of one record; see `driftfit.judge.alarms.detect` for those of
+one.
+
+N series side by side, each with one false alarm in ``every`` samples, ring N times in that time. Here ``every`` is of
+all of them together: each gets one in N every samples. Rates add up whatever the series have in common, so that this
+needs no independence.
+
+An alarm says when. Which series had something at all is a question of its own, answered once the records are over:
+every series has the chance p that a record without a fault gets as extreme as it did (`Alarms.p`), and
+
+    q_(k) = min over j >= k of  p_(j) N / j         (p in ascending order)
+
+is below ``level`` for the series in ``faulty``, of which at most that share is without a fault on average, for series
+that are independent or positively dependent. A series can have an alarm and not be among them, and the other way
+round.
+
+Source: Benjamini and Hochberg (1995). Cost: that of `detect` for each run; limits by simulation take as many records as
+N every asks for, N times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.engine.settings import numbers
+from driftfit.judge.alarms.detect import Alarms, detect
+from driftfit.judge.many import SHOWN, discoveries
+from driftfit.judge.verdict import p_text
+from driftfit.show.summary import Printed, facts, key_text, table_of
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+
+@dataclass(frozen=True)
+class Watch:
+    """One series among many: its alarms, its q-value, and whether it is said to have had something."""
+
+    key: Hashable
+    alarms: Alarms
+    q: float
+    faulty: bool
+
+    @property
+    def first(self) -> str:
+        """The beginning of its first alarm, and the cause; empty without one."""
+        if not len(self.alarms.onsets):
+            return ""
+        t = int(self.alarms.onsets[0])
+        return f"{self.alarms.run.time_text(t)}, {self.alarms.cause(t)}"
+
+
+@dataclass(frozen=True)
+class ManyAlarms(Printed):
+    """What `detect` of a fleet returns; printing it shows the twenty most extreme series.
+
+    Attributes
+    ----------
+    rows : tuple of Watch
+        The most extreme first; those with nothing judged last.
+    every : float
+        Samples in which one false alarm may begin, in all series together.
+    level : float
+        False discovery rate.
+    failed : dict
+        Why some could not be judged.
+    """
+
+    rows: tuple[Watch, ...]
+    kind: str
+    every: float
+    level: float
+    failed: dict[Hashable, str] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, key: Hashable) -> Alarms:
+        for row in self.rows:
+            if row.key == key:
+                return row.alarms
+        raise KeyError(f"there are no alarms of {key!r}{': ' + self.failed[key] if key in self.failed else '.'}")
+
+    @property
+    def faulty(self) -> tuple[Hashable, ...]:
+        """Keys of the series that had something."""
+        return tuple(row.key for row in self.rows if row.faulty)
+
+    @property
+    def alarmed(self) -> tuple[Hashable, ...]:
+        """Keys of the series with an alarm."""
+        return tuple(row.key for row in self.rows if len(row.alarms.onsets))
+
+    @property
+    def expected(self) -> float:
+        """False alarms expected in all series together, were none faulty."""
+        return float(sum((len(row.alarms.active) - row.alarms.start) / row.alarms.every for row in self.rows))
+
+    @property
+    def table(self) -> Any:
+        """One row an alarm, as a polars table."""
+        import polars
+
+        columns: dict[str, list[Any]] = {name: [] for name in ("key", "from", "to", "cause", "p", "q", "faulty")}
+        for row in self.rows:
+            said = row.alarms
+            for t in map(int, said.onsets):
+                cells = (key_text(row.key), *said.span(t), said.cause(t), said.p, row.q, row.faulty)
+                for column, cell in zip(columns.values(), cells, strict=True):
+                    column.append(cell)
+        return polars.DataFrame(columns, strict=False)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        begun = sum(len(row.alarms.onsets) for row in self.rows)
+        yield facts(
+            ("Alarm", f"{self.kind}, one false alarm of all {len(self.rows)} series in {self.every:g} samples"),
+            ("Alarms", f"{begun} in {len(self.alarmed)} series; {self.expected:.2g} false alarms expected"),
+            (
+                "Series",
+                f"{len(self.faulty)} had something; of those at most {100.0 * self.level:g} % had nothing, on average",
+            ),
+        )
+        table = table_of("The most extreme first", "", "alarms", "the first", "p", "q", "", names=1)
+        for row in self.rows[:SHOWN]:
+            numbers = (p_text(row.alarms.p), p_text(row.q), "something" if row.faulty else "")
+            table.add_row(Text(key_text(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
+        yield table
+        if len(self.rows) > SHOWN:
+            yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
+        for key, reason in list(self.failed.items())[:SHOWN]:
+            yield Text(f" not judged, {key_text(key)}: {reason}")
+
+
+def alarms(
+    runs: Mapping[Hashable, Track], kind: str, *, every: float, level: float, reference: Any, **settings: Any
+) -> ManyAlarms:
+    """Watch runs by key; ``reference`` is one for all, or a mapping from every key to its own."""
+    from driftfit.run.fleet import cores
+
+    if not runs:
+        raise ValueError("detect: there is no run with a result to watch.")
+    level = numbers("detect", "level", level, ndim=0)
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"detect: level must lie between 0 and 1; got {level!r}.")
+    every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
+    own = isinstance(reference, Mapping) and any(key in reference for key in runs)
+    lacking = [key_text(key) for key in runs if own and key not in reference]
+    if lacking:
+        raise ValueError(
+            f"detect: reference has nothing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
+        )
+
+    def watch(key: Hashable) -> Alarms | ValueError:
+        known = reference[key] if own else reference
+        try:
+            return detect(runs[key], kind, every=every * len(runs), reference=known, **settings)
+        except ValueError as error:
+            return error
+
+    keys = list(runs)
+    said = [watch(key) for key in keys[:1]]  # one thread compiles
+    with ThreadPoolExecutor(cores()) as pool:
+        said += pool.map(watch, keys[1:])
+    good = {key: one for key, one in zip(keys, said, strict=True) if isinstance(one, Alarms)}
+    failed = {key: one for key, one in zip(keys, said, strict=True) if isinstance(one, ValueError)}
+    if not good:
+        raise next(iter(failed.values()))
+    q = discoveries(np.array([one.p for one in good.values()]))
+    rows = [Watch(key, one, float(a), bool(a < level)) for (key, one), a in zip(good.items(), q, strict=True)]
+    rows.sort(key=lambda row: (np.isnan(row.q), row.alarms.p))
+    return ManyAlarms(tuple(rows), kind, float(every), level, {key: str(error) for key, error in failed.items()})

@@ -1,0 +1,79 @@
+"""The stretch of a record that is normal: given as a number of first samples, or from one time to another."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from driftfit.engine.settings import whole
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+LEAST = 20
+"""Samples that a reference must have after the start of the run."""
+
+
+def burn(run: Track) -> int:
+    """Samples at the beginning of a run that judge nothing: an estimate that has just begun is no alarm."""
+    return max(50, 5 * run.model.n)
+
+
+def in_samples(run: Track, reference: Any) -> Any:
+    """A reference from one time to another as one in samples; any other as it is."""
+    if isinstance(reference, tuple | list) and len(reference) == 2:
+        return tuple(_place(run, one) for one in reference)
+    return reference
+
+
+def stretch(run: Track, reference: Any) -> tuple[int, int]:
+    """(first, end) of the samples that are normal, without the start of the run; ValueError where they are too few.
+
+    ``reference`` is a number of first samples, or (from, to) in samples, up to but not including the last.
+    """
+    if isinstance(reference, tuple) and len(reference) == 2:
+        first, end = reference
+    elif reference is None or isinstance(reference, tuple | list):
+        raise ValueError(
+            'detect: say where the parameters belong, reference={"b1": (0.9, 1.1)}, how many of the first samples are '
+            f"normal, reference=500, or from when to when, reference=(from, to); got {reference!r}."
+        )
+    else:
+        first, end = 0, whole("detect", "reference", reference, 1)
+    first = max(first, burn(run))
+    if not first + LEAST <= end <= len(run):
+        raise ValueError(
+            f"detect: the reference leaves too little: of its samples up to {end} those from {first} on count (the run "
+            f"has {len(run)}, and starts until {burn(run)}), and {LEAST} are needed."
+        )
+    return first, end
+
+
+def _place(run: Track, given: Any) -> int:
+    """The first sample that is not before a time, or a sample number."""
+    time = run.time
+    if time.dtype.kind != "M":
+        if isinstance(given, str | datetime | np.datetime64):
+            raise ValueError(f"detect: reference names the time {given!r}, but this run has no dates (time=).")
+        return int(np.searchsorted(time, float(given)))
+    if isinstance(given, int | np.integer):
+        return min(int(given), len(run))
+    return int(np.searchsorted(time, as_date(given, run.labels.zone)))
+
+
+def as_date(given: Any, zone: str | None) -> np.datetime64:
+    """A date as the time of a record: one without a time zone is in that of the table that the record came from."""
+    try:
+        date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
+    except ValueError:
+        raise ValueError(f"detect: {given!r} is no date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
+    if isinstance(date, np.datetime64):
+        if zone is None:
+            return date
+        date = date.astype("datetime64[us]").item()
+    if date.tzinfo is None and zone is not None:
+        date = date.replace(tzinfo=ZoneInfo(zone))
+    return np.datetime64(date if date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None))

@@ -1,0 +1,159 @@
+"""The rule of an alarm: what is compared with which limits, taken from a reference, for any run or stream after it.
+
+    band          z_ti = max(theta_ti - high_i, low_i - theta_ti) / std_ti
+    innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
+                  score among innovations that were normal
+    probability   the probability of a change in the tracker's window
+
+A record and a stream do the same operations in the same order, so that they agree bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import Settings, near
+from driftfit.trackers.base import Tracker
+
+KINDS = ("band", "innovation", "probability")
+
+CHANGE, REPORT = "window", "report"
+"""Where the probability of a change is: a field that a tracker stores, or in the report of a `Bank`."""
+
+
+@dataclass(frozen=True)
+class AlarmRule(Settings):
+    """What `Track.detect` found in its reference: `Alarms.rule`. Frozen, equal by value, saved as plain data.
+
+    Attributes
+    ----------
+    kind : "band", "innovation" or "probability"
+    every : number
+        Samples in which one false alarm may begin.
+    names, limits : (c,)
+        What is compared (parameters; "power" and "mean" of the innovations; "probability"), and with what.
+    hold : int
+        An alarm stays on for so many samples after what caused it.
+    window : int
+        Samples in the sums of "innovation".
+    low, high : (c,)
+        Bands of the parameters, for "band".
+    normal : (k,)
+        Absolute standardised innovations that are normal, ascending, for "innovation" with a reference; else empty.
+    simulated : bool
+        Whether the limits were found by simulation.
+    """
+
+    kind: str
+    every: float
+    names: tuple[str, ...]
+    limits: tuple[float, ...]
+    hold: int = 0
+    window: int = 50
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+    normal: tuple[float, ...] = ()
+    simulated: bool = False
+
+    def __repr__(self) -> str:
+        limits = ", ".join(f"{name} {limit:.4g}" for name, limit in zip(self.names, self.limits, strict=True))
+        return f"AlarmRule({self.kind}, one false alarm in {self.every:g} samples, limits {limits})"
+
+    @property
+    def slack(self) -> float:
+        """By what limits are wider because what is normal is itself an estimate."""
+        return float(np.sqrt(1.0 + self.window / len(self.normal))) if self.normal else 1.0
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Places of the watched parameters among those of a run; ValueError where one is not there."""
+        return [names.index(name) for name in self.names] if self.kind == "band" else []
+
+    def outside(self, theta: Array, std: Array) -> Array:
+        """How many standard deviations parameters (.., c) are outside their bands; NaN where nothing is known."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            beyond = np.maximum(theta - np.array(self.high), np.array(self.low) - theta) / std
+        return np.where(np.isfinite(std), beyond, np.nan)
+
+    def scores(self, innovation: Array, std: Array) -> Array:
+        """g, finite or NaN: innovations over their standard deviations, or their normal scores."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            g = innovation / std
+        g = np.where(np.isfinite(g), g, np.nan)
+        return normal_scores(g, np.array(self.normal)) if self.normal else g
+
+    def exceeded(self, statistic: Array) -> Array:
+        """Whether any column (.., c) is beyond its limit."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((statistic > np.array(self.limits)).any(axis=-1))
+
+    def cause(self, statistic: Array) -> int:
+        """The column (c,) that is furthest beyond its limit."""
+        ratio = np.where(np.isfinite(statistic), statistic / np.array(self.limits), -np.inf)
+        return int(np.argmax(ratio))
+
+    def limit_text(self, column: int) -> str:
+        """The limit of a column as it is written; a probability near 1 as its distance from it."""
+        return value_text(self.kind, self.limits[column])
+
+
+def value_text(kind: str, value: float) -> str:
+    """A statistic or a limit as it is written; a probability near 1 as its distance from it."""
+    return f"1 - {1.0 - value:.2g}" if kind == "probability" and 0.999 < value < 1.0 else f"{value:.4g}"
+
+
+def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
+    """Refuse what a tracker cannot be watched for."""
+    kind = type(tracker).__name__
+    absent = [name for name in rule.names if name not in names] if rule.kind == "band" else []
+    if absent:
+        raise ValueError(f"detect: there is no parameter {absent[0]!r}; {near(str(absent[0]), names)}")
+    if rule.kind == "band" and not tracker.covariance:
+        raise ValueError(f"detect: {kind} carries no covariance, so no band can be judged.")
+    if rule.kind == "innovation" and not tracker.covariance:
+        raise ValueError(
+            f"detect: {kind} carries no covariance, so how large an innovation may be is not known; use FLS or Kalman."
+        )
+    if rule.kind == "probability" and not {CHANGE, REPORT} & set(tracker.outputs):
+        raise ValueError(
+            f"detect: {kind} carries no probability of a change; track with Bank, or use "
+            'kind="band" or kind="innovation".'
+        )
+
+
+def normal_scores(g: Array, known: Array) -> Array:
+    """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
+    share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
+    return np.where(np.isfinite(g), -special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
+
+
+def moving_sums(values: Array, window: int) -> Array:
+    """Sums (.., T - window + 1) of neighbours on the last axis, added from the oldest on, as a stream adds them."""
+    count = max(values.shape[-1] - window + 1, 0)
+    total = np.zeros((*values.shape[:-1], count))
+    for k in range(window if count else 0):
+        total += values[..., k : k + count]
+    return total
+
+
+def power_and_mean(g: Array, window: int) -> Array:
+    """Moving sums of g^2 and absolute moving sums of g, (T - window + 1, 2)."""
+    power, mean = moving_sums(np.stack([g * g, g]), window)
+    return np.stack([power, np.abs(mean)], axis=1)
+
+
+def last_power_and_mean(g: Array) -> Array:
+    """The last row of `power_and_mean` for a window of all of g, (2,)."""
+    return np.array([np.cumsum(g * g)[-1], np.abs(np.cumsum(g)[-1])])
+
+
+def change_probability(tracker: Any, fields: Any) -> float:
+    """The probability of a change in the tracker's window, from the fields of one lane."""
+    if CHANGE in tracker.outputs:
+        return float(np.reshape(fields[CHANGE], -1)[0])
+    return float(tracker.told(fields[REPORT], CHANGE))

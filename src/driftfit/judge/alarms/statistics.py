@@ -1,0 +1,147 @@
+"""What the alarms of `driftfit.judge.alarms.detect` look at in a run, the limits that theory gives, and the chance of
+an extreme.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.alarms.onsets import (
+    chance,
+    mean_limit,
+    mean_rate,
+    normal_limit,
+    normal_rate,
+    power_limit,
+    power_rate,
+)
+from driftfit.judge.alarms.reference import burn, stretch
+from driftfit.judge.alarms.rule import CHANGE, AlarmRule, check_fits, power_and_mean
+from driftfit.run.result import Track
+
+Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
+
+Chance = Callable[[Array, int], float]
+"""Chance that a record without a fault reaches these highest values (c,) in so many samples."""
+
+
+def rule_of(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """A rule with its names, reference and limits, and the first sample of the run that it judges."""
+    return RULES[rule.kind](run, rule, reference)
+
+
+def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """Bands that were given, or the range of the parameters in the reference."""
+    if isinstance(reference, Mapping):
+        names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
+    else:
+        first, start = stretch(run, reference)
+        names, known = run.names, slice(first, start)
+        low, high = run.theta[known].min(axis=0), run.theta[known].max(axis=0)
+    rule = replace(rule, names=names, low=tuple(low.tolist()), high=tuple(high.tolist()))
+    check_fits(rule, run.tracker, run.names)
+    alike = _alike(run, rule, known)
+    return replace(rule, limits=tuple(normal_limit(rho, rule.every * len(names)) for rho in alike)), start
+
+
+def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
+    """(low, high) of every band, (2, c)."""
+    try:
+        edges = np.array([[float(edge) for edge in pair] for pair in reference.values()]).T
+    except (TypeError, ValueError):
+        edges = np.zeros(0)
+    if edges.ndim != 2 or len(edges) != 2 or not (edges[0] <= edges[1]).all():
+        raise ValueError(
+            f"detect: a reference names parameters, each with a band (low, high), low <= high; got {dict(reference)!r}."
+        )
+    return edges
+
+
+def _alike(run: Track, rule: AlarmRule, part: slice) -> Array:
+    """(c,): correlation of successive errors of the watched estimates, from a part of the run."""
+    columns = rule.columns(run.names)
+    theta, std = run.theta[part, columns], run.std[part, columns]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = np.diff(theta, axis=0) ** 2 / std[1:] ** 2
+    d = np.array([np.mean(column[np.isfinite(column)]) if np.isfinite(column).any() else 1.0 for column in step.T])
+    return np.asarray(1.0 / (1.0 + d))
+
+
+def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """What is normal: standard normal, or as the innovations of the reference are distributed."""
+    rule, start = replace(rule, names=("power", "mean")), burn(run)
+    check_fits(rule, run.tracker, run.names)
+    if isinstance(reference, Mapping):
+        raise ValueError(
+            'detect: the reference of "innovation" is a number of samples, such as reference=500, or (from, to).'
+        )
+    if reference is not None:
+        first, start = stretch(run, reference)
+        g = rule.scores(run.innovation[first:start], run.innovation_std[first:start])
+        rule = replace(rule, normal=tuple(np.sort(np.abs(g[np.isfinite(g)])).tolist()))
+    power, mean = power_limit(rule.window, 2.0 * rule.every), mean_limit(rule.window, 2.0 * rule.every)
+    limits = (rule.window + (power - rule.window) * rule.slack, mean * rule.slack)
+    return replace(rule, limits=limits), start
+
+
+def _probability(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+    """No theory gives a limit: it is found by simulation."""
+    rule = replace(rule, names=("probability",), limits=(1.0,))
+    check_fits(rule, run.tracker, run.names)
+    return rule, burn(run)
+
+
+def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
+    """What the rule compares, (T, c), NaN where there is nothing to judge."""
+    if rule.kind == "band":
+        columns = rule.columns(run.names)
+        return rule.outside(run.theta[:, columns], run.std[:, columns])
+    if rule.kind == "probability":
+        bank: Any = run
+        p = bank._written(CHANGE) if CHANGE in run.tracker.outputs else bank.hypotheses.window
+        return np.asarray(np.reshape(p, (len(run), -1))[:, :1])
+    g = rule.scores(run.innovation, run.innovation_std)
+    used = np.flatnonzero(np.isfinite(g) & (np.arange(len(g)) >= start))
+    statistic = np.full((len(run), 2), np.nan)
+    statistic[used[rule.window - 1 :]] = power_and_mean(g[used], rule.window)
+    return _carried(statistic)
+
+
+def _carried(statistic: Array) -> Array:
+    """The last statistic, where there is no new sample."""
+    place = np.maximum.accumulate(np.where(np.isfinite(statistic[:, 0]), np.arange(len(statistic)), -1))
+    return np.where((place >= 0)[:, None], statistic[place], np.nan)
+
+
+def chance_of(run: Track, rule: AlarmRule) -> Chance:
+    """The chance of an extreme by theory; of probabilities and simulated limits there is none, and it is NaN."""
+    if rule.simulated or rule.kind == "probability":
+        return lambda highest, J: float("nan")
+    if rule.kind == "band":
+        rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
+
+        def of_band(highest: Array, J: int) -> float:
+            each = [chance(rate, z, special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
+            return min(1.0, len(each) * min(each))
+
+        return of_band
+
+    def of_sums(highest: Array, J: int) -> float:
+        W, slack = rule.window, rule.slack
+        loud, aside = W + (highest[0] - W) / slack, highest[1] / slack
+        each = (
+            chance(power_rate(W), loud, special.chdtrc(W, max(loud, 0.0)), J),
+            chance(mean_rate(W), aside, 2.0 * special.ndtr(-aside / np.sqrt(W)), J),
+        )
+        return min(1.0, 2.0 * min(each))
+
+    return of_sums
+
+
+RULES = {"band": _band, "innovation": _innovation, "probability": _probability}

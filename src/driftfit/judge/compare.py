@@ -1,0 +1,84 @@
+"""The comparison that every result carries: what a user would otherwise have done, on the same samples.
+
+*persistence*   the last output that was seen
+*constant LS*   recursive least squares without forgetting on the same regressors (fitted on the past only)
+*constant ARX*  the same on ARX(2, 1 per input) with intercept
+
+All are one-step predictions, scored on the samples after max(50, 5 n) that every one of them could predict.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import Array
+from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.models.arx import ARX
+from driftfit.run.result import Track, root_mean_square
+
+
+class Comparison(NamedTuple):
+    """Root mean square one-step errors on ``samples`` samples; NaN where a record is too short to score."""
+
+    tracked: float
+    persistence: float
+    constant_ls: float
+    constant_arx: float
+    samples: int
+
+
+def persistence(y: Array) -> Array:
+    """For every sample the last output seen before it; NaN before the first."""
+    seen = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(seen)[:-1]])
+    return np.where(last >= 0, y[last], np.nan)
+
+
+def _error(y: Array, prediction: Array, innovation: Array) -> Array:
+    """Error of the prediction of y; the innovation of a model may be that of something else."""
+    return np.where(np.isfinite(innovation), y - prediction, np.nan)
+
+
+class Errors(NamedTuple):
+    """One-step errors of everyone, (T,) each, and which samples are scored."""
+
+    tracked: Array
+    persistence: Array
+    constant_ls: Array
+    constant_arx: Array
+    scored: Array
+
+
+def burn_in(n: int) -> int:
+    """Samples that are not scored where a model has n parameters."""
+    return max(50, 5 * n)
+
+
+def errors(run: Track, burn: int | None = None) -> Errors:
+    """One-step errors of a run, of persistence, of constant least squares and of constant ARX.
+
+    The first ``burn`` samples are not scored, max(50, 5 n) unless it is said.
+    """
+    y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
+    steady = constant_least_squares(run.model, run.y, run.u, run._known)
+    known = run._known[:, :3].copy()
+    known[:, 0] = np.where(known[:, 0] > 0.0, known[:, 0], 1.0)  # 0 before the lags of the run were filled
+    known[:, 1] = 1.0
+    small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
+    arx = constant_least_squares(small, y, u, known)
+    tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
+    own = (tracked, y - persistence(y), constant, arx["e"][:, 0])
+    scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
+    for error in own:
+        scored &= np.isfinite(error)
+    return Errors(*own, scored)
+
+
+def compare(run: Track) -> Comparison:
+    """Score a run beside persistence, constant least squares and constant ARX."""
+    *own, scored = errors(run)
+    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in own)
+    return Comparison(tracked, last, ls, constant, int(scored.sum()))

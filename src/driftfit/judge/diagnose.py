@@ -1,0 +1,261 @@
+"""Diagnose: what is wrong with a run, in numbers with their limits, and a sentence for each that is out of bounds.
+
+With z = e / s, innovations over their standard deviation, after the first max(50, 5 n) samples:
+
+    whiteness         p-value of 20 autocorrelations of z, robust to changing variance          at least 0.01
+    inputs            smallest p-value of z against 11 lags of an input, times their number     at least 0.01
+    noise level       mean of z^2 without the outliers, over what a Gaussian has                0.75 to 1.33
+    steady noise      the same, largest over smallest of ten parts of the record                at most 3
+    outliers          share of |z| > 4                                                          at most 0.2 %
+    symmetry          skewness of z clipped at 4                                                -0.5 to 0.5
+    excitation        largest condition index of a window (`driftfit.judge.excitation`)        at most 100
+    constancy         joint p-value of constant coefficients (`driftfit.judge.statistics.constancy`)      see below
+
+Constancy is out of bounds where the record and the tracker disagree: the coefficients move but the tracker holds them
+constant (p below 0.01), or they do not and the tracker lets them move at a price: p above 0.05, and one-step errors
+more than 3 % larger than those of constants, by a paired test at 1 % (of e^2 - (1.03 e_constant)^2, see
+`driftfit.judge.statistics.paired`). So fault is found with fewer than one in a hundred trackers whose drift costs less
+than that, and on short records only where it costs much more: ``benchmarks/diagnose_constancy.py``. The mean of z^2 is
+over |z| < 3 of the median scale, so that outliers are counted once, under their own name; limits are widened where a
+short record makes them too tight: by three standard errors. Source: Mehra (1970), Bar-Shalom et al. (2001, section
+5.4) for innovation tests. Cost: that of a verdict.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import Array
+from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.excitation import INDEX, Excitation, excitation
+from driftfit.judge.regressors import Rows, regressors
+from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.judge.statistics.paired import paired
+from driftfit.judge.statistics.scale import core
+from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
+from driftfit.run.result import Track, root_mean_square
+from driftfit.show.summary import Printed, table_of
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PARTS = 10
+MATERIAL, SURE = 1.03, 0.01
+"""A tracker of constant coefficients is at fault where its error is more than that many times theirs, at that level."""
+NOT_REJECTED = 0.05
+"""p from which on constants count as not rejected."""
+BEYOND = 4.0
+"""Standard deviations from which on an innovation counts as an outlier."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number with its limits; ``advice`` is a sentence where it is out of bounds, else empty.
+
+    ``value`` is NaN, and in bounds, where the record is too short or the tracker carries no covariance.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    advice: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the value is within its limits, or cannot be told."""
+        return not (self.value < self.low or self.value > self.high)
+
+
+@dataclass(frozen=True)
+class Diagnosis(Printed):
+    """What `Track.diagnose` returns; printing it shows it, `plot` draws one page.
+
+    Attributes
+    ----------
+    checks : tuple of Check
+        Every number with its limits.
+    ok : bool
+        All of them are within.
+    """
+
+    checks: tuple[Check, ...]
+    run: Track = field(repr=False, compare=False)
+    z: Array = field(repr=False, compare=False)
+    white: Whiteness = field(repr=False, compare=False)
+    excited: Excitation = field(repr=False, compare=False)
+    constant: Constancy = field(repr=False, compare=False)
+    rows: Rows = field(repr=False, compare=False)
+
+    @property
+    def ok(self) -> bool:
+        return all(check.ok for check in self.checks)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is out of bounds, and what to try."""
+        return tuple(check.advice for check in self.checks if not check.ok)
+
+    def __getitem__(self, name: str) -> Check:
+        return next(check for check in self.checks if check.name == name)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = table_of("Diagnostics", "", "value", "from", "to", "")
+        for check in self.checks:
+            limits = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
+            verdict = "not known" if np.isnan(check.value) else "" if check.ok else "out of bounds"
+            table.add_row(check.name, f"{check.value:.4g}", *limits, verdict)
+        yield table
+        for sentence in self.sentences or ("Everything is within its limits.",):
+            yield Text(f" {sentence}")
+
+    def plot(self) -> Figure:
+        """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""
+        from driftfit.judge.plots import draw_diagnosis
+
+        return draw_diagnosis(self)
+
+
+def diagnose(run: Track) -> Diagnosis:
+    """Check a run; see the module for the numbers and their limits. Never raises for what the data are."""
+    start = burn_in(run.model.n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = run.innovation / run.innovation_std
+    z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
+    rows = regressors(run)
+    # without a covariance there is no scale, but correlation needs none
+    white = whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
+    excited, constant = excitation(rows.phi), constancy(rows.phi, rows.y)
+    checks = (
+        _whiteness(white),
+        *_inputs(run, z),
+        *_level(z, white, _robust(run)),
+        *_distribution(z, _robust(run)),
+        _excitation(run, excited),
+        _constancy(run, constant),
+    )
+    return Diagnosis(checks, run, z, white, excited, constant, rows)
+
+
+def _whiteness(white: Whiteness) -> Check:
+    first = white.r[0] if len(white.r) else np.nan
+    sign = "positive" if first > 0.0 else "negative"
+    hint = (
+        "more drift (a larger q, less memory), or one more lag"
+        if first > 0.0
+        else "less drift, or one more lag (noise on the output does this too)"
+    )
+    advice = (
+        f"The innovations are correlated ({first:.2f} at the first lag, {sign}): something that can be predicted is "
+        f"left. Try {hint}."
+    )
+    return Check("whiteness (p)", white.p, 0.01, np.inf, advice)
+
+
+def _inputs(run: Track, z: Array) -> list[Check]:
+    if run.u.shape[1] == 0:
+        return []
+    p = np.array([crossing(z, u).p for u in np.where(np.abs(run.u) < LARGEST, run.u, np.nan).T])
+    if np.isnan(p).all():
+        return [Check("inputs (p)", float("nan"), 0.01, np.inf, "")]
+    worst = int(np.nanargmin(p))
+    given = run.labels.u
+    name = given[worst] if worst < len(given) else f"input {worst + 1}"
+    advice = (
+        f"The innovations still follow {name}: its effect is not all in the model. "
+        "Try more lags of it, another delay, or a curve."
+    )
+    return [Check("inputs (p)", min(1.0, float(p[worst]) * len(p)), 0.01, np.inf, advice)]
+
+
+def _robust(run: Track) -> bool:
+    """Whether the tracker discounts outliers and follows the noise by itself."""
+    return isinstance(run.tracker, AdaptiveKalman)
+
+
+def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
+    count = int(np.isfinite(z).sum())
+    level = core(z)
+    slack = 3.0 * np.sqrt(2.0 / count) if count else 0.0
+    sign = white.r[0] if len(white.r) and white.p < 0.05 else 0.0
+    if level > 1.0:
+        what = f"larger than it says; raise {'q, since they are correlated too' if sign > 0.0 else 'r'}"
+    else:
+        what = f"smaller than it says; lower {'q, since one overshoots the last' if sign < 0.0 else 'r'}"
+    advice = f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() finds the numbers."
+    levels = np.array([core(part) for part in np.array_split(z, PARTS)])
+    ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")
+    wide = 3.0 * np.exp(2.0 * slack * np.sqrt(PARTS) / 2.0) if count else 3.0
+    changing = (
+        f"The noise is not steady: its variance changes {ratio:.1f}-fold over the record. Bands are too narrow where "
+        f"it is large; {'look there' if robust else 'give weights=, or use AdaptiveKalman, which follows the noise'}."
+    )
+    return (
+        Check("noise level", level, min(0.75, 1.0 - slack), max(1.33, 1.0 + slack), advice),
+        Check("steady noise", ratio, -np.inf, wide, changing),
+    )
+
+
+def _distribution(z: Array, robust: bool) -> tuple[Check, Check]:
+    z = z[np.isfinite(z)]
+    if len(z) < 20:
+        return Check("outliers", float("nan"), 0.0, 0.002, ""), Check("symmetry", float("nan"), -0.5, 0.5, "")
+    share = float(np.mean(np.abs(z) > BEYOND))
+    limit = max(0.002, 2.5 / len(z))
+    outliers = (
+        f"{100.0 * share:.2g} % of the innovations are beyond {BEYOND:g} standard deviations. "
+        + ("They are discounted, but look at them." if robust else "Outliers pull the parameters: use AdaptiveKalman, ")
+        + ("" if robust else "which discounts them, or give weights=0 to known bad samples.")
+    )
+    held = np.clip(z - np.median(z), -BEYOND, BEYOND)
+    skew = float(np.mean((held - held.mean()) ** 3) / np.mean((held - held.mean()) ** 2) ** 1.5) if held.any() else 0.0
+    slack = max(0.5, 3.0 * np.sqrt(6.0 / len(z)))
+    skewed = f"The innovations are skewed ({skew:.2f}): try the logarithm of a positive output, or a missing curve."
+    return (Check("outliers", share, 0.0, limit, outliers), Check("symmetry", skew, -slack, slack, skewed))
+
+
+def _excitation(run: Track, excited: Excitation) -> Check:
+    if not len(excited.at):
+        return Check("excitation", float("nan"), 0.0, INDEX, "")
+    poor = float(np.mean(excited.condition > INDEX))
+    share = np.abs(excited.direction)
+    involved = [name for name, part in zip(run.model.names, share, strict=True) if part > 0.3 * share.max()]
+    advice = (
+        f"In {100.0 * poor:.0f} % of the windows the inputs do not tell {', '.join(involved)} apart: there these come "
+        "from what was known before. Excite the system, use fewer lags, or centre the signals if there is an intercept."
+    )
+    return Check("excitation", float(excited.condition.max()), 0.0, INDEX, advice)
+
+
+def _constancy(run: Track, test: Constancy) -> Check:
+    if holds_constant(run):
+        advice = (
+            "The coefficients move, but this tracker holds them constant: use Kalman with a drift, or AdaptiveKalman."
+        )
+        return Check("constancy (p)", test.p_joint, SURE, np.inf, advice)
+    error = errors(run)
+    own, steady = (part[error.scored] for part in (error.tracked, error.constant_ls))
+    least, most = root_mean_square(steady), root_mean_square(own)
+    advice = (
+        f"Constants are not rejected, and predict better ({least:.4g} against {most:.4g}): the drift is set too high. "
+        "Lower q or raise the memory; tune() finds it."
+    )
+    dear = paired("constant LS", own, MATERIAL * steady).p < SURE
+    return Check("constancy (p)", test.p_joint, -np.inf, NOT_REJECTED if dear else np.inf, advice)
+
+
+def holds_constant(run: Track) -> bool:
+    """Whether the tracker of a run lets no parameter move."""
+    settings = run.tracker.settings()
+    if "forgetting" in settings:
+        return bool(settings["forgetting"] == 1.0)
+    if "mu" in settings:
+        return bool(np.isinf(settings["mu"]).all())
+    return "q" in settings and not np.any(settings["q"])

@@ -1,0 +1,54 @@
+"""Excitation: did the regressors of a window tell the parameters apart?
+
+    R_w = (1 / W) sum over a window of psi_t psi_t',     psi_ti = phi_ti / rms of regressor i over the record
+
+The smallest eigenvalue of R_w over the largest is 1 over the squared condition index of Belsley, Kuh and Welsch (1980);
+scaling makes it independent of units, and a window in which an input stands still has a small one. 30 is where they
+call dependence moderate to strong; 100 is the limit here: there the parameters of that window come from what was known
+before.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+
+INDEX = 100.0
+"""Limit of the condition index."""
+
+
+class Excitation(NamedTuple):
+    """Windows of W samples, half overlapping."""
+
+    at: Array
+    """(w,): number of the last sample of each window, among the samples used."""
+    eigenvalues: Array
+    """(w, n) ascending."""
+    direction: Array
+    """(n,): the scaled combination of parameters that the worst window tells least about."""
+
+    @property
+    def condition(self) -> Array:
+        """(w,): condition index of each window; inf where a direction is not excited at all."""
+        low, high = self.eigenvalues[:, 0], self.eigenvalues[:, -1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            condition: Array = np.sqrt(high / np.maximum(low, 0.0))
+        return np.where(high > 0.0, condition, np.inf)
+
+
+def excitation(phi: Array, window: int | None = None) -> Excitation:
+    """Eigenvalues of windows of regressors phi (N, n); max(50, 5 n) samples unless ``window`` says otherwise."""
+    N, n = phi.shape
+    W = max(50, 5 * n) if window is None else window
+    size = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.ones(n)
+    scaled = phi / np.where(size > 0.0, size, 1.0)
+    ends = np.arange(W, N + 1, max(W // 2, 1))
+    if not len(ends):
+        return Excitation(np.zeros(0, int), np.zeros((0, n)), np.full(n, np.nan))
+    R = np.array([scaled[end - W : end].T @ scaled[end - W : end] / W for end in ends])
+    values, vectors = np.linalg.eigh(R)
+    found = Excitation(ends - 1, np.maximum(values, 0.0), vectors[0, :, 0])
+    return found._replace(direction=vectors[int(np.argmax(found.condition)), :, 0])

@@ -1,0 +1,265 @@
+"""Verdict and diagnosis of many runs at once: a fleet, or the outputs of one record. One table, one row for each.
+
+    q_(k) = min over j >= k of  p_(j) N / j         (p in ascending order, N runs that can be tested)
+
+A level of 5 % for each of 200 sensors would accuse ten that stand still. Here the level is the false discovery rate: of
+the runs that are said to move (q below the level), at most that share stands still on average, for tests that are
+independent or positively dependent. The same holds for "following pays". Each run is judged by itself, on all cores.
+
+Source: Benjamini and Hochberg (1995). Cost: that of a verdict for each run.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Hashable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.progress import Progress
+from rich.text import Text
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.diagnose import Diagnosis, diagnose
+from driftfit.judge.verdict import Verdict, p_text, verdict
+from driftfit.show.summary import Printed, key_text, table_of
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+SHOWN = 20
+BAR = 100
+"""Runs from which on there is a progress bar."""
+
+Said = TypeVar("Said")
+
+
+def discoveries(p: Array) -> Array:
+    """q-values (N,) of p-values (N,): the least false discovery rate at which each is found; NaN where p is NaN."""
+    p = np.asarray(p, float)
+    known = np.flatnonzero(np.isfinite(p))
+    order = known[np.argsort(-p[known], kind="stable")]
+    rank = np.arange(len(order), 0, -1)
+    q = np.full(len(p), np.nan)
+    q[order] = np.minimum.accumulate(np.minimum(p[order] * len(order) / rank, 1.0))
+    return q
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One run among many: its verdict, and the q-values of "the parameters move" and of "following them pays"."""
+
+    key: Hashable
+    said: Verdict
+    q: float
+    q_pays: float
+    drifts: bool
+    pays: bool
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the parameters that move."""
+        return self.said.moving if self.drifts else ()
+
+    @property
+    def relative(self) -> float:
+        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named."""
+        moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(max((np.abs(np.divide(m.after - m.before, m.before)) for m in moved), default=0.0))
+
+    @property
+    def change(self) -> str:
+        """The first of them in words."""
+        moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
+        more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
+        if not moved:
+            return ""
+        return f"{moved[0].name} {moved[0].before:.3g} to {moved[0].after:.3g} at {moved[0].when}{more}"
+
+
+@dataclass(frozen=True)
+class ManyVerdicts(Printed):
+    """Verdicts of many runs; printing it shows the twenty that move most clearly.
+
+    Attributes
+    ----------
+    rows : tuple of Judgement
+        The clearest first; those that cannot be tested last.
+    level : float
+        False discovery rate.
+    """
+
+    rows: tuple[Judgement, ...]
+    level: float
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, key: Hashable) -> Judgement:
+        for row in self.rows:
+            if row.key == key:
+                return row
+        raise KeyError(f"there is no verdict of {key!r}.")
+
+    def ranked(self, by: str = "clearest") -> ManyVerdicts:
+        """The same rows in another order: the "clearest" first, or the largest relative "change" first."""
+        if by not in ("clearest", "change"):
+            raise ValueError(f"ranked: by must be 'clearest' or 'change'; got {by!r}.")
+        clear = sorted(self.rows, key=lambda row: (np.isnan(row.q), row.said.p, -row.said.statistic))
+        if by == "change":
+            clear.sort(key=lambda row: -row.relative)
+        return ManyVerdicts(tuple(clear), self.level)
+
+    @property
+    def drifting(self) -> tuple[Hashable, ...]:
+        """Keys of the runs whose parameters move."""
+        return tuple(row.key for row in self.rows if row.drifts)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in words."""
+        tested, paying = (int(np.isfinite([getattr(row, q) for row in self.rows]).sum()) for q in ("q", "q_pays"))
+        drifting, pays = len(self.drifting), sum(row.pays for row in self.rows)
+        found = (
+            f"In {drifting} of {tested} the parameters move; of those at most {100.0 * self.level:g} % stand still, on "
+            "average (false discovery rate)."
+            if drifting
+            else f"In none of {tested} is a drift found. One that is small beside the noise cannot be ruled out."
+            if tested
+            else ""
+        )
+        names = Counter(name for row in self.rows for name in row.moving).most_common(3)
+        which = f"Most often it is {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
+        gain = f"Following them pays in {pays} of {paying}." if paying else ""
+        rest = len(self.rows) - tested
+        short = f"{rest} cannot be tested: too few samples, or regressors that do not span." if rest else ""
+        return tuple(filter(None, (found, which, gain, short)))
+
+    @property
+    def table(self) -> Any:
+        """One row a run, as a polars table."""
+        import polars
+
+        return polars.DataFrame(
+            {
+                "key": [key_text(row.key) for row in self.rows],
+                "p": [row.said.p for row in self.rows],
+                "q": [row.q for row in self.rows],
+                "drifts": [row.drifts for row in self.rows],
+                "moving": [", ".join(row.moving) for row in self.rows],
+                "change": [row.change for row in self.rows],
+                "relative": [row.relative for row in self.rows],
+                "rms": [row.said.rms for row in self.rows],
+                "constant_ls": [row.said.rivals[1].rms for row in self.rows],
+                "pays": [row.pays for row in self.rows],
+                "samples": [row.said.samples for row in self.rows],
+            }
+        )
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for sentence in self.sentences:
+            yield Text(f" {sentence}")
+        table = table_of("The clearest first", "", "what moves most", "p", "q", "error", "LS", "pays", names=2)
+        table.columns[1].no_wrap = False  # words give way to numbers
+        for column, width in zip(table.columns[2:], (8, 8, 7, 7, 4), strict=True):
+            column.ratio, column.min_width = None, width
+        for row in self.rows[:SHOWN]:
+            errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
+            table.add_row(Text(key_text(row.key)), Text(row.change), p_text(row.said.p), p_text(row.q), *errors)
+        yield table
+        if len(self.rows) > SHOWN:
+            yield Text(f" and {len(self.rows) - SHOWN} more", "dim")
+
+
+@dataclass(frozen=True)
+class ManyDiagnoses(Printed):
+    """Diagnoses of many runs; printing it shows how often each number is out of bounds, and the worst runs.
+
+    Attributes
+    ----------
+    of : dict
+        The Diagnosis of every run, by key.
+    """
+
+    of: dict[Hashable, Diagnosis] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.of)
+
+    def __getitem__(self, key: Hashable) -> Diagnosis:
+        return self.of[key]
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything is within its limits everywhere."""
+        return all(said.ok for said in self.of.values())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many runs are out of bounds, by number."""
+        names = dict.fromkeys(check.name for said in self.of.values() for check in said.checks)
+        return {
+            name: sum(not c.ok for said in self.of.values() for c in said.checks if c.name == name) for name in names
+        }
+
+    @property
+    def worst(self) -> tuple[Hashable, ...]:
+        """Keys, those with most numbers out of bounds first."""
+        return tuple(sorted(self.of, key=lambda key: -len(self.of[key].sentences)))
+
+    @property
+    def table(self) -> Any:
+        """One row a run with every number, as a polars table."""
+        import polars
+
+        rows = [{"key": key_text(key)} | {c.name: c.value for c in said.checks} for key, said in self.of.items()]
+        out = [len(said.sentences) for said in self.of.values()]
+        return polars.DataFrame(rows, infer_schema_length=None).with_columns(polars.Series("out_of_bounds", out))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = table_of("Out of bounds", "", "runs", "of")
+        for name, count in self.counts.items():
+            table.add_row(name, str(count), str(len(self.of)))
+        yield table
+        table = table_of("The worst first", "", "what is out of bounds", names=2)
+        for key in [key for key in self.worst if not self.of[key].ok][:SHOWN]:
+            table.add_row(Text(key_text(key)), Text(", ".join(c.name for c in self.of[key].checks if not c.ok)))
+        yield table
+
+
+def verdicts(
+    runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
+) -> ManyVerdicts:
+    """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
+    said = _each(runs, lambda run: verdict(run, level, lags, burn), "verdict")
+    q, q_pays = (
+        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.rivals[1].p for v in said.values()])
+    )
+    rows = [
+        Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))
+        for (key, one), a, b in zip(said.items(), q, q_pays, strict=True)
+    ]
+    return ManyVerdicts(tuple(rows), level).ranked("clearest")
+
+
+def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
+    """Diagnose runs by key."""
+    return ManyDiagnoses(_each(runs, diagnose, "diagnosis"))
+
+
+def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: str) -> dict[Hashable, Said]:
+    """What is said of each run, on all cores; the first is alone, so that only one thread compiles."""
+    from driftfit.run.fleet import cores
+
+    keys, tracks = list(runs), list(runs.values())
+    first = [judge(track) for track in tracks[:1]]
+    with (
+        Progress(console=Console(stderr=True), transient=True, disable=len(tracks) < BAR) as progress,
+        ThreadPoolExecutor(cores()) as pool,
+    ):
+        rest = progress.track(pool.map(judge, tracks[1:]), total=len(tracks) - 1, description=what)
+        return dict(zip(keys, [*first, *rest], strict=True))

@@ -1,0 +1,265 @@
+"""Segments of a whole record: between which dates were the parameters constant, and how sure are the dates?
+
+    min over breaks of  sum over segments of min_theta sum (y_t - phi_t' theta)^2 / noise  +  penalty * number of breaks
+
+The minimum is found exactly by pruned dynamic programming (`driftfit.judge.statistics.partition`) on rows that have
+been divided by the level of the noise, made white where it is an autoregression, and held within three levels of the
+fit, so that an outlier is no segment (`driftfit.judge.statistics.noise`). The penalty is such that a record of
+constant parameters is divided with the probability ``false``. Each date comes with an interval that holds the true one
+with at least the probability ``level`` (`driftfit.judge.statistics.break_dates`), given that there is a break.
+
+Use it on complete records in which parameters jump and stay; the `Bank` says on-line what this says afterwards, and
+`Track.smooth` follows parameters that drift: a slow drift is cut into steps here. A record of more than 2000 samples is
+divided on a grid of as many places, and every date then moved to its likeliest place among all samples between its
+neighbours; two breaks nearer to each other than ``shortest`` are not told apart.
+
+Source: Bai and Perron (1998, 2003) for breaks in regressions; Killick, Fearnhead and Eckley (2012) for the pruning; Yao
+(1987), Bai (1997) for dates. Departures: whitening, outliers, the penalty from a rate of false breaks, and dates from
+their likelihood. Cost: O(T n^2) and at most CELLS^2 / 2 factors of order n + 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.judge.regressors import regressors
+from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.statistics.constancy import shortest as shortest_of
+from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
+from driftfit.judge.statistics.robust import orthonormal, robust_fit
+from driftfit.models.base import Model
+from driftfit.models.regression import Regression
+from driftfit.run.track import track
+from driftfit.show.summary import Printed, table_of
+from driftfit.trackers.rls import RLS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+
+CELLS = 2000
+"""At most so many places for breaks are compared at once."""
+SWEEPS = 10
+
+
+class Break(NamedTuple):
+    """A change of parameters: the first sample of the new ones, and an interval for it.
+
+    ``date, first, last`` are times where the record has them, sample numbers otherwise; ``at``: sample number of date.
+    """
+
+    date: Any
+    first: Any
+    last: Any
+    at: int
+
+
+class Segment(NamedTuple):
+    """Samples start .. stop - 1 of the record, with constant theta (n,) and its standard errors (n,)."""
+
+    start: int
+    stop: int
+    theta: Array
+    std: Array
+
+
+@dataclass(frozen=True)
+class Segmentation(Printed):
+    """What `segment` returns; printing it shows it.
+
+    Attributes
+    ----------
+    breaks : tuple of Break
+        In the order of time; one less than segments.
+    segments : tuple of Segment
+    level : float
+        An interval holds its date with at least this probability.
+    penalty : float
+        Of a break, in units of the noise variance.
+    noise : float
+        Standard deviation of the noise, the median over time.
+    ar : tuple of float
+        Autoregression of the noise; empty where it is white.
+    """
+
+    breaks: tuple[Break, ...]
+    segments: tuple[Segment, ...]
+    level: float
+    penalty: float
+    noise: float
+    ar: tuple[float, ...]
+    run: Track = field(repr=False, compare=False)
+
+    @property
+    def theta(self) -> Array:
+        """Parameters of every sample, (T, n)."""
+        return np.repeat([s.theta for s in self.segments], [s.stop - s.start for s in self.segments], axis=0)
+
+    def summary(self) -> str:
+        """The segments as a table, as text."""
+        return str(self)
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        count = len(self.breaks)
+        yield Text(f" {count or 'no'} break{'' if count == 1 else 's'}, dates with {100.0 * self.level:g} % intervals")
+        names = self.run.model.names
+        text = self.run.time_text
+        for one in self.breaks:
+            yield Text(f" {text(one.at)}, from {text(self._sample(one.first))} to {text(self._sample(one.last))}")
+        names = self.run.model.names
+        table = table_of("Segments, from sample", "", "samples", *(text for name in names for text in (name, "+-")))
+        for part in self.segments:
+            numbers = (f"{value:.4g}" for pair in zip(part.theta, part.std, strict=True) for value in pair)
+            table.add_row(str(part.start), str(part.stop - part.start), *numbers)
+        yield table
+        correlated = f"; autoregression of the noise {', '.join(f'{a:.2f}' for a in self.ar)}" if self.ar else ""
+        yield Text(f" noise {self.noise:.4g}{correlated}; penalty of a break {self.penalty:.1f}", "dim")
+
+    def _sample(self, time: Any) -> int:
+        return int(np.searchsorted(self.run.time, time))
+
+    def plot(self) -> Figure:
+        """Parameters of the segments with two standard errors, and the intervals of the dates; a matplotlib figure."""
+        import matplotlib.pyplot as plt
+
+        names, time = self.run.model.names, self.run.time
+        figure: Figure
+        figure, axes = plt.subplots(
+            len(names) + 1, 1, sharex=True, figsize=(8.0, 2.0 * len(names) + 2.0), squeeze=False
+        )
+        axes[0, 0].plot(time, self.run.y, ".", ms=2, color="0.5")
+        axes[0, 0].set_ylabel("y")
+        for i, name in enumerate(names):
+            panel = axes[i + 1, 0]
+            for part in self.segments:
+                span, value, width = time[[part.start, part.stop - 1]], part.theta[i], 2.0 * part.std[i]
+                panel.plot(span, [value, value], color="C0")
+                panel.fill_between(span, value - width, value + width, color="C0", alpha=0.25, lw=0)
+            panel.set_ylabel(name)
+        for panel in axes[:, 0]:
+            for one in self.breaks:
+                panel.axvspan(one.first, one.last, color="C3", alpha=0.2, lw=0)
+                panel.axvline(one.date, color="C3", lw=0.8)
+        figure.align_ylabels()
+        figure.tight_layout()
+        return figure
+
+
+def segment(
+    y: Any,
+    u: Any = None,
+    model: Model | None = None,
+    *,
+    level: float = 0.95,
+    false: float = 0.01,
+    shortest: int | None = None,
+    **record: Any,
+) -> Segmentation:
+    """Divide a record where the parameters of a model change.
+
+    Parameters
+    ----------
+    y, u : as for `track`
+        Output and inputs.
+    model : Model or None
+        What is constant within a segment. None: the mean of y, with coefficients of u where there is one.
+    level : number
+        Of the intervals for dates.
+    false : number
+        Chance that a record of constant parameters is divided, which sets the penalty; where the noise is correlated
+        and its autoregression is estimated it may be several times that.
+    shortest : int or None
+        Samples in the shortest segment; max(10, 4 n) by default.
+    record
+        More of `track`: ``data, time, dt, weights, units``.
+
+    Raises
+    ------
+    ValueError
+        Numbers out of range, or what `track` refuses.
+    """
+    if model is None:
+        model = Regression(0 if u is None else None, intercept=True)
+    return segmented(track(model, RLS(1.0), y, u, **record), level=level, false=false, shortest=shortest)
+
+
+def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: int | None = None) -> Segmentation:
+    """Divide the record of a run; see `segment`. The tracker does not enter."""
+    for name, given in (("level", level), ("false", false)):
+        if not 0.0 < given < 1.0:
+            raise ValueError(f"segment: {name} must be between 0 and 1, such as 0.95; got {given!r}.")
+    n = run.model.n
+    least = shortest_of(n) if shortest is None else max(whole("segment", "shortest", shortest, 1), n + 1)
+    rows = regressors(run)
+    N = len(rows.y)
+    size = np.sqrt(np.mean(rows.phi**2, axis=0)) if N else np.zeros(n)
+    if max(2 * least, n + 2) > N or not (size > 0.0).all() or np.linalg.matrix_rank(rows.phi / size, 1e-9) < n:
+        return _undivided(run, rows.phi, rows.y, level)
+    fit = robust_fit(rows.phi, rows.y)
+    if not fit.scale > 1e-10 * np.sqrt(np.mean(rows.y**2)):
+        return _undivided(run, rows.phi, rows.y, level)
+    Q = orthonormal(rows.phi / size)[0]
+    found = noise(Q, fit.residual, CELLS, least, quiet=false)
+    # a value that is held still votes for one side; without its row it does not
+    used = np.abs(found.near) <= HELD * found.level
+    X, z = Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
+    breaks, spans = _dated(X / found.white, z / found.white, found, least, level)
+    at = [int(rows.at[b]) for b in breaks]
+    time = run.time
+    edges = [0, *breaks, N]
+    limits = [0, *at, len(run)]
+    parts = tuple(
+        Segment(limits[k], limits[k + 1], *_fitted(rows.phi[a:b], rows.y[a:b], found, a, b))
+        for k, (a, b) in enumerate(pairwise(edges))
+    )
+    dated = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
+    spread = float(np.median(found.level))
+    return Segmentation(dated, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
+
+
+def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[list[int], list[tuple[int, int]]]:
+    """Likeliest dates, each between its neighbours until all stay, and their intervals."""
+    breaks, N = [int(b) for b in found.breaks], len(z)
+    spans = [(b, b) for b in breaks]
+    p = len(found.ar)
+    for _ in range(SWEEPS):
+        before = list(breaks)
+        for k, _b in enumerate(breaks):
+            a, b = ([0, *breaks][k], [*breaks, N][k + 1])
+            low, high = min(max(least // 2, p + 1), (b - a) // 3), max((b - a) - least // 2, (b - a) * 2 // 3)
+            loglik = date_loglik(X[a:b], z[a:b], found.ar, low, high)
+            breaks[k] = a + low + int(np.argmax(loglik))
+            first, last = smallest(loglik, level)
+            spans[k] = (a + low + first, a + low + last)
+        if breaks == before:
+            break
+    return breaks, spans
+
+
+def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
+    """theta and its standard errors, Huber's for a noise that is white once whitened."""
+    c = found.level[a:b]
+    X, z = whitened(phi / c[:, None], y / c, found.ar)
+    X, z = X[len(found.ar) :], z[len(found.ar) :]
+    fit = robust_fit(X, z)
+    N, n = X.shape
+    variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
+    return fit.theta, np.sqrt(np.maximum(variance * np.diag(np.linalg.pinv(X.T @ X)), 0.0))
+
+
+def _undivided(run: Track, phi: Array, y: Array, level: float) -> Segmentation:
+    """One segment: too few samples, regressors that do not span, or no noise at all."""
+    n = phi.shape[1]
+    theta = np.linalg.lstsq(phi, y, rcond=None)[0] if len(y) else np.full(n, np.nan)
+    spread = float(np.std(y - phi @ theta)) if len(y) else float("nan")
+    one = Segment(0, len(run), theta, np.full(n, np.nan))
+    return Segmentation((), (one,), level, float("nan"), spread, (), run)

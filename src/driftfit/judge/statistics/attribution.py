@@ -1,0 +1,147 @@
+"""Which parameters move, once it is known that some do: steps are explained one after the other.
+
+    1. of the parameters whose own path rejects constancy (Holm's correction), take the one of which a step near the
+       furthest point of its path explains most of y, outliers held
+    2. give it that step: one more regressor, phi_i from that sample on
+    3. test again; until no parameter rejects, or MOST steps are there
+
+A large move of one parameter changes the regressors of an ARX model and its residuals, and makes the paths of others
+look moved too; once the step is in the regression those are still again. A slow drift takes several steps of the same
+parameter, a passing fault two that go back. What is reported is the value before the first step, the one that is
+furthest from it in units of its standard error, and the last. A parameter whose furthest value is within the error of
+the first is not named, whatever its path says. Bai and Perron (1998) estimate several breaks in all parameters that
+way, one after the other; here each step belongs to one parameter.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.judge.statistics.noise import Noise, whitened
+from driftfit.judge.statistics.robust import robust_fit
+
+MOST = 12
+AROUND = 0.03
+"""Share of the record on each side of the furthest point of a path where the date of a step is looked for."""
+NEAR = 0.01
+"""Steps of one parameter within this share of the record are the same step."""
+
+
+class Step(NamedTuple):
+    """A parameter of the n, and the sample (of the N) from which on it is another."""
+
+    parameter: int
+    at: int
+
+
+class Attribution(NamedTuple):
+    """What moves."""
+
+    p: Array
+    """(n,): p-value of each parameter when it was named, or at the end where it was not."""
+    steps: tuple[Step, ...]
+    """In the order in which they were found."""
+    before: Array
+    """(n,): value before its first step; constant value of those that have none."""
+    after: Array
+    """(n,): the value furthest from it."""
+    std: Array
+    """(n,): standard error of the difference."""
+    last: Array
+    """(n,): value after its last step."""
+    moves: Array
+    """(n,): whether it has steps, and a difference that is none of chance."""
+
+    def first(self, i: int) -> int | None:
+        """The date of the step of parameter i that was found first; None where it has none."""
+        return next((step.at for step in self.steps if step.parameter == i), None)
+
+
+def holm(p: Array, level: float) -> Array:
+    """Which of n hypotheses Holm's procedure rejects."""
+    order = np.argsort(p)
+    passed = p[order] < level / np.arange(len(p), 0, -1)
+    rejected = np.zeros(len(p), bool)
+    rejected[order] = np.logical_and.accumulate(passed)
+    return rejected
+
+
+def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
+    """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
+    N, n = phi.shape
+    steps: list[Step] = []
+    p, now = test.p_own.copy(), test
+    while len(steps) < min(MOST, N // (4 * n + 8)):
+        step = _next(_with(phi, steps), now, n, level)
+        if step is None or any(s.parameter == step.parameter and abs(s.at - step.at) <= NEAR * N for s in steps):
+            break
+        p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
+        steps.append(step)
+        later = constancy(_with(phi, steps), y, lags)
+        if np.isnan(later.p_joint):
+            steps.pop()
+            break
+        now = later
+    named = {step.parameter for step in steps}
+    p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
+    before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
+    far = np.abs(after - before) > special.ndtri(1.0 - 0.5 * level) * std
+    return Attribution(p, tuple(steps), before, after, std, last, far & [i in named for i in range(n)])
+
+
+def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
+    """The step, of a parameter that is rejected and near the furthest point of its path, that explains most."""
+    rejected = np.flatnonzero(holm(test.p_own[:n], level))
+    if not len(rejected) or test.noise is None:
+        return None
+    Q = np.linalg.qr(X)[0]
+    e = test.noise.held - Q @ (Q.T @ test.noise.held)
+    found = [_dated(Q, X[:, i], e, int(test.at[i])) for i in rejected]
+    most = int(np.argmax([gain for _, gain in found]))
+    return Step(int(rejected[most]), found[most][0])
+
+
+def _dated(Q: Array, x: Array, e: Array, at: int) -> tuple[int, float]:
+    """The place near ``at`` where a step of x explains most of e, which is orthogonal to Q, and how much."""
+    N = len(x)
+    places = np.arange(max(1, at - int(AROUND * N)), min(N - 1, at + int(AROUND * N)) + 1)
+    later = np.cumsum((x * e)[::-1])[::-1][places]
+    inside = np.cumsum((x[:, None] * Q)[::-1], axis=0)[::-1][places]
+    left = np.cumsum((x * x)[::-1])[::-1][places] - np.sum(inside * inside, axis=1)
+    gain = np.where(left > 1e-9 * (x @ x), later * later / np.maximum(left, 1e-300), 0.0)
+    best = int(np.argmax(gain))
+    return int(places[best]), float(gain[best])
+
+
+def _with(phi: Array, steps: list[Step]) -> Array:
+    """The regressors with one more column a step."""
+    later = [phi[:, step.parameter] * (np.arange(len(phi)) >= step.at) for step in steps]
+    return np.column_stack([phi, *later])
+
+
+def _sizes(X: Array, y: Array, steps: list[Step], n: int, noise: Noise | None) -> tuple[Array, Array, Array, Array]:
+    """(before, after, standard error of their difference, last); errors are heteroscedasticity-consistent."""
+    if noise is not None and len(noise.ar):
+        c = noise.level
+        X, y = whitened(X / c[:, None], y / c, noise.ar)
+        X, y = X * c[:, None], y * c
+    fit = robust_fit(X, y)
+    inverse = np.linalg.pinv(X.T @ (X * fit.inside[:, None]))
+    scores = X * fit.psi[:, None]
+    cov = inverse @ (scores.T @ scores) @ inverse
+    before, after, std, last = fit.theta[:n].copy(), fit.theta[:n].copy(), np.zeros(n), fit.theta[:n].copy()
+    for i in range(n):
+        own = sorted((k for k, step in enumerate(steps) if step.parameter == i), key=lambda k: steps[k].at)
+        if not own:
+            continue
+        levels = np.tril(np.ones((len(own), len(own))))
+        moved, columns = levels @ fit.theta[n:][own], np.ix_([n + k for k in own], [n + k for k in own])
+        errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", levels, cov[columns], levels), 0.0))
+        furthest = int(np.argmax(np.abs(moved) / np.maximum(errors, 1e-300)))
+        after[i], std[i], last[i] = before[i] + moved[furthest], errors[furthest], before[i] + moved[-1]
+    return before, after, std, last

@@ -1,0 +1,228 @@
+"""Are the coefficients of a regression constant? Score tests with the null of the record itself.
+
+    theta    the constant that solves sum phi_t psi(e_t) = 0,  e_t = y_t - phi_t' theta
+    psi(e)   = e clipped at 1.5 scales of the noise
+    S_t      = sum_{s <= t} phi_s psi(e_s)                      score path, 0 at the end
+    A_t      = sum_{s <= t} phi_s phi_s' psi'(e_s)              information
+    V_t      = sum_{s <= t} phi_s phi_s' psi(v_s)^2             variance of the scores
+    L_i      = mean_t S_ti^2 / V_Ti,    L = mean_t S_t' V_T^-1 S_t                (Nyblom 1989, Hansen 1992)
+
+If theta is constant, S_t = F_t - A_t A_T^-1 F_T, where F has independent increments of variance dV_t, so that
+
+    Cov(S_t, S_s) = V_min(t,s) - V_t A^-1 A_s - A_t A^-1 V_s + A_t A^-1 V_T A^-1 A_s
+
+and L is a weighted sum of chi-squares whose weights are the eigenvalues of that covariance; its tail is inverted
+numerically. Where noise and regressors are stationary this is the table of Hansen (1992). Where the noise variance or
+the excitation change, that table is wrong and this is not: the null follows the variance profile of the record.
+Zero drift lies on the boundary of "q >= 0", which spoils likelihood-ratio tests; a score test has no such trouble.
+
+L averages over the record, and sees a slow drift best. Beside it stand the suprema over one break and over a stretch
+(`driftfit.judge.statistics.supremum`), which see a sudden or a passing move best. The three become one p-value by the
+Cauchy combination of Liu and Xie (2020), so that the error rate is that of all together.
+
+The noise is that of the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which are
+those of constants where the record is not divided. Residuals of constants would count a large change as noise, and the
+test would be the weaker the larger the change. Where the noise is an autoregression, the rows of the regression are
+made white first. What correlation the scores have left is allowed for by the Bartlett estimate of V, up to 4 (N /
+100)^(2/9) lags, the rule of thumb (`driftfit.judge.statistics.bandwidth`).
+
+Which parameter moves is asked of A_T^-1 S_t, the path of the estimates: a move of one parameter shows in the scores of
+all whose regressors are correlated with its own, but there only in its own row.
+
+Departures: bounded scores (Huber 1964), so that outliers do not hide a drift; the null from the record (the idea of
+Hansen 2000, with the distribution inverted instead of simulated). Cost: O(T n^2), and an eigenvalue problem of at most
+about 200 rows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
+from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
+from driftfit.judge.statistics.quadratic import tail
+from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
+from driftfit.judge.statistics.supremum import suprema, together
+
+POINTS = 48
+"""At most so many points of the path enter the statistics and their null."""
+ROWS = 200
+"""At most about so many rows of the covariance of the joint path."""
+CELLS = 200
+"""At most so many places for breaks, where the noise is looked for."""
+EDGE = 0.05
+"""Share of a record at each end where no date is looked for."""
+
+
+class Constancy(NamedTuple):
+    """Tests of constancy; NaN where the record determines nothing."""
+
+    L: Array
+    """(n,): Nyblom's statistic of each parameter."""
+    p: Array
+    """(n,): its p-value, for the scores as Hansen has them."""
+    p_own: Array
+    """(n,): p-value of the path of the estimate, all tests together, which tells correlated parameters apart."""
+    joint: float
+    """Nyblom's statistic of all parameters together."""
+    p_joint: float
+    """All tests of all parameters together."""
+    p_each: tuple[float, float, float]
+    """Those of all parameters: of the mean square, of one break, of a stretch."""
+    at: Array
+    """(n,): the sample (of the N) from which on each parameter most likely is another."""
+    path: Array
+    """(N, n): standardised path of each estimate; about +-3 is far."""
+    fit: Fit
+    """Constants."""
+    noise: Noise | None
+    lags: int
+    """Order of the autoregression, and lags beyond it, that were allowed for."""
+
+
+def least_rows(n: int) -> int:
+    """Rows that a test of n parameters needs."""
+    return 4 * n + 8
+
+
+def shortest(n: int) -> int:
+    """Rows in the shortest segment or stretch that is looked for."""
+    return max(10, 4 * n)
+
+
+def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
+    """Test whether y (N,) on phi (N, n) has constant coefficients.
+
+    ``lags``: order of the autoregression of the noise; None finds it, and 0 takes the scores to be white.
+    """
+    N, n = phi.shape
+    size: Array = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.zeros(n)
+    if least_rows(n) > N or not (size > 0.0).all() or np.linalg.matrix_rank(phi / size, 1e-9) < n:
+        return _nothing(N, n)
+    X = phi / size
+    fit = robust_fit(X, y)
+    if not fit.scale > 1e-10 * np.sqrt(np.mean(y * y)):
+        return _nothing(N, n)._replace(fit=fit._replace(theta=fit.theta / size))
+    found = noise(orthonormal(X)[0], fit.residual, CELLS, shortest(n), lags)
+    return _tested(X, size, fit, found, lags)
+
+
+def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
+    N, n = X.shape
+    still = fit
+    if len(found.ar):
+        c = found.level
+        X, y = whitened(X / c[:, None], found.held / c, found.ar)
+        X, y = X * c[:, None], y * c
+        still = robust_fit(X, y)
+    psi = _alternative(found, still)
+    rest = min(plugged_in(X, psi), rule_of_thumb(N)) if lags is None else 0
+    m = max(24, min(POINTS, ROWS // n, N // 2))
+    ends = np.linspace(0, N, m + 1).astype(int)[1:]
+    A = _profile(X * still.inside[:, None], X, ends)
+    V = _profile(*(2 * (_summed(X * psi[:, None], rest),)), ends)
+    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < n or np.linalg.matrix_rank(V[-1], 1e-12) < n:
+        return _nothing(N, n)
+    S, inverse = np.cumsum(X * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
+    null = _null(A, V, inverse)
+    own = np.einsum("ij,bjck,kl->bicl", inverse, null, inverse, optimize=True)
+    path = S @ inverse
+    var = np.einsum("ij,jk,ki->i", inverse, V[-1], inverse)
+    least, apart = shortest(n), len(found.breaks) > 0
+    L, p = _each(S[ends - 1], null, np.diag(V[-1]))
+    _, p_path = _each(path[ends - 1], own, var)
+    alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
+    p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
+    joint, p_mean = _joint(S[ends - 1], null, V[-1])
+    p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
+    spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
+    std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
+    at, z = _dates(path, std.T)
+    shown = fit._replace(theta=fit.theta / size)
+    return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, shown, found, len(found.ar) + rest)
+
+
+def _alternative(found: Noise, still: Fit) -> Array:
+    """Bounded residuals of the segments, on the rows of the test.
+
+    Each is that of a fit without it: a short segment fits its own rows too well (MacKinnon and White, 1985).
+    """
+    if not len(found.breaks):
+        return still.psi
+    c = found.level
+    v = found.residual
+    if len(found.ar):
+        held = np.clip(v / c, -HELD, HELD)
+        v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
+    return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
+
+
+def _nothing(N: int, n: int) -> Constancy:
+    unknown = np.full(n, np.nan)
+    fit = Fit(unknown, np.full(N, np.nan), float("nan"), np.full(N, np.nan), np.zeros(N))
+    path = np.full((N, n), np.nan)
+    return Constancy(unknown, unknown, unknown, np.nan, np.nan, (np.nan,) * 3, np.zeros(n, int), path, fit, None, 0)
+
+
+def _summed(scores: Array, lags: int) -> Array:
+    """Moving sums over lags + 1 samples, scaled so that their squares are the Bartlett estimate."""
+    if lags == 0:
+        return scores
+    total = np.cumsum(np.concatenate([np.zeros((lags + 1, scores.shape[1])), scores]), axis=0)
+    summed: Array = (total[lags + 1 :] - total[: -lags - 1]) / np.sqrt(lags + 1.0)
+    return summed
+
+
+def _profile(left: Array, right: Array, ends: Array) -> Array:
+    """sum over s < end of left_s right_s', (m, n, n)."""
+    starts = np.concatenate([[0], ends[:-1]])
+    blocks = [left[a:b].T @ right[a:b] for a, b in zip(starts, ends, strict=True)]
+    total: Array = np.cumsum(np.array(blocks), axis=0)
+    return total
+
+
+def _null(A: Array, V: Array, inverse: Array) -> Array:
+    """Covariance of the score path, (m, n, m, n)."""
+    m, n = A.shape[:2]
+    G = A @ inverse
+    earlier = np.minimum.outer(np.arange(m), np.arange(m))
+    tall = G.reshape(m * n, n)
+    cross = (V.reshape(m * n, n) @ tall.T).reshape(m, n, m, n)
+    both = (tall @ V[-1] @ tall.T).reshape(m, n, m, n)
+    cov: Array = np.swapaxes(V[earlier], 1, 2) - cross - np.transpose(cross, (2, 3, 0, 1)) + both
+    return np.ascontiguousarray(cov)
+
+
+def _weights(cov: Array) -> Array:
+    """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
+    weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
+    return weights
+
+
+def _each(S: Array, cov: Array, var: Array) -> tuple[Array, Array]:
+    """Statistic and p-value of each parameter by itself."""
+    m, n = S.shape
+    L = np.mean(S * S, axis=0) / var
+    p = [tail(_weights(cov[:, i, :, i]) / (m * var[i]), L[i]) for i in range(n)]
+    return L, np.array(p)
+
+
+def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
+    """Statistic and p-value of all parameters together."""
+    m, n = S.shape
+    lower = np.linalg.cholesky(V)
+    root = np.linalg.inv(lower)
+    L = float(np.sum((S @ root.T) ** 2) / m)
+    white = np.einsum("ij,bjck,lk->bicl", root, cov, root, optimize=True).reshape(m * n, m * n)
+    return L, tail(_weights(white) / m, L)
+
+
+def _dates(path: Array, std: Array) -> tuple[Array, Array]:
+    """Where each standardised path is furthest from zero, edges left out."""
+    N = len(path)
+    z = path / np.where(std > 0.0, std, np.inf)
+    low, high = int(EDGE * N), max(int((1.0 - EDGE) * N), int(EDGE * N) + 1)
+    return low + np.argmax(np.abs(z[low:high]), axis=0) + 1, z

@@ -1,0 +1,332 @@
+"""What the noise of a regression is like while its coefficients may change: its level over time and its correlation.
+
+    v_t = y_t - phi_t' theta_(segment of t)          residuals of coefficients that are constant within segments
+    c_t                                              level of v around t: 1.4826 median |v| in windows, interpolated
+    v_t / c_t = sum_k a_k v_(t-k) / c_(t-k) + w_t    an autoregression, w white
+
+Residuals of constants would take a large change for noise, for a changing level of it and for its correlation. So the
+three are found from segments, and the segments in turn need the three:
+
+    1. windows of the record are fitted each by itself; level and partial autocorrelations are medians over windows, of
+       which a few contain a break
+    2. y is held within three levels of the fit, so that an outlier is no segment; rows are divided by the level and
+       made white, y_t - sum a_k y_(t-k) on phi_t - sum a_k phi_(t-k); `driftfit.judge.statistics.partition` finds the
+       segments
+    3. level and correlation anew from their residuals; from 2, until the segments stay
+
+The order of the autoregression is that of least BIC. A fit takes correlation away from its residuals: the first
+autocorrelation r of N residuals is too small by (2 r + sum_i (g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are
+the autocorrelations of the regressors (for a mean alone (1 + 3 r) / N), which is given back.
+
+Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for whitening before the segments; Marriott and Pope (1954) for
+the bias of a mean. Cost: O(T n^2), and that of the partition.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import ndimage, optimize, special
+
+from driftfit.engine.kernel import Array, Driver, shared
+from driftfit.judge.statistics.partition import partition
+from driftfit.judge.statistics.robust import cholesky, huber
+
+HELD = 3.0
+"""Levels of the noise within which y is held around the fit."""
+ORDER = 8
+"""Highest order of the autoregression."""
+LARGEST = 0.97
+ROUNDS = 6
+QUIET = 0.01
+"""Chance that a record of constant coefficients is divided."""
+WINDOW = 50
+
+
+class Noise(NamedTuple):
+    """What was found, on N rows."""
+
+    breaks: Array
+    """(K,): first rows of the segments after the first."""
+    residual: Array
+    """(N,): v, not bounded."""
+    level: Array
+    """(N,): c_t, standard deviation of v."""
+    ar: Array
+    """(p,): a."""
+    held: Array
+    """(N,): y within three levels of the fit of its segment, or of the nearest one beside a break."""
+    near: Array
+    """(N,): v, or that of the neighbouring segment beside a break where it is smaller."""
+    leverage: Array
+    """(N,): diagonal of the projector on the white rows of each segment."""
+    white: float
+    """Standard deviation of w, in units of the level."""
+    penalty: float
+    """What a break had to gain, in units of w's variance."""
+
+
+@shared
+def lagged(v: Array, limit: float, k: int) -> float:
+    """sum v_t v_(t-k) of v held within +-limit."""
+    total = 0.0
+    for t in range(k, v.shape[0]):
+        total += min(max(v[t], -limit), limit) * min(max(v[t - k], -limit), limit)
+    return total
+
+
+def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, level: Array, r: Array) -> None:
+    """Robust fits of windows: residual (N,) of the nearest centre, level (W,), sums at lags 0 .. P in r (W, P + 1)."""
+    n, W, P = Q.shape[1], starts.shape[0], r.shape[1] - 1
+    theta = np.zeros(n)
+    for w in range(W):
+        a, b = starts[w], ends[w]
+        own = np.empty(b - a)
+        level[w] = huber(Q[a:b], y[a:b], theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
+        first = a if w == 0 else (a + ends[w - 1]) // 2
+        final = b if w == W - 1 else (starts[w + 1] + b) // 2
+        residual[first:final] = own[first - a : final - a]
+        for k in range(P + 1):
+            r[w, k] = lagged(own, HELD * level[w], k)
+
+
+def _segments(
+    Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, residual: Array, near: Array, leverage: Array
+) -> None:
+    """Robust fits of segments on the white rows X, z, those that are mixed left out: residual (N,) of y on Q, near
+    (N,), that of the neighbouring segment where a break is near and it is smaller, and the leverage (N,) of X."""
+    N, n = Q.shape
+    K = bounds.shape[0] - 1
+    theta, own = np.zeros((K, n)), np.empty(N)
+    for k in range(K):
+        a, b = bounds[k], bounds[k + 1]
+        first = min(a + order[0], b - 1)
+        huber(X[first:b], z[first:b], theta[k], own[first:b])
+        lever(X[first:b], leverage[first:b])
+        leverage[a:first] = 0.0
+    for k in range(K):
+        a, b = bounds[k], bounds[k + 1]
+        for t in range(a, b):
+            residual[t] = y[t]
+            for i in range(n):
+                residual[t] -= Q[t, i] * theta[k, i]
+            near[t] = residual[t]
+            other = k - 1 if t - a < b - t else k + 1
+            if 0 <= other < K and min(t - a, b - t) < NEAR:
+                e = y[t]
+                for i in range(n):
+                    e -= Q[t, i] * theta[other, i]
+                if abs(e) < abs(near[t]):
+                    near[t] = e
+
+
+@shared
+def lever(X: Array, h: Array) -> None:
+    """h_t = x_t' (X' X)^-1 x_t."""
+    N, n = X.shape
+    M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
+    for t in range(N):
+        for i in range(n):
+            for j in range(i + 1):
+                M[i, j] += X[t, i] * X[t, j]
+    cholesky(M, n)
+    for t in range(N):
+        h[t] = 0.0
+        for i in range(n):
+            z[i] = X[t, i]
+            for j in range(i):
+                z[i] -= M[i, j] * z[j]
+            z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
+            h[t] += z[i] * z[i]
+
+
+def _pooled(v: Array, bounds: Array, limit: Array, r: Array) -> None:
+    """Sums at lags 0 .. P of products within segments, r (P + 1,)."""
+    for k in range(bounds.shape[0] - 1):
+        for lag in range(r.shape[0]):
+            r[lag] += lagged(v[bounds[k] : bounds[k + 1]], limit[0], lag)
+
+
+NEAR = 20
+_fit_windows = Driver(_windows)
+_fit_segments = Driver(_segments)
+_lags = Driver(_pooled)
+
+
+def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, quiet: float = QUIET) -> Noise:
+    """The noise of y (N,) on Q (N, n), Q' Q = N I.
+
+    ``cells``: breaks may lie at so many places, evenly spaced, at the most; ``least``: rows in a segment; ``order`` of
+    the autoregression, None finds it; ``quiet``: chance that constants are divided.
+    """
+    N, n = Q.shape
+    spans = _spans(N, n)
+    P = max(order or 0, min(ORDER, N // 20, (spans[1][0] - spans[0][0]) // 6))
+    residual, level, r = np.empty(N), np.empty(len(spans[0])), np.zeros((len(spans[0]), P + 1))
+    _fit_windows(Q, y, *spans, residual, level, r)
+    g = np.linalg.eigvalsh(0.5 * (Q[1:].T @ Q[:-1] + Q[:-1].T @ Q[1:]) / N)
+    width = int(spans[1][0] - spans[0][0])
+    c = _level(spans, level, N)
+    search = _Search(Q, y, c, spans, g, P, order, np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:],
+                     least, penalty(N, n, least, quiet))  # fmt: skip
+    r = r[r[:, 0] > 0.0]
+    pacf = np.median(_partial(r / r[:, :1], g, width), axis=0) if len(r) else np.zeros(P)
+    local = _chosen(pacf, min(N, 8 * width), order)
+    whole = search.correlation(y, np.zeros(0, np.int64))
+    found = search.settle(local, residual, residual)
+    if len(whole) or len(local):
+        found = min(found, search.settle(whole, residual, y), key=lambda one: one[0])
+    return found[1]
+
+
+class _Search(NamedTuple):
+    """What segments are looked for in; y is the residual of constants."""
+
+    Q: Array
+    y: Array
+    c: Array
+    spans: tuple[Array, Array]
+    g: Array
+    P: int
+    order: int | None
+    grid: Array
+    least: int
+    penalty: float
+
+    def settle(self, ar: Array, local: Array, near: Array) -> tuple[float, Noise]:
+        """Segments and noise that agree, from a first autoregression, that of ``near``; -2 log-likelihood first.
+
+        ``local``: residuals of windows, for outliers.
+        """
+        Q, y, c = self.Q, self.y, self.c
+        N, breaks = len(y), np.zeros(0, np.int64)
+        held = y - local + np.clip(local, -HELD * c, HELD * c)
+        for _ in range(ROUNDS):
+            before = breaks
+            X, z = whitened(Q / self.c[:, None], held / self.c, ar)
+            size = self.size(near, ar)
+            breaks = partition(X / size, z / size, self.grid, self.price(ar), self.least, len(ar))
+            residual, near, leverage = np.empty(N), np.empty(N), np.empty(N)
+            z = whitened(X[:, :0], y / self.c, ar)[1]
+            bounds = np.concatenate([[0], breaks, [N]])
+            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), residual, near, leverage)
+            ar = self.correlation(near, breaks)
+            c = self.c * (1.4826 * np.median(np.abs(near / self.c)))
+            held = y - near + np.clip(near, -HELD * c, HELD * c)
+            if np.array_equal(before, breaks):
+                break
+        cost = 2.0 * N * np.log(self.size(near, ar)) + len(breaks) * self.price(ar) + len(ar) * np.log(N)
+        return float(cost), Noise(
+            breaks,
+            residual,
+            c,
+            ar,
+            held,
+            near,
+            leverage,
+            self.size(near, ar) * float(np.median(self.c / c)),
+            self.price(ar),
+        )
+
+    def price(self, ar: Array) -> float:
+        """The penalty, dearer by the standard error of the logarithm of the noise's long-run variance."""
+        total = max(float(ar.sum()), 0.0)
+        return self.penalty * (1.0 + (2.0 * np.sqrt((1.0 + total) / (1.0 - total) / len(self.y)) if len(ar) else 0.0))
+
+    def correlation(self, v: Array, breaks: Array) -> Array:
+        """The autoregression of v within segments."""
+        N, r, v = len(v), np.zeros(self.P + 1), v / self.c
+        limit = HELD * 1.4826 * np.median(np.abs(v))
+        _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
+        if not r[0] > 0.0:
+            return r[:0]
+        return _chosen(_partial(r[None] / r[0], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
+
+    def size(self, v: Array, ar: Array) -> float:
+        """Standard deviation of the white noise, outliers held."""
+        w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
+        limit = HELD * 1.4826 * np.median(np.abs(w))
+        return float(np.sqrt(np.mean(np.clip(w, -limit, limit) ** 2))) if limit > 0.0 else 1.0
+
+
+def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
+    """Rows less a times the rows before; nothing in the first p."""
+    p = len(ar)
+    if p == 0:
+        return X, y
+    rows, values = X.copy(), y.copy()
+    for k, a in enumerate(ar, 1):
+        rows[k:] -= a * X[:-k]
+        values[k:] -= a * y[:-k]
+    rows[:p], values[:p] = 0.0, 0.0
+    return rows, values
+
+
+@lru_cache(4096)
+def penalty(N: int, n: int, least: int, quiet: float) -> float:
+    """Least fall of the sum of squares for a break.
+
+    The chance of one break by mistake, and half of that of a pair, in white Gaussian noise are about ``quiet``: the
+    supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
+    """
+    span = np.log(max(N / least - 1.0, np.e))
+    one = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
+    pair = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
+    return max(one, 0.5 * pair)
+
+
+def _exceeded(excess: Any) -> float:
+    return float(optimize.brentq(excess, 4.0, 1000.0))
+
+
+def _spans(N: int, n: int) -> tuple[Array, Array]:
+    """Starts and ends of windows that overlap by half."""
+    width = min(N, max(4 * n + 12, min(max(WINDOW, 10 * n), N // 6), N // 16))
+    count = max(1, 2 * (N // width) - 1)
+    starts = np.linspace(0, N - width, count).astype(np.int64)
+    return starts, starts + width
+
+
+def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
+    """c (N,) from the levels of windows (W,): medians of five, at least a twentieth of the median of all."""
+    smooth = ndimage.median_filter(level, 5, mode="nearest") if len(level) > 2 else level
+    positive = smooth[smooth > 0.0]
+    floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
+    return np.interp(np.arange(N), 0.5 * (spans[0] + spans[1]), np.maximum(smooth, floor))
+
+
+def _partial(r: Array, g: Array, N: float) -> Array:
+    """Partial autocorrelations (W, P) from autocorrelations r (W, P + 1) of residuals of fits on N rows."""
+    W, P = len(r), r.shape[1] - 1
+    found, a, left = np.zeros((W, P)), np.zeros((W, 0)), np.ones(W)
+    for k in range(P):
+        last = (r[:, k + 1] - np.sum(a * r[:, k:0:-1], axis=1)) / np.maximum(left, 1e-9)
+        found[:, k] = last = np.minimum(np.maximum(last, -LARGEST), LARGEST)
+        a = np.concatenate([a - last[:, None] * a[:, ::-1], last[:, None]], axis=1)
+        left *= 1.0 - last * last
+    if P:
+        found[:, 0] = _unbiased(found[:, 0], g, N)
+    return found
+
+
+def _unbiased(r: Array, g: Array, N: float) -> Array:
+    """The autocorrelations whose estimates from N residuals are r (W,) on average."""
+    rho = r
+    for _ in range(10):
+        each = rho[:, None]
+        lost = (2.0 * rho + np.sum((g - each) * (1.0 + g * each) / (1.0 - g * each), axis=1)) / N
+        rho = np.minimum(np.maximum(r + lost, -LARGEST), LARGEST)
+    return rho
+
+
+def _chosen(pacf: Array, N: int, order: int | None) -> Array:
+    """Coefficients of the autoregression of least BIC, or of the order given."""
+    if order is None:
+        bic = np.cumsum(N * np.log1p(-pacf * pacf) + np.log(N))
+        order = int(np.argmin(np.concatenate([[0.0], bic])))
+    a = np.zeros(0)
+    for last in pacf[:order]:
+        a = np.append(a - last * a[::-1], last)
+    return a

@@ -1,0 +1,54 @@
+"""Paired tests of one-step errors: is one predictor better than another on the same samples?
+
+    d_t = e_rival,t^2 - e_t^2,     t = mean(d) / sqrt(v / N),     v = Bartlett sum of autocovariances
+
+The lags are floor(4 (N / 100)^(2/9)). The p-value is one-sided, for the claim that the run is better. Where parameters
+are constant a tracker is a little worse than constant least squares, so that the test claims too seldom.
+
+Source: Diebold and Mariano (1995); the variance is that of Newey and West (1987).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+
+LEAST = 10
+"""Fewest errors that are compared."""
+
+
+class Paired(NamedTuple):
+    """A rival beside the run: its root mean square error, the t statistic and p-value of being worse than the run."""
+
+    name: str
+    rms: float
+    t: float
+    p: float
+
+
+def newey_west(d: Array) -> float:
+    """Long-run variance of d (N,)."""
+    N = len(d)
+    d = d - d.mean()
+    lags = min(int(4.0 * (N / 100.0) ** (2.0 / 9.0)), N - 1)
+    v = float(d @ d)
+    for k in range(1, lags + 1):
+        v += 2.0 * (1.0 - k / (lags + 1.0)) * float(d[k:] @ d[:-k])
+    return v / N
+
+
+def paired(name: str, rival: Array, own: Array) -> Paired:
+    """Compare the one-step errors (N,) of a rival with those of a run; NaN where there are fewer than ten."""
+    rms = float(np.sqrt(np.mean(rival * rival))) if len(rival) else float("nan")
+    if len(own) < LEAST:
+        return Paired(name, rms, float("nan"), float("nan"))
+    d = rival * rival - own * own
+    v = newey_west(d)
+    if not v > 0.0:
+        return Paired(name, rms, 0.0, 0.5)
+    t = float(d.mean() / np.sqrt(v / len(d)))
+    return Paired(name, rms, t, 0.5 * math.erfc(t / math.sqrt(2.0)))

@@ -1,0 +1,106 @@
+"""The cheapest partition of a record into segments with coefficients of their own, exactly, by dynamic programming.
+
+    F(t) = min over s of  F(s) + C(s, t) + penalty,     C(s, t) = least sum of squares of the rows s .. t
+
+C comes from a Cholesky factor of [phi, y]' [phi, y], summed block by block from s on, without differences of large
+sums. Rows that were made white by an autoregression of order p belong to two segments for p rows after a break: these
+count as one each, whatever they are.
+
+A start s with F(s) + C(s, t) - p >= F(t) can never be the last break of a longer record and is dropped (as soon as
+segments from t on are long enough to be allowed), so that the cost is O(T) where breaks keep coming, and O(T^2) blocks
+where there are none. Breaks may lie between blocks only. Source: Killick, Fearnhead and Eckley (2012), PELT.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.statistics.robust import cholesky
+
+
+def _sum(phi: Array, y: Array, ends: Array, p: Array, G: Array) -> None:
+    """[phi, y]' [phi, y] of the blocks of rows that end at ``ends`` (m,), lower triangles: G (2, m, n + 1, n + 1).
+
+    In G[0] of all rows, in G[1] of those after the first p.
+    """
+    n = phi.shape[1]
+    start = 0
+    for b in range(ends.shape[0]):
+        for t in range(start, ends[b]):
+            for later in range(2 if t - start >= p[0] else 1):
+                for i in range(n):
+                    for j in range(i + 1):
+                        G[later, b, i, j] += phi[t, i] * phi[t, j]
+                    G[later, b, n, i] += phi[t, i] * y[t]
+                G[later, b, n, n] += y[t] * y[t]
+        start = ends[b]
+
+
+def _partition(G: Array, ends: Array, penalty: Array, least: Array, p: Array, F: Array, last: Array) -> None:
+    """F (m + 1,), and the start of the last segment of the first t blocks, last (m + 1,)."""
+    m, k = G.shape[1], G.shape[2]
+    total, M = np.zeros((m, k, k)), np.zeros((k, k))
+    alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, np.inf)
+    mixed = np.zeros(m)
+    count = 0
+    F[0] = -penalty[0]
+    for t in range(1, m + 1):
+        end, begin = ends[t - 1], ends[t - 2] if t > 1 else 0
+        if np.isfinite(F[t - 1]):
+            alive[count] = t - 1
+            count += 1
+        best, chosen = np.inf, -1
+        for a in range(count):
+            s = alive[a]
+            start = ends[s - 1] if s > 0 else 0
+            free = 0 if s == 0 else p[0] - (begin - start)
+            if free <= 0 or begin == start:
+                block = G[1 if free > 0 else 0, t - 1]
+                for i in range(k):
+                    for j in range(i + 1):
+                        total[s, i, j] += block[i, j]
+                mixed[s] += max(0, min(free, end - begin))
+            else:
+                mixed[s] += end - begin
+            value[s] = np.inf
+            if end - start >= least[0]:
+                for i in range(k):
+                    for j in range(i + 1):
+                        M[i, j] = total[s, i, j]
+                value[s] = F[s] + cholesky(M, k - 1) + mixed[s]
+                if value[s] < best:
+                    best, chosen = value[s], s
+        F[t] = best + penalty[0]
+        last[t] = chosen
+        kept = 0
+        for a in range(count):
+            s = alive[a]
+            if expired[s] < 0 and np.isfinite(value[s]) and value[s] - p[0] >= F[t]:
+                expired[s] = end
+            if expired[s] < 0 or end - expired[s] < least[0]:
+                alive[kept] = s
+                kept += 1
+        count = kept
+
+
+_blocks = Driver(_sum)
+_best = Driver(_partition)
+
+
+def partition(phi: Array, y: Array, ends: Array, penalty: float, least: int, p: int = 0) -> Array:
+    """First rows of the segments after the first, of y (N,) on phi (N, n), both in units of the noise.
+
+    ``ends`` (m,) of whole numbers, the last of them N: where a segment may end. ``least``: rows in a segment. ``p``:
+    order of the autoregression that made the rows white.
+    """
+    m, k = len(ends), phi.shape[1] + 1
+    G, F, last = np.zeros((2, m, k, k)), np.empty(m + 1), np.zeros(m + 1, np.int64)
+    ends, order = np.ascontiguousarray(ends, np.int64), np.array([p])
+    _blocks(phi, y, ends, order, G)
+    _best(G, ends, np.array([penalty]), np.array([least]), order, F, last)
+    breaks, t = [], m
+    while last[t] > 0:
+        t = int(last[t])
+        breaks.append(int(ends[t - 1]))
+    return np.array(breaks[::-1], np.int64)

@@ -1,0 +1,137 @@
+"""Is there a date, or a stretch, at which a score path moved too far? Suprema of Wald-type statistics.
+
+    Q(a, b) = (S_b - S_a)' Var(S_b - S_a)^-1 (S_b - S_a)          chi-square with n degrees of freedom for constants
+    one break      c = max over b of Q(0, b)                      the path is tied at both ends: before b against after
+    a stretch      c = max over a < b of Q(a, b)                  within against outside
+
+    P(max Q > c) = P(chi2_n > c) sum kappa_b,  or  sum kappa_a kappa_b,      kappa = x nu(sqrt(2 x)),  x = c (1 - rho)
+
+rho is the correlation of Q's Gaussian vector with that of the next place, from the covariance of the path, so that the
+null is that of the record. nu is what is lost between places: kappa is 1 where neighbours are independent, which is
+Bonferroni's bound, and less where they are alike. Where the mean square of a path (Nyblom and Hansen) averages a short
+move away, the supremum keeps it: it grows with the square of its size.
+
+Source: Andrews (1993) for the supremum; Siegmund (1985), Yao (1993) for its tail on a grid. Departures: covariances
+of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m places.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from driftfit.engine.kernel import Array, Driver
+from driftfit.judge.statistics.robust import cholesky
+
+
+def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
+    """Q, and 1 - rho when a or b moves by one place; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n)."""
+    m, n = S.shape[0] - 1, S.shape[1]
+    M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
+    for a in range(m):
+        for b in range(a + 1, m + 1):
+            for i in range(n):
+                for j in range(i + 1):
+                    M[i, j] = cov[b, i, b, j] + cov[a, i, a, j] - cov[a, i, b, j] - cov[b, i, a, j]
+                M[n, i] = S[b, i] - S[a, i]
+            M[n, n] = 0.0
+            cholesky(M, n)
+            total = 0.0
+            for i in range(n):
+                total += M[n, i] * M[n, i]
+            Q[a, b] = total
+            for side in range(2):
+                x = a if side == 0 else b - 1
+                y = x + 1
+                share = 0.0
+                for j in range(n):
+                    # column j of the factor's inverse times the variance of the place that is gained or lost
+                    for i in range(n):
+                        z[i] = cov[y, i, y, j] + cov[x, i, x, j] - cov[x, i, y, j] - cov[y, i, x, j]
+                    for i in range(n):
+                        for k in range(i):
+                            z[i] -= M[i, k] * z[k]
+                        z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
+                    for i in range(n - 1, j - 1, -1):
+                        for k in range(i + 1, n):
+                            z[i] -= M[k, i] * z[k]
+                        z[i] = z[i] / M[i, i] if M[i, i] > 0.0 else 0.0
+                    share += z[j]
+                if side == 0:
+                    left[a, b] = 0.5 * share / n
+                else:
+                    right[a, b] = 0.5 * share / n
+
+
+_run = Driver(_scan)
+
+
+def scanned(S: Array, cov: Array) -> tuple[Array, Array, Array]:
+    """Q, and 1 - rho when a or b moves by one place, (m + 1, m + 1) each, of a path S (m, n)."""
+    m, n = S.shape
+    path, full = np.zeros((m + 1, n)), np.zeros((m + 1, n, m + 1, n))
+    path[1:], full[1:, :, 1:] = S, cov
+    Q, left, right = np.zeros((3, m + 1, m + 1))
+    _run(path, full, Q, left, right)
+    return Q, left, right
+
+
+def suprema(S: Array, cov: Array, rows: Array, least: int, apart: bool) -> tuple[float, float]:
+    """p-values of one break, and of a stretch, for the path S (m, n) with covariance (m, n, m, n).
+
+    ``rows`` (m,): rows up to each place, the last of them all; ``least``: rows on each side, in a stretch and outside.
+    ``apart``: the covariance is that of other residuals than those of the path. Then Q of a stretch of k rows is
+    Hotelling's T^2, which is far from chi-square where k is small, and (k - (n + 3) / 2) log(1 + Q / k) is taken
+    (Bartlett, 1938). Of the same residuals Q is at most k.
+    """
+    m, n = S.shape
+    Q, left, right = scanned(S, cov)
+    at = np.concatenate([[0], rows])
+    length = at[None, :] - at[:, None]
+    allowed = (length >= least) & (length <= rows[-1] - least)
+    if apart:
+        k = np.maximum(np.minimum(length, rows[-1] - length), least)
+        Q = (k - 0.5 * (n + 3)) * np.log1p(Q / k)
+    single, double = allowed.copy(), allowed
+    single[1:] = False
+    double[0] = double[:, m] = False
+    single[:, m] = False
+    return _tail(Q[single], n, right[single]), _tail(Q[double], n, left[double], right[double])
+
+
+def _tail(Q: Array, n: int, *moved: Array) -> float:
+    """P(max Q > its largest) for chi-squares that have 1 - rho = moved to their neighbours."""
+    if not Q.size:
+        return float("nan")
+    c = float(Q.max())
+    places = np.ones(len(Q))
+    for one in moved:
+        places *= _kappa(c * np.minimum(one, 1.0))
+    return float(min(1.0, special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
+
+
+def _kappa(x: Array) -> Array:
+    """x nu(sqrt(2 x))."""
+    half = np.sqrt(np.maximum(x, 1e-12) / 2.0)
+    density = np.exp(-0.5 * half * half) / np.sqrt(2.0 * np.pi)
+    above = special.ndtr(half)
+    nu = (above - 0.5) / half / (half * above + density)
+    kappa: Array = np.minimum(1.0, np.maximum(x, 0.0) * nu)
+    return kappa
+
+
+def together(mean: float, *suprema: float) -> float:
+    """One p-value of tests of one record, however they depend on each other: Liu and Xie (2020).
+
+    The mean square has half of the weight, the suprema share the rest. p-values above one half count as one half: those
+    of suprema are bounds, and say no more there.
+    """
+    p = np.array([mean, *suprema])
+    weight = np.array([0.5, *[0.5 / len(suprema)] * len(suprema)])
+    known = np.isfinite(p)
+    if not known.any():
+        return float("nan")
+    p, weight = np.clip(p[known], 1e-12, 0.5), weight[known] / weight[known].sum()
+    # tan loses the small ones
+    total = float(np.sum(weight * np.where(p < 1e-6, 1.0 / (p * np.pi), np.tan((0.5 - p) * np.pi))))
+    return 1.0 / (total * np.pi) if total > 1e6 else float(0.5 - np.arctan(total) / np.pi)

@@ -1,0 +1,58 @@
+"""Is a sequence white? Autocorrelations whose limits do not need a constant variance.
+
+    r_k = sum z_t z_(t-k) / sum z_t^2,   se_k^2 = sum z_t^2 z_(t-k)^2 / (sum z_t^2)^2,   Q = sum_k (r_k / se_k)^2
+
+Q is chi-square with K degrees of freedom for martingale differences, whatever their variance does. Values are clipped
+at three robust standard deviations first, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from driftfit.engine.kernel import Array
+
+
+class Whiteness(NamedTuple):
+    """Correlations at K lags with their standard errors under whiteness, Q and its p-value."""
+
+    r: Array
+    std: Array
+    Q: float
+    p: float
+
+
+def clipped(z: Array) -> Array:
+    """z within three robust standard deviations, missing values as 0."""
+    z = np.where(np.isfinite(z), z, 0.0)
+    used = np.abs(z[z != 0.0])
+    limit = 3.0 * 1.4826 * float(np.median(used)) if used.size else 0.0
+    return np.clip(z, -limit, limit)
+
+
+def whiteness(z: Array, lags: int | None = None) -> Whiteness:
+    """Test z (N,), in the order of time, NaN where there is nothing; 20 lags unless N is below 100."""
+    z = clipped(z)
+    K = min(20, len(z) // 5) if lags is None else lags
+    return _correlation(z, z, range(1, K + 1))
+
+
+def crossing(z: Array, u: Array, lags: int = 10) -> Whiteness:
+    """Correlations of z (N,) with u (N,) of 0 .. lags samples before."""
+    u = u - np.mean(u[np.isfinite(u)]) if np.isfinite(u).any() else u
+    return _correlation(clipped(z), np.where(np.isfinite(u), u, 0.0), range(min(lags, len(z) - 1) + 1))
+
+
+def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
+    total = np.sqrt(np.sum(z * z) * np.sum(u * u))
+    if not total > 0.0 or not len(lags):
+        unknown = np.full(len(lags), np.nan)
+        return Whiteness(unknown, unknown, float("nan"), float("nan"))
+    pairs = [z[k:] * u[: len(u) - k] for k in lags]
+    r = np.array([np.sum(pair) for pair in pairs]) / total
+    std = np.sqrt([np.sum(pair * pair) for pair in pairs]) / total
+    Q = float(np.sum((r[std > 0.0] / std[std > 0.0]) ** 2))
+    return Whiteness(r, std, Q, float(special.chdtrc(len(lags), Q)))

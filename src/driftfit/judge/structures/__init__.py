@@ -1,0 +1,1 @@
+"""Which structure: orders, delays and regressors, selected or averaged."""

@@ -1,0 +1,155 @@
+"""Structures as columns of one regression: the union of what several ARX or Regression models use.
+
+    phi_t of a structure = its columns of the union's phi_t
+
+The union is run once to collect its regressors (lags that are missing are filled by constant least squares on all of
+them), so all structures see the same rows. Structures with as many columns have states of the same shape and run side
+by side, in fleets of up to 32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.data.record import Records
+from driftfit.engine.kernel import Array
+from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.models.regression import Regression
+from driftfit.run.fleet import run_fleet
+from driftfit.run.result import Track
+from driftfit.run.track import drive
+from driftfit.run.warm_start import fresh_tile
+from driftfit.trackers.base import Tracker
+
+TOGETHER = 32
+
+Term = tuple[str, int, int]
+"""("y", 0, lag), ("u", input, lag) or ("1", 0, 0)."""
+
+
+class Structure(NamedTuple):
+    """A candidate: a model, columns of the union (None: the model runs by itself), or columns without a model."""
+
+    name: str
+    n: int
+    model: Model | None
+    columns: tuple[int, ...] | None
+
+
+class Predicted(NamedTuple):
+    """What a structure said of every sample before its output was seen; NaN where it said nothing."""
+
+    y_hat: Array
+    s: Array
+    loglik: Array
+
+
+@dataclass(frozen=True)
+class Pool:
+    """A record, and the regressors (T, N) of the union of the structures that are made of columns."""
+
+    y: Array
+    u: Array
+    known: Array
+    phi: Array
+    names: tuple[str, ...]
+    gaps: Array
+
+    def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
+        """Run structures and return what they predicted."""
+        found: dict[int, Predicted] = {}
+        sizes = sorted({s.n for s in structures if s.columns is not None})
+        for n in sizes:
+            same = [k for k, s in enumerate(structures) if s.n == n and s.columns is not None]
+            for first in range(0, len(same), TOGETHER):
+                part = same[first : first + TOGETHER]
+                runs = self._lanes(tracker, [structures[k] for k in part])
+                found |= dict(zip(part, map(predicted, runs), strict=True))
+        for k, structure in enumerate(structures):
+            if structure.columns is None:
+                found[k] = predicted(self._alone(tracker, structure))
+        return [found[k] for k in range(len(structures))]
+
+    def _lanes(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Track]:
+        count, T, n = len(structures), len(self.y), structures[0].n
+        columns = [s.columns for s in structures]
+        u = np.concatenate([self.phi[:, list(chosen or ())] for chosen in columns])
+        factors = np.broadcast_to(self.known, (T, 3)).copy()
+        factors[:, 0] = self.gaps
+        records = Records(
+            tuple(range(count)), np.arange(count) * T, np.full(count, T), np.tile(self.y, count), u,
+            np.tile(factors, (count, 1)),
+        )  # fmt: skip
+        fleet = run_fleet(Regression(n), [tracker] * count, records)
+        return [fleet[k] for k in range(count)]
+
+    def _alone(self, tracker: Tracker, structure: Structure) -> Track:
+        assert structure.model is not None
+        tile = fresh_tile(structure.model, tracker)
+        out = drive(structure.model, tracker, tile, self.y, self.u, self.known)
+        return Track(structure.model, tracker, self.y, self.u, None, self.known, out, tile)
+
+
+def predicted(run: Track) -> Predicted:
+    """The predictions of a run, and the log-likelihood of each sample."""
+    s = run.innovation_std**2
+    known = run.ok & np.isfinite(s) & (s > 0.0)
+    return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
+
+
+def pool_of(
+    models: Sequence[Model], names: Sequence[str], y: Array, u: Array, known: Array
+) -> tuple[Pool, list[Structure]]:
+    """The record with the union of the models' regressors, and the models as structures; models are bound."""
+    linear = [model for model in models if _terms(model) is not None]
+    if not linear:
+        empty = Pool(y, u, known, np.zeros((len(y), 0)), (), np.ones(len(y)))
+        return empty, [Structure(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
+    union = _union(linear)
+    order = {term: i for i, term in enumerate(_terms(union) or ())}
+    seen = constant_least_squares(union, y, u, known)
+    phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
+    pool = Pool(y, u, known, phi, union.names, seen["dt"][:, 0].copy())
+    structures = []
+    for name, model in zip(names, models, strict=True):
+        terms = _terms(model)
+        columns = None if terms is None else tuple(order[term] for term in terms)
+        structures.append(Structure(name, model.n, model, columns))
+    return pool, structures
+
+
+def _terms(model: Model) -> list[Term] | None:
+    """What the columns of a model are; None for a model that is no ARX or Regression with one output."""
+    one: list[Term] = [("1", 0, 0)] if getattr(model, "intercept", False) else []
+    if len(model.outputs) > 1 or hasattr(model, "log_jacobian"):
+        return None
+    if isinstance(model, Regression):
+        return [*(("u", j, 0) for j in range(model.m)), *one]
+    if isinstance(model, ARX):
+        lags: list[Term] = [("y", 0, i + 1) for i in range(model.na)]
+        return [*lags, *(("u", j, nk + i) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)), *one]
+    return None
+
+
+def _union(models: Sequence[Model]) -> Model:
+    """The smallest model that has the regressors of all."""
+    terms = {term for model in models for term in _terms(model) or ()}
+    constant = ("1", 0, 0) in terms
+    if all(isinstance(model, Regression) for model in models):
+        first = models[0]
+        assert isinstance(first, Regression)
+        return Regression(first.regressors, intercept=constant)
+    na = max((lag for what, _, lag in terms if what == "y"), default=0)
+    nb, nk = [], []
+    for j in range(models[0].m):
+        lags = [lag for what, i, lag in terms if what == "u" and i == j]
+        nk.append(min(lags, default=0))
+        nb.append(max(lags) - nk[-1] + 1 if lags else 0)
+    arx = next(model for model in models if isinstance(model, ARX))
+    return ARX(na, tuple(nb), nk=tuple(nk), inputs=arx.inputs, intercept=constant, start=arx.start)

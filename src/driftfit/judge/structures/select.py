@@ -1,0 +1,277 @@
+"""Select: orders, delays and regressors by how well each structure predicted, and averages over structures in time.
+
+    loglik of a structure = sum over scored samples of -1/2 (log 2 pi s_t + e_t^2 / s_t),   e_t, s_t one step ahead
+
+Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them
+without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. All
+structures are scored on the same samples: those after max(50, 5 n) of the largest that every one could predict.
+
+* `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
+  columns of one regression, the union of their regressors: it is built once, its rows are shared, and structures with
+  as many columns run side by side as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run one by
+  one; a model whose regressors hold the present output brings its Jacobian (``log_jacobian``).
+* `select(model, y, u)` with one model looks for the best subset of its regressors: all subsets up to 5 of them, and
+  from there to 30 a search that adds the best and drops the worst, p runs a round instead of 2^p.
+
+The table gives for each structure the loglik, its distance from the best with a standard error (Newey and West), and
+the root mean square error. ``best`` has the highest; ``simplest`` has the fewest parameters of those that are within
+one standard error of it. `Selection.average` is dynamic model averaging: see there.
+
+Source: Dawid (1984); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the recursion of the
+weights in closed form. Cost: one run a structure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.data.arguments import check_roles
+from driftfit.data.record import Reading, one_series
+from driftfit.data.signals import check_ready, factor
+from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.paired import newey_west
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
+from driftfit.judge.structures.subsets import subsets
+from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.show.summary import Printed, table_of
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.trackers.base import Tracker
+
+if TYPE_CHECKING:
+    import polars
+    from matplotlib.figure import Figure
+
+    from driftfit.judge.structures.average import Average
+
+MOST = 30
+"""At most so many regressors are searched."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One structure: its loglik, how far below the best with a standard error, and its root mean square error."""
+
+    name: str
+    n: int
+    loglik: float
+    below: float
+    std: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Selection(Printed):
+    """What `select` returns; printing it shows the table.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        Every structure that was tried, best first.
+    best, simplest : str
+        Names of the structure with the highest loglik, and of the one with the fewest parameters within one standard
+        error of it.
+    scored : int
+        Samples in the loglik.
+    """
+
+    rows: tuple[Row, ...]
+    scored: int
+    tracker: Tracker
+    pool: Pool = field(repr=False, compare=False)
+    structures: tuple[Structure, ...] = field(repr=False, compare=False)
+    predictions: tuple[Predicted, ...] = field(repr=False, compare=False)
+    judged: Array = field(repr=False, compare=False)
+
+    @property
+    def best(self) -> str:
+        return self.rows[0].name
+
+    @property
+    def simplest(self) -> str:
+        within = [row for row in self.rows if row.below <= row.std]
+        return min(within, key=lambda row: (row.n, row.below)).name
+
+    def model(self, name: str | None = None) -> Model:
+        """The model of a structure, the best by default; ValueError for a subset, which is no model by itself."""
+        found = self._structure(name).model
+        if found is None:
+            raise ValueError(
+                "select: a subset of regressors is no model by itself; regressors(name) says what it holds."
+            )
+        return found
+
+    def regressors(self, name: str | None = None) -> tuple[str, ...]:
+        """Names of the regressors of a structure, the best by default."""
+        structure = self._structure(name)
+        if structure.columns is None:
+            assert structure.model is not None
+            return structure.model.names
+        return tuple(self.pool.names[i] for i in structure.columns)
+
+    def _structure(self, name: str | None) -> Structure:
+        wanted = self.best if name is None else name
+        for structure in self.structures:
+            if structure.name == wanted:
+                return structure
+        raise ValueError(f"select: there is no structure {wanted!r}; the table has {len(self.rows)}.")
+
+    def average(self, forgetting: float = 0.99) -> Average:
+        """Average all structures in time; ``forgetting`` in (0, 1] is how fast a structure's past counts less."""
+        if not 0.0 < forgetting <= 1.0:
+            raise ValueError(f"average: forgetting must be in (0, 1]; got {forgetting!r}.")
+        from driftfit.judge.structures.average import averaged
+
+        names = self.pool.names if all(s.columns is not None for s in self.structures) else ()
+        return averaged(list(self.structures), list(self.predictions), self.pool.y, self.judged, forgetting, names)
+
+    @property
+    def table(self) -> polars.DataFrame:
+        """The rows as a table."""
+        import polars
+
+        heads = ("name", "n", "loglik", "below", "std", "rms")
+        return polars.DataFrame({head: [getattr(row, head) for row in self.rows] for head in heads})
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = table_of("Structures", "", "n", "loglik", "below", "+-", "rms")
+        table.columns[0].no_wrap, table.columns[0].overflow, table.columns[0].ratio = False, "fold", 5
+        for row in self.rows[:20]:
+            numbers = (f"{row.loglik:.1f}", f"{row.below:.1f}", f"{row.std:.1f}", f"{row.rms:.3g}")
+            table.add_row(Text(row.name), str(row.n), *numbers)
+        yield table
+        if len(self.rows) > 20:
+            yield Text(f" and {len(self.rows) - 20} more", "dim")
+        yield Text(" below: log-likelihood below the best, +- its standard error", "dim")
+        yield Text(f" best: {self.best}")
+        yield Text(f" simplest within one standard error: {self.simplest}")
+        yield Text(f" on {self.scored} samples that all could predict", "dim")
+
+    def plot(self, most: int = 20) -> Figure:
+        """How far structures are below the best, with standard errors, and where in time they lost it."""
+        from driftfit.judge.plots import plot_selection
+
+        return plot_selection(self, most)
+
+
+def grid(kind: type[Model], **choices: Any) -> list[Model]:
+    """Every combination of settings: ``grid(ARX, na=[1, 2], nb=[1, 2], intercept=True)`` is four models.
+
+    A list is a choice; anything else, a tuple too, is one value for all. Combinations that the model refuses are left
+    out; ValueError where none is left.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Model)):
+        raise TypeError(f"grid: it makes the models, so give their class, as in grid(ARX, na=[1, 2]); got {kind!r}.")
+    options = [value if isinstance(value, list | range) else [value] for value in choices.values()]
+    models: list[Model] = []
+    refused = ""
+    for values in product(*options):
+        try:
+            models.append(kind(**dict(zip(choices, values, strict=True))))
+        except ValueError as error:
+            refused = str(error)
+    if not models:
+        raise ValueError(f"grid: no combination makes a {kind.__name__}: {refused or 'a choice is empty'}")
+    return models
+
+
+def select(
+    models: Model | Sequence[Model],
+    y: Any,
+    u: Any = None,
+    *,
+    tracker: Tracker | None = None,
+    keep: Sequence[str] = (),
+    most: int | None = None,
+    time: Any = None,
+    dt: Any = None,
+    weights: Any = 1.0,
+    drift: Any = 1.0,
+    limits: Any = None,
+    exclude: Any = None,
+) -> Selection:
+    """Compare structures by predictive likelihood.
+
+    Parameters
+    ----------
+    models : sequence of models, or one model
+        Candidates; or the model whose regressors are to be chosen, at most 30.
+    y, u, time, dt, weights, drift, limits, exclude
+        As for `track`; one number or (T,) for drift.
+    tracker : Tracker
+        How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
+        parameters: one q, not a vector.
+    keep : names
+        Regressors that every subset has, such as ("intercept",).
+    most : int or None
+        Most regressors in a subset.
+
+    Raises
+    ------
+    ValueError
+        No candidate, a tracker without a variance, more than 30 regressors, names that are not there, or what `track`
+        refuses.
+    """
+    tracker = AdaptiveKalman() if tracker is None else tracker
+    candidates = list(models) if isinstance(models, Iterable) else [models]
+    for model in candidates:
+        check_roles("select", model, tracker)
+    check_ready(tracker)
+    if not tracker.covariance:
+        raise ValueError(f"select: {type(tracker).__name__} has no variance, so there is no likelihood to compare.")
+    if not candidates:
+        raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
+    reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    records = one_series(y, u, reading)
+    factor("drift", drift, len(records.y))
+    named = max(candidates, key=lambda model: len(model.input_names))
+    records = records.for_model(named, reading, max(model.reach for model in candidates))
+    bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
+    if any(len(model.outputs) > 1 for model in bound):
+        raise ValueError("select: structures are compared for one output at a time.")
+    if isinstance(models, Model) and bound[0].n > MOST:
+        raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
+    names = [repr(model) for model in candidates]
+    pool, structures = pool_of(bound, names, records.y, records.u, records.known)
+    if isinstance(models, Model):
+        structures, predictions = subsets(pool, tracker, structures[0], keep, most)
+    else:
+        predictions = pool.predict(tracker, structures)
+    return _judged(pool, tracker, structures, predictions)
+
+
+def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
+    """A candidate for these inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+    m = inputs if isinstance(inputs, int) else len(inputs)
+    if isinstance(model, ARX) and model.inputs == 0 and m > 0:
+        model = replace(model, inputs=m)
+    if not isinstance(inputs, int) and model.input_names not in ((), tuple(inputs)):
+        raise ValueError(
+            f"select: candidates name the same inputs in the same order; {model!r} has others than {', '.join(inputs)}."
+        )
+    return model.bind(inputs)
+
+
+def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
+    """Rank structures on the samples that all could predict."""
+    judged = np.arange(len(pool.y)) >= max(50, 5 * max(s.n for s in structures))
+    for prediction in predictions:
+        judged &= np.isfinite(prediction.loglik)
+    terms = [prediction.loglik[judged] for prediction in predictions]
+    totals = np.array([float(np.sum(term)) for term in terms])
+    top, count = int(np.argmax(totals)), int(judged.sum())
+    rows = []
+    for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):
+        spread = float(np.sqrt(count * max(newey_west(terms[top] - term), 0.0))) if count > 10 else float("nan")
+        error = (pool.y - prediction.y_hat)[judged]
+        rms = float(np.sqrt(np.mean(error * error))) if count else float("nan")
+        rows.append(Row(structure.name, structure.n, float(total), float(totals[top] - total), spread, rms))
+    rows.sort(key=lambda row: -row.loglik)
+    return Selection(tuple(rows), count, tracker, pool, tuple(structures), tuple(predictions), judged)

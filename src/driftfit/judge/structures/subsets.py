@@ -1,0 +1,88 @@
+"""The best subset of the regressors of one model: all subsets of a few, a search among many.
+
+The search adds the regressor that helps most and drops what no longer helps, until neither raises the log-likelihood by
+GAIN: p runs a round instead of 2^p. Every subset is run once, and subsets of one size run side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure
+from driftfit.trackers.base import Tracker
+
+ALL = 5
+"""Up to so many regressors all subsets are tried."""
+GAIN = 2.0
+"""A step of the search must raise the loglik by this much."""
+
+
+def subsets(
+    pool: Pool, tracker: Tracker, full: Structure, keep: Sequence[str], most: int | None
+) -> tuple[list[Structure], list[Predicted]]:
+    """Subsets of the regressors of one model: all, or those that a search visits."""
+    if full.columns is None:
+        raise ValueError("select: subsets are those of the regressors of ARX or Regression; give a list of models.")
+    unknown = [name for name in keep if name not in pool.names]
+    if unknown:
+        raise ValueError(f"select: there is no regressor {unknown[0]!r}; there is {', '.join(pool.names)}.")
+    N = len(pool.names)
+    largest = N if most is None else whole("select", "most", most, 1)
+    kept = frozenset(pool.names.index(name) for name in keep)
+    free = [i for i in range(N) if i not in kept]
+    tried = Tried(pool, tracker)
+    if len(free) <= ALL:
+        every = [kept | set(c) for r in range(len(free) + 1) for c in combinations(free, r)]
+        tried([chosen for chosen in every if 0 < len(chosen) <= largest])
+    else:
+        _search(tried, kept, free, largest)
+    return tried.structures, tried.predictions
+
+
+class Tried:
+    """Subsets that were run, each once."""
+
+    def __init__(self, pool: Pool, tracker: Tracker) -> None:
+        self.pool, self.tracker = pool, tracker
+        self.structures: list[Structure] = []
+        self.predictions: list[Predicted] = []
+        self._place: dict[frozenset[int], int] = {}
+        self._start = min(max(50, 5 * len(pool.names)), len(pool.y) // 2)
+
+    def __call__(self, subsets: Sequence[frozenset[int]]) -> Array:
+        """logliks of subsets, after the start, (k,)."""
+        new = [s for s in dict.fromkeys(map(frozenset, subsets)) if s not in self._place]
+        structures = [
+            Structure(" ".join(self.pool.names[i] for i in sorted(s)), len(s), None, tuple(sorted(s))) for s in new
+        ]
+        for subset, structure, found in zip(new, structures, self.pool.predict(self.tracker, structures), strict=True):
+            self._place[subset] = len(self.structures)
+            self.structures.append(structure)
+            self.predictions.append(found)
+        terms = [self.predictions[self._place[frozenset(s)]].loglik[self._start :] for s in subsets]
+        return np.array([float(np.nansum(term)) for term in terms])
+
+
+def _search(tried: Tried, kept: frozenset[int], free: Sequence[int], largest: int) -> None:
+    """Add what helps most, drop what no longer helps, until neither raises the loglik."""
+    chosen = kept
+    best = float(tried([chosen])[0]) if chosen else -np.inf
+    while True:
+        before = best
+        more = [chosen | {i} for i in free if i not in chosen] if len(chosen) < largest else []
+        if more:
+            logliks = tried(more)
+            if logliks.max() > best + GAIN:
+                chosen, best = more[int(np.argmax(logliks))], float(logliks.max())
+        fewer = [chosen - {i} for i in chosen - kept] if len(chosen) > 2 else []
+        if fewer:
+            logliks = tried(fewer)
+            if logliks.max() > best:
+                chosen, best = fewer[int(np.argmax(logliks))], float(logliks.max())
+        if not best > before:
+            return

@@ -1,0 +1,284 @@
+"""Verdict: is the time variation real, which parameters move, by how much and when, and does following them pay?
+
+Two questions that have different answers:
+
+* *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
+  square of Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
+  variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
+  do not enter. Where constants are true, "they move" is said with probability ``level``, as
+  ``benchmarks/verdict_error_rate.py`` verifies.
+* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
+  constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`).
+
+The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
+rejects, its own still does when what was named before it is taken into account
+(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance.
+
+A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
+autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
+wanders as fast as the noise itself passes for such noise. Not for smooth fast oscillations: a parameter that swings
+many times within the record leaves little trace in a cumulated score. Cost: three constant fits, O(T n^2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
+from driftfit.engine.settings import whole
+from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.regressors import Rows, regressors
+from driftfit.judge.statistics.attribution import Attribution, attribute
+from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
+from driftfit.judge.statistics.paired import LEAST as COMPARED
+from driftfit.judge.statistics.paired import Paired, paired
+from driftfit.judge.statistics.whiteness import whiteness
+from driftfit.run.result import Track, root_mean_square
+from driftfit.show.summary import Printed, facts, table_of
+
+RIVALS = ("persistence", "constant LS", "constant ARX")
+CORRELATED = 1e-3
+"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What the record says of one parameter.
+
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
+    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
+    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
+    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
+    after the last step, which is ``before`` again after a fault that passed.
+    """
+
+    name: str
+    statistic: float
+    p: float
+    p_own: float
+    moves: bool
+    at: int
+    when: str
+    before: float
+    after: float
+    std: float
+    last: float
+
+
+@dataclass(frozen=True)
+class Verdict(Printed):
+    """What `Track.verdict` returns; printing it shows it.
+
+    Attributes
+    ----------
+    drifts : bool or None
+        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+    pays : bool or None
+        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
+        where there are too few samples to compare.
+    p : float
+        Joint test of all parameters; NaN where the record cannot tell.
+    statistic : float
+        Its part that is Nyblom's.
+    level : float
+        Error rate: how often constants are said to move.
+    parameters : tuple of Moved
+    rms : float
+        Root mean square one-step error of the run on ``scored`` samples.
+    rivals : tuple of Paired
+        The same of persistence, constant LS and constant ARX, with paired tests.
+    samples, scored : int
+        Samples in the test, and in the comparison.
+    correlated : bool
+        The residuals are correlated, also within segments of constant coefficients.
+    lags : int
+        Lags of correlation that were allowed for.
+    burn : int
+        Samples at the beginning that are not scored.
+    """
+
+    drifts: bool | None
+    pays: bool | None
+    p: float
+    statistic: float
+    level: float
+    parameters: tuple[Moved, ...]
+    rms: float
+    rivals: tuple[Paired, ...]
+    samples: int
+    scored: int
+    correlated: bool
+    lags: int
+    burn: int
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Names of the parameters that move."""
+        return tuple(moved.name for moved in self.parameters if moved.moves)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in words."""
+        return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
+
+    def _drift(self) -> str:
+        if self.drifts is None:
+            least = least_rows(len(self.parameters))
+            short = f"{self.samples} samples can be used, and {least} are the least that tell."
+            alike = "its regressors do not tell the parameters apart, or explain it without error."
+            return f"The record cannot say whether parameters move: {short if self.samples < least else alike}"
+        if self.drifts:
+            return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
+        if self.pays:
+            reason = (
+                "once correlated noise is allowed for. A model with too few lags has that, and a parameter that "
+                "wanders as fast looks the same."
+                if self.lags
+                else "by a test of the whole record, which a small or a fast drift escapes."
+            )
+            return (
+                "Something can be followed, but it is not shown that parameters move: constants are not rejected "
+                f"({p_equals(self.p)}, level {self.level:g}) {reason}"
+            )
+        return (
+            f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
+            "A drift that is small beside the noise cannot be ruled out."
+        )
+
+    def _which(self) -> str:
+        if not self.drifts:
+            return ""
+        if not self.moving:
+            return "Which of them moves cannot be told: their regressors are too alike, or the move is spread over all."
+        return f"It is {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
+
+    def _gain(self) -> str:
+        steady = self.rivals[1]
+        if self.pays is None:
+            return (
+                f"Predictions cannot be compared: {self.scored} samples are left after the first {self.burn}, and "
+                f"{COMPARED} are the least; burn= leaves out fewer."
+            )
+        change = 100.0 * (self.rms / steady.rms - 1.0)
+        size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
+        if self.pays:
+            follow = "Following the parameters pays" if self.drifts else "Following it pays"
+            return f"{follow}: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+        return (
+            f"Following them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"({p_equals(steady.p)})."
+        )
+
+    def _caution(self) -> str:
+        better = [rival.name for rival in self.rivals if rival.rms < self.rms]
+        told = f"Lower error than this run: {', '.join(better)}. " if better else ""
+        if self.correlated:
+            told += (
+                "The residuals are correlated, also where parameters are constant: a model with too few lags does "
+                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} "
+                "of it; try one more lag in the model."
+            )
+        return told.strip()
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for sentence in self.sentences:
+            yield Text(f" {sentence}")
+        table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
+        for m in self.parameters:
+            shown = (f"{m.statistic:.3g}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
+            table.add_row(Text(m.name), *shown, *change)
+        yield table
+        table = table_of("One-step prediction error, root mean square", "", "error", "t", "p")
+        table.add_row("this run", f"{self.rms:.5g}", "", "")
+        for rival in self.rivals:
+            table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
+        yield table
+        yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def _told(moved: Moved) -> str:
+    """What one parameter did, in words."""
+    text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
+    if abs(moved.last - moved.after) <= 2.0 * moved.std:
+        return text
+    back = "back to" if abs(moved.last - moved.before) < abs(moved.last - moved.after) else "then"
+    return f"{text}, {back} {moved.last:.4g} at the end"
+
+
+def p_text(p: float) -> str:
+    """A p-value as it is written."""
+    return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
+
+
+def p_equals(p: float) -> str:
+    """A p-value in a sentence."""
+    return f"p {p_text(p)}" if p < 1e-4 else f"p = {p_text(p)}"
+
+
+def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
+    """Judge a run.
+
+    Parameters
+    ----------
+    run : Track
+        What `track` returned.
+    level : number
+        Error rate of "the parameters move".
+    lags : int or None
+        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        one-step errors are known to be white.
+    burn : int or None
+        So many samples at the beginning are not scored; max(50, 5 n) by default.
+
+    Raises
+    ------
+    ValueError
+        If level is not between 0 and 1, or lags or burn is negative.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"verdict: level must be between 0 and 1, such as 0.05; got {level!r}.")
+    for name, given in (("lags", lags), ("burn", burn)):
+        if given is not None:
+            whole("verdict", name, given, 0)
+    burn = burn_in(run.model.n) if burn is None else burn
+    rows = regressors(run)
+    test = constancy(rows.phi, rows.y, lags)
+    drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
+    steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
+    own, *others, scored = errors(run, burn)
+    rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
+    return Verdict(
+        drifts=drifts,
+        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
+        p=test.p_joint,
+        statistic=test.joint,
+        level=level,
+        parameters=tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p))),
+        rms=root_mean_square(own[scored]),
+        rivals=rivals,
+        samples=len(rows.y),
+        scored=int(scored.sum()),
+        correlated=test.noise is not None and bool(whiteness(test.noise.residual).p < CORRELATED),
+        lags=test.lags,
+        burn=burn,
+    )
+
+
+def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
+    at, own = int(test.at[i]), float(test.p_own[i])
+    before = after = std = last = np.nan
+    named = steps is not None and bool(steps.moves[i])
+    if steps is not None:
+        own = float(steps.p[i])
+        if named:
+            at = steps.first(i) or 0
+            before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
+    sample = int(rows.at[min(at, len(rows.at) - 1)]) if len(rows.at) else 0
+    when = run.time_text(sample)
+    L, p = float(test.L[i]), float(test.p[i])
+    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last)

@@ -1,0 +1,1 @@
+"""Static curves of Hammerstein-Wiener blocks: bases and their compiled functions."""

@@ -1,0 +1,223 @@
+"""Static curves f(x) = sum_k c_k f_k(x): what every basis offers, and functions of your own.
+
+A basis gives `value(x)` and `derivative(x)`, (..., n) each, and for steps the machine ``evaluate``.
+Its numbers p (``parameters``) live in the record, so that another range needs no other code.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+
+from driftfit.engine.kernel import Array, Driver, kernel
+from driftfit.engine.settings import Settings, numbers, whole
+from driftfit.models.hammerstein_wiener.curves import kernels
+
+
+@lru_cache
+def _over(evaluate: Any) -> Driver:
+    """A compiled loop of ``evaluate`` over an array."""
+
+    @Driver
+    def each(x: Array, p: Array, out: Array, slopes: Array) -> None:
+        n = out.shape[1]
+        for i in range(x.shape[0]):
+            evaluate(x[i], p.ctypes.data, p.shape[0], out[i].ctypes.data, slopes[i].ctypes.data, n, 1)
+
+    return each
+
+
+def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> tuple[Array, Array]:
+    """The functions of a machine at x (k,), and their derivatives, (k, n) each; its numbers p may be written to."""
+    evaluate.load()
+    out, slopes = np.empty((2, len(x), n))
+    _over(evaluate)(np.ascontiguousarray(x), p, out, slopes)
+    return out, slopes
+
+
+class Basis(Settings, ABC):
+    """A set of functions of one variable, without a constant."""
+
+    code: ClassVar[int] = -1
+    """The kind, as `driftfit.models.hammerstein_wiener.curves.kernels` knows it."""
+    adaptive: ClassVar[bool] = False
+    """Whether the functions depend on their own coefficients, which then are fed back at every sample."""
+
+    @property
+    @abstractmethod
+    def n(self) -> int:
+        """Number of functions."""
+
+    @property
+    def evaluate(self) -> Any:
+        """The machine that evaluates the functions and their derivatives; see `curve_kernels`."""
+        return kernels.evaluate
+
+    @property
+    def kind(self) -> tuple[Any, int]:
+        """The machine and the code, which steps are made from."""
+        return self.evaluate, self.code
+
+    @property
+    def own_numbers(self) -> Array:
+        """Numbers of the basis, (k,)."""
+        return np.zeros(0)
+
+    @property
+    def parameters(self) -> Array:
+        """What the compiled functions get as p: the code of the kind, and the numbers of the basis."""
+        return np.concatenate([[float(self.code)], self.own_numbers])
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """Where data are expected."""
+        return (-np.inf, np.inf)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Where the functions are defined; a sample outside is missing."""
+        return (-np.inf, np.inf)
+
+    @property
+    def rise_between(self) -> tuple[float, float]:
+        """Two inputs: a curve that is higher at the second than at the first counts as rising.
+
+        0, or what is nearest to it in the range, and the upper end; so an even curve has a sign as well.
+        """
+        low, high = self.expected
+        if not (np.isfinite(low) and np.isfinite(high)):
+            return 0.0, 1.0
+        middle = min(max(0.0, low), high)
+        return (middle if middle < high else low), high
+
+    @property
+    def rise(self) -> Array:
+        """r (n,) with r'c > 0 for the coefficients of curves that rise."""
+        low, high = self.value(np.array(self.rise_between))
+        return np.asarray(high - low)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the functions are, in the order of the coefficients."""
+        return tuple(f"f{k + 1}" for k in range(self.n))
+
+    def value(self, x: Any) -> Array:
+        """The functions at x (...), as (..., n)."""
+        return self._at(x)[0]
+
+    def derivative(self, x: Any) -> Array:
+        """Their derivatives at x (...), as (..., n)."""
+        return self._at(x)[1]
+
+    def _at(self, x: Any) -> tuple[Array, Array]:
+        points = np.asarray(x, dtype=float)
+        out, slopes = values_and_slopes(self.evaluate, points.ravel(), self.parameters.copy(), self.n)
+        shape = (*points.shape, self.n)
+        return out.reshape(shape), slopes.reshape(shape)
+
+    @classmethod
+    def from_words(cls, words: tuple[Any, ...]) -> Self:
+        """The basis from its numbers one after the other, as on the command line."""
+        try:
+            return cls(*words)
+        except TypeError:
+            raise ValueError(f"{cls.__name__}: {len(words)} numbers were given, {words!r}; that is too many.") from None
+
+    def plain(self) -> dict[str, Any]:
+        """The basis as plain data; see `basis_of`."""
+        return {"class": type(self).__name__, "settings": self.settings()}
+
+
+@dataclass(frozen=True)
+class Functions(Basis):
+    """Functions of your own.
+
+    Parameters
+    ----------
+    values, slopes : functions (x, p, out) that Numba can compile
+        Fill ``out`` (n,) with the functions, and with their derivatives, at the number x. They may use numpy, math,
+        numbers and ``driftfit.engine.kernel`` functions. To be saved they must stand in a module that can be imported.
+    n : int
+        How many functions.
+    numbers : sequence
+        What they get as the array p.
+    labels : sequence of str or None
+        What the functions are called.
+    """
+
+    values: Any
+    slopes: Any
+    n: int = 1
+    numbers: Any = (0.0,)
+    labels: Any = None
+
+    def __post_init__(self) -> None:
+        self._set("n", whole("Functions", "n", self.n, 1))
+        given = numbers("Functions", "numbers", self.numbers)
+        self._set("numbers", given if isinstance(given, tuple) else (given,))
+        for name in ("values", "slopes"):
+            self._set(name, _imported(getattr(self, name)))
+        if self.labels is not None:
+            self._set("labels", tuple(str(label) for label in self.labels))
+            if len(self.labels) != self.n:
+                raise ValueError(f"Functions: {len(self.labels)} labels were given for {self.n} functions.")
+
+    @property
+    def evaluate(self) -> Any:
+        return _together(self.values, self.slopes)
+
+    @property
+    def parameters(self) -> Array:
+        return np.array(self.numbers)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.labels or super().names
+
+    def settings(self) -> dict[str, Any]:
+        return super().settings() | {name: _place(getattr(self, name)) for name in ("values", "slopes")}
+
+
+@lru_cache
+def _compiled(function: Callable[..., Any]) -> Any:
+    """A function of the user's as a kernel."""
+    return function if hasattr(function, "identity") else kernel(getattr(function, "py_func", function))
+
+
+@lru_cache
+def _together(values: Any, slopes: Any) -> Any:
+    """The machine of two functions of the user's."""
+    first, second = _compiled(values), _compiled(slopes)
+
+    @kernel
+    def both(x: float, p: Array, out: Array, slopes: Array) -> None:
+        first(x, p, out)
+        second(x, p, slopes)
+
+    return kernels.machine_of(both)
+
+
+def _place(function: Any) -> str:
+    """Where a function can be imported from."""
+    source = getattr(function, "py_func", function)
+    return f"{source.__module__}:{source.__qualname__}"
+
+
+def _imported(function: Any) -> Any:
+    """A function, or the one that stands at ``module:name``."""
+    if isinstance(function, str):
+        module, _, name = function.partition(":")
+        try:
+            return getattr(import_module(module), name)
+        except (ImportError, AttributeError):
+            raise ValueError(f"Functions: {function!r} cannot be imported; it must stand in a module.") from None
+    if not (callable(function) or isinstance(function, Dispatcher)):
+        raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {function!r}.")
+    return function

@@ -1,0 +1,243 @@
+"""The compiled functions of all bases that the library brings, behind one for every kind.
+
+`every` fills ``out`` (n,) and ``slopes`` (n,) with the functions and their derivatives at x; p[0] is the code of the
+kind and the rest its own numbers, which is what the parts take. Steps call it as the machine `evaluate`, with addresses
+of p, out and slopes, whose elements stand ``stride`` numbers apart: it is compiled once.
+
+B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs stands at
+the end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import Array, exp, floats, kernel, outside
+
+POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE, SATURATION, SIGMOIDS = range(8)
+
+
+@kernel
+def powers(x: float, p: Array, out: Array) -> None:
+    power = x
+    for k in range(out.shape[0]):
+        out[k] = power
+        power = power * x
+
+
+@kernel
+def power_slopes(x: float, p: Array, out: Array) -> None:
+    power = 1.0
+    for k in range(out.shape[0]):
+        out[k] = (k + 1) * power
+        power = power * x
+
+
+@kernel
+def legendre(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    for k in range(out.shape[0]):
+        out[k] = now
+        now, before = s * now + (s * now - before) * ((k + 1) / (k + 2)), now
+
+
+@kernel
+def legendre_slopes(x: float, p: Array, out: Array) -> None:
+    # P'_(k+1) = P'_(k-1) + (2 k + 1) P_k
+    s, scale = (x - p[0]) / p[1], 1.0 / p[1]
+    before, now = 1.0, s
+    slope_before, slope = 0.0, 1.0
+    for k in range(out.shape[0]):
+        out[k] = slope * scale
+        slope, slope_before = slope_before + (2 * k + 3) * now, slope
+        now, before = s * now + (s * now - before) * ((k + 1) / (k + 2)), now
+
+
+@kernel
+def chebyshev(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    for k in range(out.shape[0]):
+        out[k] = now
+        before, now = now, 2.0 * s * now - before
+
+
+@kernel
+def chebyshev_slopes(x: float, p: Array, out: Array) -> None:
+    s = (x - p[0]) / p[1]
+    before, now = 1.0, s
+    slope_before, slope = 0.0, 1.0
+    for k in range(out.shape[0]):
+        out[k] = slope / p[1]
+        slope_before, slope = slope, 2.0 * now + 2.0 * s * slope - slope_before
+        before, now = now, 2.0 * s * now - before
+
+
+@kernel
+def dead_zone(x: float, p: Array, out: Array) -> None:
+    above, below = x >= p[0], x <= p[1]
+    out[0] = x if above or below or x != x else 0.0
+    out[1] = -1.0 if above else 0.0
+    out[2] = -1.0 if below else 0.0
+
+
+@kernel
+def dead_zone_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 1.0 if x >= p[0] or x <= p[1] else 0.0
+    out[1] = 0.0
+    out[2] = 0.0
+
+
+@kernel
+def saturation(x: float, p: Array, out: Array) -> None:
+    above, below = x >= p[0], x <= p[1]
+    out[0] = 0.0 if (above or below) and abs(x) < LARGEST else x
+    out[1] = 1.0 if above else 0.0
+    out[2] = 1.0 if below else 0.0
+
+
+@kernel
+def saturation_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 0.0 if x >= p[0] or x <= p[1] else 1.0
+    out[1] = 0.0
+    out[2] = 0.0
+
+
+@kernel
+def tanh(z: float) -> float:
+    """The library's own, with the same bits everywhere."""
+    e = exp(-2.0 * abs(z))
+    size = (1.0 - e) / (1.0 + e)
+    return size if z >= 0.0 else -size if z < 0.0 else z
+
+
+@kernel
+def sigmoids(x: float, p: Array, out: Array) -> None:
+    n = out.shape[0]
+    for k in range(n):
+        out[k] = tanh((x - p[k]) / p[n]) + tanh(p[k] / p[n]) if abs(x) < LARGEST else np.nan
+
+
+@kernel
+def sigmoid_slopes(x: float, p: Array, out: Array) -> None:
+    n = out.shape[0]
+    for k in range(n):
+        level = tanh((x - p[k]) / p[n])
+        out[k] = (1.0 - level * level) / p[n]
+
+
+@kernel
+def hinges(x: float, p: Array, out: Array) -> None:
+    out[0] = x
+    for k in range(1, out.shape[0]):
+        away = x - p[k - 1]
+        out[k] = max(0.0, away) if p[k - 1] >= 0.0 else min(0.0, away)
+        out[k] = away if away != away else out[k]
+
+
+@kernel
+def hinge_slopes(x: float, p: Array, out: Array) -> None:
+    out[0] = 1.0
+    for k in range(1, out.shape[0]):
+        beyond = x > p[k - 1] if p[k - 1] >= 0.0 else x < p[k - 1]
+        out[k] = 1.0 if beyond else 0.0
+
+
+@kernel
+def local_splines(x: float, p: Array, degree: int) -> int:
+    """The degree + 1 B-splines that are not zero at x, into the scratch at the end of p; returns their span."""
+    order, count = int(p[0]), int(p[1])
+    at, work = 2, 2 + count
+    span = order
+    while span < count - order - 2 and x >= p[at + span + 1]:
+        span += 1
+    p[work] = 1.0
+    for j in range(1, degree + 1):
+        saved = 0.0
+        for r in range(j):
+            right, left = p[at + span + r + 1] - x, x - p[at + span + 1 - j + r]
+            share = p[work + r] / (right + left)
+            p[work + r] = saved + right * share
+            saved = left * share
+        p[work + j] = saved
+    return span
+
+
+@kernel
+def splines(x: float, p: Array, out: Array) -> None:
+    order, count = int(p[0]), int(p[1])
+    work, anchor = 2 + count, 2 + count + order + 1
+    inside = x >= p[2] and x <= p[1 + count]
+    for k in range(out.shape[0]):
+        out[k] = -p[anchor + k] if inside else np.nan
+    if inside:
+        span = local_splines(x, p, order)
+        for r in range(order + 1):
+            k = span - order + r - 1  # the first of all is left out
+            if k >= 0:
+                out[k] += p[work + r]
+
+
+@kernel
+def spline_slopes(x: float, p: Array, out: Array) -> None:
+    order, count = int(p[0]), int(p[1])
+    work = 2 + count
+    inside = x >= p[2] and x <= p[1 + count]
+    for k in range(out.shape[0]):
+        out[k] = 0.0 if inside else np.nan
+    if inside and order > 0:
+        span = local_splines(x, p, order - 1)
+        for r in range(order):
+            k = span - order + 1 + r  # the lower B-spline that starts at knot k
+            slope = order * p[work + r] / (p[2 + k + order] - p[2 + k])
+            if k - 1 >= 0:
+                out[k - 1] += slope
+            if k - 2 >= 0:
+                out[k - 2] -= slope
+
+
+@kernel
+def every(x: float, p: Array, out: Array, slopes: Array) -> None:
+    """The functions of a basis and their derivatives."""
+    code, own = p[0], p[1:]
+    if code == POWERS:
+        powers(x, own, out)
+        power_slopes(x, own, slopes)
+    elif code == LEGENDRE:
+        legendre(x, own, out)
+        legendre_slopes(x, own, slopes)
+    elif code == CHEBYSHEV:
+        chebyshev(x, own, out)
+        chebyshev_slopes(x, own, slopes)
+    elif code == HINGES:
+        hinges(x, own, out)
+        hinge_slopes(x, own, slopes)
+    elif code == SPLINES:
+        splines(x, own, out)
+        spline_slopes(x, own, slopes)
+    elif code == SATURATION:
+        saturation(x, own, out)
+        saturation_slopes(x, own, slopes)
+    elif code == SIGMOIDS:
+        sigmoids(x, own, out)
+        sigmoid_slopes(x, own, slopes)
+    else:
+        dead_zone(x, own, out)
+        dead_zone_slopes(x, own, slopes)
+
+
+def machine_of(function: Any) -> Any:
+    """``evaluate(x, p, count, out, slopes, n, stride)`` of a kernel (x, p, out, slopes)."""
+
+    def machine_evaluate(x: float, p: int, count: int, out: int, slopes: int, n: int, stride: int) -> None:
+        function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
+
+    machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a place on disk of its own
+    return outside(machine_evaluate)
+
+
+evaluate = machine_of(every)

@@ -1,0 +1,103 @@
+"""The memory of a Hammerstein-Wiener model's compiled steps: numbers and arrays one after the other in one field.
+
+The field ``blocks`` (size, L) begins with the numbers named below. `places_of` says the orders and where the arrays
+begin. The machines behind the steps get the address of ``blocks`` for one lane, element i of which stands L numbers
+after element i - 1; the places are constants to them, so that their loops unroll.
+
+    now, next (n)             regressors of this sample but those of its output, and those of the next
+    f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, .., of a dead zone with the thresholds known then;
+                              one array after the other where there are several inputs
+    g_past  (1 + na, n_out)   functions of the outputs t, t - 1, ..; their slopes in h_past
+    d_now   (n_out)           coefficients (1, d_2 ..) before the sample
+    trial, trial_bend         functions and slopes at a y that is tried; spare, slopes that nobody needs
+    into, out                 the numbers of the bases, those of all inputs first
+    curve (n_out, ROW)        functions of the output block on the grid, and one level beyond all; bend, their slopes
+    coarse (n_out, EIGHT)     the same functions at every eighth point of the grid
+    level (GRID)              an envelope of the levels
+    d_seen, reach (n_out)     coefficients for which the grid was found to rise, and how far it is safe to be from them
+    us (inputs)               the inputs of this sample
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.models.hammerstein_wiener.products import Structure
+
+GRID = 64
+"""Points of the grid on which the output block is inverted."""
+EIGHT = 8
+"""Levels that are compared at once: GRID is its square."""
+ROW = GRID + 1
+
+(
+    LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
+    FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, SEEN, OK, FACTOR, HEAD,
+) = range(26)  # fmt: skip
+"""Numbers: the grid, the range of outputs believed, where the output block is defined, results, whether all lags are
+there, whether theta is xi, the noise factor given, the output as it came, sigma^2 or 0, the two outputs before, the
+range of medians of three, whether the range moved, whether a level stands where the prediction
+will, the cell of the grid that holds it, and what steps tell the machine and hear from it; HEAD is how many there are.
+"""
+
+(
+    NA, NB, N_IN, N_OUT, N, NK, IDENTITY, ADAPTIVE, NOW, NEXT, F_PAST, G_PAST, H_PAST, SPARE, D_NOW, TRIAL,
+    TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_SEEN, REACH, US, INPUTS, OWN,
+) = range(28)  # fmt: skip
+"""Places: orders, whether the output block is the identity and an input basis depends on its own coefficients, where
+the arrays begin, and how many inputs there are. NB is the number of all b, NK the least delay; N_IN, F_PAST and INTO
+are those of the first input.
+"""
+OWN_NB, OWN_N_IN, OWN_NK, OWN_F, OWN_INTO, OWN_ADAPTIVE, OWN_END, EACH = range(8)
+"""From OWN on, EACH numbers for each input: its orders, where its functions and the numbers of its basis begin, whether
+that depends on its own coefficients, and where its numbers end.
+"""
+
+
+Places = Array
+"""Whole numbers (28 + 7 a input,), a constant to the compiler."""
+
+
+def _arrays(structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array) -> dict[int, Array]:
+    """The arrays before the first sample, in their order."""
+    na, nb, n_in, n_out, _ = structure
+    lags = sum(width * (count + delay) for width, count, delay in zip(n_in, nb, nk, strict=True))
+    outputs = np.full((1 + max(na, 1)) * n_out, np.nan)
+    return {
+        NOW: np.full(structure.n, np.nan), NEXT: np.full(structure.n, np.nan),
+        F_PAST: np.full(lags, np.nan), G_PAST: outputs, H_PAST: outputs,
+        SPARE: np.zeros(max(n_in)), D_NOW: np.eye(1, n_out)[0], TRIAL: np.zeros(n_out), TRIAL_BEND: np.zeros(n_out),
+        INTO: np.concatenate(into), OUT: out,
+        CURVE: np.zeros(ROW * n_out), BEND: np.zeros(ROW * n_out), COARSE: np.zeros(EIGHT * n_out),
+        LEVEL: np.zeros(GRID), D_SEEN: np.zeros(n_out), REACH: np.full(n_out, np.inf),
+        US: np.zeros(len(nb)),
+    }  # fmt: skip
+
+
+def places_of(
+    structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array, identity: bool,
+    adaptive: tuple[bool, ...],
+) -> tuple[int, ...]:  # fmt: skip
+    """Orders and beginnings; ``into`` and ``out`` are the numbers of the bases."""
+    na, nb, n_in, n_out, _ = structure
+    arrays = _arrays(structure, nk, into, out)
+    begins = np.cumsum([HEAD, *(array.size for array in arrays.values())])[:-1].tolist()
+    head = (na, sum(nb), n_in[0], n_out, structure.n, min(nk), int(identity), int(any(adaptive)), *begins, len(nb))
+    f, own, each = head[F_PAST], head[INTO], []
+    for i in range(len(nb)):
+        each += [nb[i], n_in[i], nk[i], f, own, int(adaptive[i]), own + into[i].size]
+        f, own = f + n_in[i] * (nb[i] + nk[i]), own + into[i].size
+    return (*head, *each)
+
+
+def memory(
+    structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array, limits: tuple[float, float],
+    sigma: float | None,
+) -> Array:  # fmt: skip
+    """``blocks`` before the first sample."""
+    head = np.zeros(HEAD)
+    head[[LOWEST, HIGHEST, FIRM_LOW, FIRM_HIGH, BOTTOM, TOP]] = np.inf, -np.inf, np.inf, -np.inf, *limits
+    head[[RISING, PREDICTED, BEFORE, EARLIER]] = 1.0, np.nan, np.nan, np.nan
+    head[VARIANCE] = 0.0 if sigma is None else sigma * sigma
+    return np.concatenate([head, *_arrays(structure, nk, into, out).values()])

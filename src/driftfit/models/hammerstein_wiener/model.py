@@ -1,0 +1,341 @@
+"""Hammerstein-Wiener: a static curve, a linear system, and another static curve, all of which may drift.
+
+    v_t = sum_k c_k f_k(u_t)                                          input block
+    w_t = -sum_{i=1..na} a_i w_{t-i} + sum_{j=1..nb} b_j v_{t-nk-j+1}  linear block
+    sum_k d_k g_k(y_t) = w_t,  d_1 = 1                                inverse of the output block, increasing
+
+With several inputs each has a curve v_i and coefficients b_i of its own, and their sum drives the linear block.
+
+In terms of what is measured this is a regression on products of the parameters
+(`driftfit.models.hammerstein_wiener.products`):
+
+    z_t = -g_1(y_t) = phi_t' theta_t
+    phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
+
+Any tracker follows theta (stage one); `driftfit.models.hammerstein_wiener.results` separates a, b, c, d from it. The
+regression is exact only with products of the time of each factor; products of one time leave an error of second order
+in the drift.
+
+The prediction of a run is of y, through the inverted output block; innovation, innovation_std and loglik are of the
+equation error, with the Jacobian F'(y_t) in the likelihood, since phi_t holds y_t. Nothing is filled: a missing output
+makes the samples t .. t + na unusable, a missing input t + nk .. t + nk + nb - 1.
+
+The signs of a are those of polynomials A(z) = 1 + a_1 z^-1 + ..; `ARX` has the opposite. Use it where both curves or
+one of them matter; a linear system is an `ARX`. Least squares is consistent for data without measurement noise only:
+phi holds y. ``output_noise`` weighs samples by what noise of that standard deviation does to the equation, which lowers
+the variance and not the bias; `driftfit.models.hammerstein_wiener.trackers.output_error` has neither.
+
+Source: Feng and Hong (2021), Int. J. Systems Science 52(16); Bai (1998), Automatica 34(3). Departures: all columns of
+the input carry a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import Array, Step
+from driftfit.engine.settings import numbers, whole
+from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
+from driftfit.models.hammerstein_wiener.memory import memory, places_of
+from driftfit.models.hammerstein_wiener.products import Structure
+from driftfit.models.hammerstein_wiener.rows import FLOOR
+from driftfit.models.hammerstein_wiener.steps import applying, build
+
+IDENTITY = Polynomial(1)
+FLATTEST = 1e-3
+"""The least slope of the output block that the likelihood takes for real."""
+UNIT = 10.0
+"""Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
+
+
+def several(value: Any) -> bool:
+    """Whether a setting has an entry for each input; the words of one basis begin with its name."""
+    return isinstance(value, (tuple, list)) and not (len(value) > 0 and isinstance(value[0], str))
+
+
+def _blocks(value: Any) -> Any:
+    """A basis, or one for each input."""
+    return tuple(basis_of(each) for each in value) if several(value) else basis_of(value)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as plain data."""
+    if isinstance(value, tuple):
+        return tuple(_plain(each) for each in value)
+    return value.plain() if isinstance(value, Basis) else value
+
+
+@dataclass(frozen=True)
+class HammersteinWiener(Model):
+    """Hammerstein-Wiener model with one output.
+
+    Parameters
+    ----------
+    na, nb : int
+        Lags of w and of v in the linear block; nb at least 1.
+    nk : int
+        Delay of the input in samples; 0 uses the present input.
+    input, output : Basis or None
+        Functions of the input block, and of the inverse of the output block. None is the identity, so that
+        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model. A list of bases makes a model with so many
+        inputs, each with a curve of its own; ``nb`` and ``nk`` then may be lists as well.
+    intercept : bool
+        Add one constant; those of the two blocks cannot be told apart.
+    output_noise : number or None
+        Standard deviation of white noise on y. The noise variance of the equation then is r times
+        sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
+    name : str, tuple of str or None
+        Name of the input, or of each.
+
+    Raises
+    ------
+    ValueError
+        For orders that are not whole, lists of different lengths, or a dead zone or saturation in the output block.
+    """
+
+    na: int
+    nb: Any
+    nk: Any = 1
+    input: Any = None
+    output: Any = None
+    intercept: bool = False
+    output_noise: float | None = None
+    name: Any = None
+
+    def __post_init__(self) -> None:
+        self._set("na", whole("HammersteinWiener", "na", self.na, 0))
+        counts = {name: len(value) for name in ("input", "nb", "nk") if several(value := getattr(self, name))}
+        if len(set(counts.values())) > 1 or 0 in counts.values():
+            raise ValueError(f"HammersteinWiener: lists have one entry for each input; got {counts}.")
+        for name, low in (("nb", 1), ("nk", 0)):
+            given = getattr(self, name)
+            checked = [whole("HammersteinWiener", name, x, low) for x in (given if several(given) else (given,))]
+            self._set(name, tuple(checked) if several(given) else checked[0])
+        if counts and max(counts.values()) == 1:
+            for name in counts:
+                self._set(name, getattr(self, name)[0])
+        self._set("input", _blocks(self.input))
+        self._set("output", basis_of(self.output))
+        if self.output is not None and self.output.adaptive:
+            raise ValueError(
+                f"HammersteinWiener: {type(self.output).__name__} is not one-to-one, so it can only be an input block."
+            )
+        if self.output_noise is not None:
+            sigma = numbers("HammersteinWiener", "output_noise", self.output_noise, ndim=0, low=0.0, strict=True)
+            self._set("output_noise", sigma)
+
+    def settings(self) -> dict[str, Any]:
+        return {name: _plain(value) for name, value in super().settings().items()}
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any]) -> Self:
+        bases = {"input": _blocks(settings.get("input")), "output": basis_of(settings.get("output"))}
+        return super().from_settings(settings | bases)
+
+    def bind(self, inputs: int | Sequence[str]) -> HammersteinWiener:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if count != self.m:
+            raise ValueError(
+                f"HammersteinWiener: the model has {self.m} input{'s' if self.m > 1 else ''}, but u has {count} "
+                "columns; give input= a list with a basis, or None, for each."
+            )
+        if isinstance(inputs, int) or self.name is not None:
+            return self
+        return replace(self, name=inputs[0] if count == 1 else tuple(inputs))
+
+    @property
+    def m(self) -> int:
+        return max(len(x) if several(x) else 1 for x in (self.input, self.nb, self.nk))
+
+    @property
+    def bases(self) -> tuple[Basis, ...]:
+        """Functions of the curve of each input."""
+        return tuple(IDENTITY if basis is None else basis for basis in self._each(self.input))
+
+    @property
+    def delays(self) -> tuple[int, ...]:
+        """nk of each input."""
+        return self._each(self.nk)
+
+    def _each(self, value: Any) -> tuple[Any, ...]:
+        """A setting, for each input."""
+        return value if several(value) else (value,) * self.m
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return () if self.name is None else (self.name,) if isinstance(self.name, str) else tuple(self.name)
+
+    @property
+    def into(self) -> Basis:
+        """Functions of the input block; ValueError where there are several inputs."""
+        if self.m > 1:
+            raise ValueError("HammersteinWiener: what was asked for needs a model with one input.")
+        return self.bases[0]
+
+    @property
+    def out(self) -> Basis:
+        """Functions of the inverse of the output block."""
+        return self.output if isinstance(self.output, Basis) else IDENTITY
+
+    @property
+    def structure(self) -> Structure:
+        """The orders, and where the parameters stand in theta."""
+        return Structure(self.na, self._each(self.nb), tuple(b.n for b in self.bases), self.out.n, self.intercept)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.called(self.structure.names)
+
+    def called(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of coefficients, with those of the inputs for [u1], [u2] .. where they have names."""
+        for i, name in enumerate(self.name if isinstance(self.name, tuple) else ()):
+            names = [each.replace(f"[u{i + 1}]", f"[{name}]") for each in names]
+        return tuple(names)
+
+    @property
+    def rise(self) -> Array:
+        """r with r'c > 0 for the curves that rise, of each input (sum of n_in,); 0 where c_1 = 1 by definition."""
+        return _rise(self)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the output block is the identity."""
+        return self.out == IDENTITY
+
+    def memory(self) -> Mapping[str, Any]:
+        return {"blocks": _memory(self).copy()}
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Where everything stands in the memory of the steps."""
+        return _places(self)
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self)
+
+    @property
+    def apply(self) -> Step | None:
+        return applying(tuple(basis.kind for basis in self.bases), self.places) if min(self.delays) > 0 else None
+
+    @property
+    def reach(self) -> int:
+        return max(self.na, *(nb + nk - 1 for nb, nk in zip(self.structure.nb, self.delays, strict=True)))
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        from driftfit.models.hammerstein_wiener.forward import play
+
+        return play(self, theta, y, u, noise, span)
+
+    def touched(self, t: int, signal: str) -> range:
+        """The samples that cannot be used when "y" or "u" is missing at t."""
+        if signal == "y":
+            return range(t, t + self.na + 1)
+        ends = [nb + nk for nb, nk in zip(self.structure.nb, self.delays, strict=True)]
+        return range(t + min(self.delays), t + max(ends))
+
+    def output_weights(self, theta: Array) -> Array:
+        """d (..., n_out) with d_1 = 1 from theta (..., n), or from the minimal xi (..., n_x)."""
+        at = self.structure.starts[0]
+        if theta.shape[-1] != self.n:
+            at += sum(self.structure.n_in) - self.m
+        d = theta[..., at : at + self.out.n - 1]
+        return np.concatenate([np.ones((*theta.shape[:-1], 1)), d], axis=-1)
+
+    def slope(self, theta: Array, y: Array) -> Array:
+        """F'(y; d), the slope of the inverse of the output block; theta (..., n) or xi (..., n_x), y (...)."""
+        found: Array = np.sum(self.out.derivative(y) * self.output_weights(theta), axis=-1)
+        return found
+
+    def log_jacobian(self, theta: Array, y: Array) -> Array:
+        """log max(F'(y_t; d_t), 1e-3) with the estimate after the sample: what turns the density of z into that of y.
+
+        The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
+        y integrates to 1 with the estimate after the sample, and to more with the one before.
+        """
+        with np.errstate(invalid="ignore"):
+            found: Array = np.log(np.maximum(self.slope(theta, y), FLATTEST))
+        return found
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of w to one equation error: that of 1 / A(z)."""
+        response: Array = np.eye(1, h)[0]
+        for t in range(1, h):
+            lags = response[max(t - self.na, 0) : t][::-1]
+            response[t] = np.clip(-theta[: len(lags)] @ lags, -LARGEST, LARGEST)  # unstable estimates grow for ever
+        return response
+
+    def output_slope(self, theta: Array, y: Array) -> Array:
+        """F'(y), at least 1e-3: an equation error moves y by its reciprocal."""
+        found: Array = np.maximum(self.slope(theta, y), FLATTEST)
+        return found
+
+    def noise_factor(self, theta: Array, y: Array) -> float:
+        """1, or sigma^2 (1 + sum_i a_i^2) F'(y)^2 + 1e-4 under ``output_noise``."""
+        if self.output_noise is None:
+            return 1.0
+        energy = 1.0 + float(np.sum(theta[: self.na] ** 2))
+        return float((self.output_noise * self.slope(theta, y)) ** 2 * energy + FLOOR)
+
+    def follows(self, other: Model) -> bool:
+        return isinstance(other, HammersteinWiener) and replace(self, name=None) == replace(other, name=None)
+
+    def inspect(self, y: Array, u: Array) -> None:
+        """Warn of data that the bases do not fit; `driftfit.track` calls it with a whole record, y (T,), u (T, 1)."""
+        given = self.name if isinstance(self.name, tuple) else None
+        names = given or (["u"] if self.m == 1 else [f"u{i + 1}" for i in range(self.m)])
+        for what, basis, data in (*zip(names, self.bases, u.T, strict=True), ("y", self.out, y)):
+            if basis.n == 1 and not np.isfinite(basis.expected).any():
+                continue
+            with np.errstate(invalid="ignore", over="ignore"):
+                total = float(data.sum())
+            seen = data if abs(total) < LARGEST else data[np.abs(data) < LARGEST]  # mostly all are there
+            low, high = basis.expected
+            outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
+            if outside:
+                effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
+                warnings.warn(
+                    f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
+                    f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
+                    UserWarning,
+                    stacklevel=4,
+                )
+            size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
+            if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
+                warnings.warn(
+                    f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
+                    f"scaled; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
+                    UserWarning,
+                    stacklevel=4,
+                )
+
+
+@lru_cache
+def _places(model: HammersteinWiener) -> tuple[int, ...]:
+    into = tuple(basis.parameters for basis in model.bases)
+    adaptive = tuple(basis.adaptive for basis in model.bases)
+    return places_of(model.structure, model.delays, into, model.out.parameters, model.linear, adaptive)
+
+
+@lru_cache
+def _memory(model: HammersteinWiener) -> Array:
+    into = tuple(basis.parameters for basis in model.bases)
+    return memory(model.structure, model.delays, into, model.out.parameters, model.out.limits, model.output_noise)
+
+
+@lru_cache
+def _rise(model: HammersteinWiener) -> Array:
+    return np.concatenate([np.zeros(basis.n) if basis.adaptive else basis.rise for basis in model.bases])
+
+
+@lru_cache
+def _steps(model: HammersteinWiener) -> ModelSteps:
+    return build(tuple(basis.kind for basis in model.bases), model.out.kind, model.places)

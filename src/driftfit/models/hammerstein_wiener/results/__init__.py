@@ -1,0 +1,1 @@
+"""What a Hammerstein-Wiener run is asked for: blocks, free runs, diagnostics, pictures."""

@@ -1,0 +1,75 @@
+"""Pictures of blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
+from driftfit.show.plots import date_axis, frame, new_figure, settled, time_label
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+
+POINTS = 200
+
+
+def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
+    """Input and output curve at samples ``times`` (four by default), and a, b, c, d over time."""
+    from matplotlib import colormaps
+
+    found = blocks_of(run, method)
+    T = len(run)
+    chosen = [T // 4, T // 2, 3 * T // 4, T - 1] if times is None else [range(T)[t] for t in times]
+    colours = colormaps["viridis"](np.linspace(0.0, 0.85, len(chosen)))
+    figure = new_figure(9.0, 6.6)
+    grid = figure.add_gridspec(3, 2, height_ratios=[1.4, 1.0, 1.0])
+    left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    u, y = (_points(signal) for signal in (run.u[:, 0], run.y))
+    for t, colour in zip(chosen, colours, strict=True):
+        label = run.time_text(t) if run._time is not None else f"sample {t}"
+        left.plot(u, found.input_curve(u, t), color=colour, lw=1.3, label=label)
+        right.plot(found.output_curve(y, t), y, color=colour, lw=1.3)
+    left.set(xlabel=run.labels.u[0] if run.labels.u else "u", ylabel="v", title="input block")
+    right.set(xlabel="w", ylabel=run.labels.y, title="output block")
+    left.legend(fontsize=8, frameon=False)
+    for place, (group, names, std) in enumerate(
+        zip((found.a, found.b, found.c, found.d), found.names, found.std, strict=True)
+    ):
+        axis = figure.add_subplot(grid[1 + place // 2, place % 2])
+        _paths(axis, run, group, names, std)
+        axis.set_ylabel("abcd"[place])
+        if place > 1:
+            axis.set_xlabel(time_label(run))
+        date_axis(axis, run)
+    for axis in (left, right):
+        axis.title.set_fontsize(10)
+        axis.grid(alpha=0.25, lw=0.5)
+    return figure
+
+
+def _points(signal: Any) -> Any:
+    """Points over the middle 99 % of a signal."""
+    seen = signal[np.isfinite(signal)]
+    low, high = np.quantile(seen, (0.005, 0.995)) if seen.size else (-1.0, 1.0)
+    return np.linspace(low, high, POINTS)
+
+
+def _paths(axis: Axes, run: Track, group: Any, names: Any, std: Any) -> None:
+    """Coefficients over time, with bands of two standard deviations where they are known; the leading 1 is left out."""
+    late = settled(run)
+    shown = [i for i in range(group.shape[1]) if not np.all(group[late, i] == 1.0)]
+    for i in shown:
+        (line,) = axis.plot(run.time, group[:, i], lw=1.2, label=names[i])
+        known = np.isfinite(std[:, i])
+        low, high = group[:, i] - 2.0 * std[:, i], group[:, i] + 2.0 * std[:, i]
+        axis.fill_between(run.time, low, high, where=known, color=line.get_color(), alpha=0.2, lw=0)
+    if shown:
+        frame(axis, group[late][:, shown].ravel())
+        axis.legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(shown))
+    axis.grid(alpha=0.25, lw=0.5)

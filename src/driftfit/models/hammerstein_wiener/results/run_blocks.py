@@ -1,0 +1,137 @@
+"""The blocks of a run: its theta separated by a method, or the minimal parameters that a tracker followed."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.engine.drivers import drivers, output_type
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.separation.least_squares import refine
+from driftfit.models.hammerstein_wiener.separation.paths import Blocks, Groups, deviations, split
+from driftfit.models.hammerstein_wiener.separation.separate import METHODS
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+BLOCK = 512
+"""Samples whose covariances are held at a time."""
+WEAK = 1e-3
+"""1 / |(1, c)| below this: the first coefficient is next to nothing beside the others, and a bad gauge."""
+
+
+def blocks_of(
+    run: Track, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+) -> Blocks:
+    """The blocks of a run; see `Track.blocks`."""
+    model = run.model
+    if not isinstance(model, HammersteinWiener):
+        raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
+    one_of("blocks", "method", method, METHODS)
+    if run.names == model.structure.minimal_names:
+        found = _of_minimal(run, model)
+    elif method == "gls":
+        found = _by_least_squares(run, model)
+    else:
+        a, b, c, d, quality = split(model, run.theta, method)
+        none = Groups(*(np.full(part.shape, np.nan) for part in (a, b, c, d)))
+        found = Blocks(model, method, a, b, c, d, quality, none, _intercept(run))
+    _warn(found, run, input)
+    return found.gauge(found.gauged[0] if input is None else input, output, at)
+
+
+def _intercept(run: Track) -> Array | None:
+    return run.theta[:, -1].copy() if getattr(run.model, "intercept", False) else None
+
+
+def _warn(found: Blocks, run: Track, input: str | None) -> None:
+    """Say where a separation cannot be relied on."""
+    used, n = int(run.ok.sum()), run.model.n
+    if used < n:
+        warnings.warn(
+            f"blocks: {used} usable samples cannot tell {n} products apart; what is shown is mostly the start.",
+            UserWarning,
+            stacklevel=4,
+        )
+    late = slice(min(len(found) // 2, 5 * run.model.n), None)
+    minimal = found.gauged[0] == "c1"
+    curves = [found.of_input(i)[1] for i in range(found.model.m)] if input == "c1" or minimal else []
+    ways = ("follow the products, with Kalman" if minimal else 'use input="unit"', "use Legendre on the range of y")
+    for group, name, way in (*((c, "c_1", ways[0]) for c in curves), (found.d, "d_1", ways[1])):
+        size = np.linalg.norm(group[late], axis=1)
+        head = np.divide(np.abs(group[late, 0]), size, out=np.full(len(size), np.nan), where=size > 0.0)
+        usual = float(np.nanmedian(head)) if np.isfinite(head).any() else 1.0
+        if usual < WEAK:
+            warnings.warn(
+                f"blocks: {name} = 1 is a bad gauge here, the other coefficients are {1.0 / usual:.3g} times as large; "
+                f"order the functions so that the first matters, or {way}.",
+                UserWarning,
+                stacklevel=4,
+            )
+    if found.method == "average" and found.c.shape[1] > 1:
+        near = np.abs(run.theta[late, found.a.shape[1] : found.a.shape[1] + found.b.shape[1]])
+        small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
+        if small.any():
+            warnings.warn(
+                f'blocks: a b_j is next to zero in {int(small.any(axis=1).sum())} samples, where "average" has spikes; '
+                'use "svd-joint".',
+                UserWarning,
+                stacklevel=4,
+            )
+
+
+def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
+    """The blocks of a tracker that follows the minimal parameters themselves."""
+    structure = model.structure
+    at = structure.na + sum(structure.nb)
+    leads = at + structure.leads - np.arange(model.m)
+    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 stand
+    var = np.insert(run._written("var"), fixed, 0.0, axis=1)
+    cov = None
+    if "P" in (run._out.dtype.names or ()):
+        cov = np.insert(np.insert(run._written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    a, b, c, d = structure.groups(run.theta)
+    exact, std = np.zeros((len(run), 2)), deviations(model, var)
+    return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
+
+
+def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
+    """Replay the run in pieces, with covariances, and refine the separation of each."""
+    if not run.tracker.covariance:
+        raise ValueError(f'blocks: "gls" weighs by the covariance, and {type(run.tracker).__name__} carries none.')
+    a, b, c, d, quality = split(model, run.theta, "svd-joint")
+    rest, at = _intercept(run), a.shape[1] + b.shape[1] + c.shape[1]
+    zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
+    T, n_z = zeta.shape
+    cov, cost = np.empty((T, n_z, n_z)), np.empty(T)
+    orders, sizes = (model.na, model.out.n), model.structure.sizes
+    for first, P in covariances(run):
+        part = slice(first, first + len(P))
+        theta = np.ascontiguousarray(run.theta[part])
+        refine(theta, P, orders, sizes, zeta[part], cov[part], cost[part])
+    cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # of d_1
+    x = np.insert(zeta, at, 1.0, axis=1)
+    a, b, c, d, more = np.split(x, np.cumsum([a.shape[1], b.shape[1], c.shape[1], d.shape[1]]), axis=1)
+    std, intercept = deviations(model, np.einsum("tii->ti", cov)), more[:, 0] if model.intercept else None
+    found = Blocks(model, "gls", a, b, c, d, quality, std, intercept, cov, cost, ("free", "d1"))
+    return found.gauge()
+
+
+def covariances(run: Track) -> Any:
+    """(first sample, P (k, n, n)) for the pieces of a run, replayed unless the run kept them."""
+    T = len(run)
+    if "P" in (run._out.dtype.names or ()):
+        yield 0, np.ascontiguousarray(run._written("P"))
+        return
+    tile = run._fresh_tile()
+    out = np.empty(min(BLOCK, T), output_type(tile, run.tracker.outputs, "cov"))
+    drive = drivers(run.model.steps, run.tracker.steps_for(run.model), "cov").run
+    for first in range(0, T, BLOCK):
+        last = min(first + BLOCK, T)
+        known = run._known if len(run._known) == 1 else run._known[first:last]
+        drive(tile, run.y[first:last, None], run.u[first:last, :, None], known[:, :, None], out[: last - first])
+        yield first, np.ascontiguousarray(out["P"][: last - first, ..., 0])

@@ -1,0 +1,1 @@
+"""Trackers of the minimal parameters of a Hammerstein-Wiener model."""

@@ -1,0 +1,177 @@
+"""Output-error filter: an extended Kalman filter that simulates the linear block, so that y is never a regressor.
+
+    state       [w_t .. w_{t-na+1}, xi_t],   xi = (a, b, c_2 .., d_2 ..) a random walk of covariance q
+    predict     w_t = -a'[w_{t-1} .. w_{t-na}] + sum_j b_j v_{t-nk-j+1} (- l) + N(0, q_w), v and b of every input
+                row of the transition: -a | -w_{t-i} | v_{t-nk-j+1} | sum_j b_j f_k(u) | 0 | (-1), then the shifts
+    measure     y_t = F^-1(w_t; d) + n_t,  n ~ N(0, r);   F' = max(F'(y_hat), 0.05)
+                row of the measurement: 1 / F' for w_t, -g_k(y_hat) / F' for d_k
+
+Measurement noise of y biases every method that has y among its regressors; here it stands in the measurement alone. A
+missing y only skips the measurement; a missing input is taken as v = 0 with its usual power as process noise. The
+price: the filter is local and needs a start in its basin, from
+`driftfit.models.hammerstein_wiener.results.hybrid_start`. The past w are taken from the first outputs. w is held
+within three times the range of F over the outputs seen, whatever the poles do.
+
+innovation, its variance and the likelihood are those of y. Source: the output-error form of Ljung and Soderstrom (1983)
+with the blocks of Feng and Hong (2021); the guards are ours. Cost per sample: O((na + n_x)^2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing
+from driftfit.engine.settings import covariance, matrix, numbers, vector
+from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
+from driftfit.models.hammerstein_wiener.memory import PREDICTED
+from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.trackers.extended_kalman import minimal_memory, structure_of
+from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
+    OK,
+    P_W,
+    Q_W,
+    S2,
+    SEEN,
+    TIME,
+    V_POWER,
+    VALID,
+    E,
+    R,
+    follow_power,
+    output_error,
+)
+from driftfit.trackers.base import Tracker
+
+
+@lru_cache
+def _steps(machine: Any) -> TrackerSteps:
+    @kernel
+    def correct(s: State, l: int) -> None:
+        s.own[TIME, l] = s.dt[l] * s.drift[l]
+        machine(
+            s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data,
+            s.w.ctypes.data, s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
+            s.theta.shape[0], s.phi.shape[0],
+        )  # fmt: skip
+        s.valid[l], s.seen[l], s.ok[l] = s.own[VALID, l], s.own[SEEN, l], s.own[OK, l]
+        s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
+
+    return TrackerSteps(nothing, correct)
+
+
+@lru_cache
+def _applying(place: Step, p: tuple[int, ...]) -> Step:
+    """The input also counts for the usual power of v."""
+    orders = np.array(p)
+
+    def apply(s: State, l: int) -> None:
+        place(s, l)
+        m, n, k = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0], s.own.shape[0]
+        theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, k)[0]
+        follow_power(m, orders, theta, own)
+
+    step: Step = kernel(apply)
+    return step
+
+
+@dataclass(frozen=True)
+class OutputError(Tracker):
+    """Output-error extended Kalman filter on the minimal parameters of a `HammersteinWiener` model.
+
+    Parameters
+    ----------
+    q : number, (n_x,), or (n_x, n_x)
+        Drift covariance of xi per nominal sample.
+    r : number
+        Variance of the measurement noise, in squared units of y.
+    p0, theta0 : covariance and mean of xi before the first sample
+        A start in the basin of the truth; see `driftfit.models.hammerstein_wiener.results.hybrid_start.hand_off`.
+    q_w, p_w : number
+        Process noise of w per sample, and variance of the w before the first sample.
+
+    Raises
+    ------
+    ValueError
+        If q or p0 is not a covariance, r is not positive, or (when it runs) the model is no `HammersteinWiener`.
+    """
+
+    q: Any = None
+    r: float | None = None
+    p0: Any = 0.05
+    theta0: Any = 0.01
+    q_w: float = 1e-6
+    p_w: float = 0.5
+
+    required: ClassVar[tuple[str, ...]] = ("q", "r")
+    width: ClassVar[int] = 1
+    output_error: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if self.q is not None:
+            self._set("q", covariance("OutputError", "q", self.q))
+        for name in ("r", "q_w", "p_w"):
+            if getattr(self, name) is not None:
+                strict = name == "r"
+                self._set(name, numbers("OutputError", name, getattr(self, name), ndim=0, low=0.0, strict=strict))
+        self._set("p0", covariance("OutputError", "p0", self.p0))
+        self._set("theta0", numbers("OutputError", "theta0", self.theta0))
+
+    @classmethod
+    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
+        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
+        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        """The part of the state that depends on the number n of minimal parameters alone."""
+        return {
+            "theta": vector("OutputError", "theta0", self.theta0, n),
+            "P": matrix("OutputError", "p0", self.p0, n),
+            "q": matrix("OutputError", "q", self.q, n),
+            "var": np.zeros(n),
+        }
+
+    @property
+    def steps(self) -> TrackerSteps:
+        raise ValueError("OutputError: the steps depend on the model; see steps_for.")
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        structure = structure_of("OutputError", model)
+        n_w = max(structure.na, 1)
+        N = n_w + structure.n_x
+        own = np.ones(V_POWER + model.m)
+        own[:V_POWER] = 0.0
+        own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
+        S = np.zeros((N, N))
+        S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
+        return {
+            **self.state(structure.n_x), "blocks": minimal_memory(model), "own": own,
+            "w": np.zeros(n_w), "S": S, "scratch": np.zeros(2 * N),
+        }  # fmt: skip
+
+    def steps_for(self, model: Model) -> TrackerSteps:
+        structure_of("OutputError", model)
+        assert isinstance(model, HammersteinWiener)
+        machine = output_error(model.out.kind, model.places)
+        for one in (model.out.evaluate, machine):  # the machine calls the other
+            one.load()
+        return _steps(machine)
+
+    def apply_for(self, model: Model) -> Step | None:
+        assert isinstance(model, HammersteinWiener)
+        return None if model.apply is None else _applying(model.apply, model.places)
+
+    def names_for(self, model: Model) -> tuple[str, ...]:
+        return structure_of("OutputError", model).minimal_names
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        n_w = len(lane["w"])
+        np.einsum("ii->i", lane["S"])[n_w:] += p
+        np.einsum("ii->i", lane["P"])[:] += p
+        lane["var"][:] += p

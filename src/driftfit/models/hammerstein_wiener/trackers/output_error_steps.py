@@ -1,0 +1,279 @@
+"""The machine behind `driftfit.models.hammerstein_wiener.trackers.output_error`: one sample on plain arrays, compiled
+once for all orders.
+
+S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
+outputs of the linear block. ``own`` holds the numbers named below. What the model says of the present input and output
+stands in its memory (`driftfit.models.hammerstein_wiener.memory`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import Array, core, floats, outside, part
+from driftfit.models.hammerstein_wiener.memory import (
+    CURVE,
+    D_NOW,
+    EACH,
+    G_PAST,
+    GIVEN,
+    GRID,
+    HIGHEST,
+    IDENTITY,
+    INPUTS,
+    LATE,
+    LEVEL,
+    LOWEST,
+    N_OUT,
+    NA,
+    NB,
+    OWN,
+    OWN_F,
+    OWN_N_IN,
+    OWN_NB,
+    OWN_NK,
+    PREDICTED,
+    RAW,
+    STARTED,
+    TRIAL,
+    TRIAL_BEND,
+    Places,
+)
+from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
+from driftfit.models.hammerstein_wiener.values import Kind, level_of, output_values
+
+FLATTEST = 0.05
+"""Least slope of F that the filter divides by."""
+REACH = 3.0
+"""Times the largest w of the outputs seen: w is held within that."""
+FARTHEST = 1e6
+"""The same before any output was seen."""
+TINY = 1e-300
+"""Least variance of what is missing: a sample without an input is marked, also where b is 0."""
+LARGEST_VARIANCE = 1e20
+"""Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
+
+TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, V_POWER = range(11)
+"""Numbers of the filter: nominal intervals times the drift, variances, whether w stands, what comes out; from V_POWER
+on the usual power of v of each input.
+"""
+
+
+@part
+def at_d(p: Places) -> int:
+    """Where d begins in xi."""
+    found = p[NA] + p[NB]
+    for i in range(p[INPUTS]):
+        found += p[OWN + EACH * i + OWN_N_IN] - 1
+    return found
+
+
+@core
+def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
+    """w = F(y) at the last outputs, each of variance p_w and independent of xi."""
+    na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_PAST]
+    for i in range(na):
+        total = m[g + (i + 1) * n_out, 0]
+        for k in range(1, n_out):
+            total += m[d + k, 0] * m[g + (i + 1) * n_out + k, 0]
+        w[i] = total if total == total else 0.0
+        for x in range(i, len(S)):
+            S[x, i] = 0.0
+        S[i, i] = p_w
+
+
+@part
+def product(S: Array, row: Array, moved: Array, total: float) -> float:
+    """moved = S row from the lower triangle; returns row' S row, added to a total."""
+    N = len(S)
+    for x in range(N):
+        value = 0.0
+        for z in range(x + 1):
+            value += S[x, z] * row[z]
+        for z in range(x + 1, N):
+            value += S[z, x] * row[z]
+        moved[x] = value
+        total += row[x] * value
+    return total
+
+
+@core
+def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
+    """The time update of w and of S."""
+    n_w, N = len(w), len(S)
+    total, x_d = transition(p, theta, phi, w, row)
+    for x in range(x_d + p[N_OUT] - 1, N):
+        row[x] = -1.0
+        total -= theta[x - n_w]
+    own = product(S, row, moved, q_w)
+    for i in range(n_w - 1, 0, -1):
+        w[i] = w[i - 1]
+        for j in range(i, 0, -1):
+            S[i, j] = S[i - 1, j - 1]
+        for x in range(n_w, N):
+            S[x, i] = S[x, i - 1]
+    shrink = np.sqrt(LARGEST_VARIANCE / own) if own > LARGEST_VARIANCE else 1.0
+    for x in range(1, N):
+        S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
+    S[0, 0] = min(own, LARGEST_VARIANCE)
+    w[0] = total
+
+
+@part
+def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tuple[float, int]:
+    """The row of the transition for the present w but for the intercept; returns w, and where d begins in the state."""
+    na, n_w = p[NA], len(w)
+    for x in range(len(row)):
+        row[x] = 0.0
+    total = 0.0
+    for i in range(na):
+        row[i] = -theta[i]
+        row[n_w + i] = -w[i]
+        total -= theta[i] * w[i]
+    b, c, at = na, na + p[NB], na + p[NB] + p[N_OUT] - 1
+    for i in range(p[INPUTS]):
+        nb, more_in = p[OWN + EACH * i + OWN_NB], p[OWN + EACH * i + OWN_N_IN] - 1
+        for j in range(nb):
+            v = -phi[b + j]
+            for k in range(more_in):
+                f = -phi[at + k * nb + j]
+                v += theta[c + k] * f
+                row[n_w + c + k] += theta[b + j] * f
+            row[n_w + b + j] = v
+            total += theta[b + j] * v
+        b, c, at = b + nb, c + more_in, at + nb * more_in
+    return total, n_w + c
+
+
+@core
+def absorb(
+    e: float, slope: float, m: Array, p: Places, r: float, ok: bool, theta: Array, w: Array, S: Array, row: Array,
+    moved: Array,
+) -> float:  # fmt: skip
+    """The measurement update; returns the variance of the innovation."""
+    n_w, N, n_out, g = len(w), len(S), p[N_OUT], p[TRIAL]
+    x_d = n_w + at_d(p)
+    for x in range(N):
+        row[x] = 0.0
+    row[0] = 1.0 / slope
+    for k in range(1, n_out):
+        row[x_d + k - 1] = -m[g + k, 0] / slope
+    s: float = product(S, row, moved, r)
+    if ok:
+        for x in range(N):
+            k = moved[x] / s
+            if x < n_w:
+                w[x] += k * e
+            else:
+                theta[x - n_w] += k * e
+            for z in range(x + 1):
+                S[x, z] -= k * moved[z]
+    return s
+
+
+@core
+def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
+    """The variance that missing inputs leave in w, sum b_j^2 times the usual power of v; 0 where all are there."""
+    b, total = p[NA], 0.0
+    for i in range(p[INPUTS]):
+        at = OWN + EACH * i
+        nb, n_in, f = p[at + OWN_NB], p[at + OWN_N_IN], p[at + OWN_F] + p[at + OWN_NK] * p[at + OWN_N_IN]
+        for j in range(nb):
+            missing = 0
+            for k in range(n_in):
+                missing += 0 if abs(m[f + j * n_in + k, 0]) < LARGEST else 1
+            total += max(theta[b + j] * theta[b + j] * own[V_POWER + i], TINY) if missing > 0 else 0.0
+        b += nb
+    return total
+
+
+@core
+def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
+    """The usual power of v, which stands for inputs that are missing."""
+    c = p[NA] + p[NB]
+    for i in range(p[INPUTS]):
+        f, more_in = p[OWN + EACH * i + OWN_F], p[OWN + EACH * i + OWN_N_IN] - 1
+        v = m[f, 0]
+        for k in range(more_in):
+            v += theta[c + k] * m[f + 1 + k, 0]
+        own[V_POWER + i] += 0.01 * (v * v - own[V_POWER + i]) if abs(v) < 1e6 else 0.0
+        c += more_in
+
+
+@core
+def hold(m: Array, p: Places, w: Array) -> None:
+    """Keep the present w within reach of the outputs seen, whatever the poles do."""
+    low, high = m[LOWEST, 0], m[HIGHEST, 0]
+    if p[IDENTITY] == 0:
+        rising, last = rises(m, p), GRID - 1
+        low = level(m, p, p[CURVE], 0) if rising else m[p[LEVEL], 0]
+        high = level(m, p, p[CURVE], last) if rising else m[p[LEVEL] + last, 0]
+    reach = REACH * max(abs(low), abs(high))
+    reach = reach if reach > 0.0 and reach < np.inf else FARTHEST
+    w[0] = min(max(w[0], -reach), reach)
+
+
+@lru_cache
+def _work(out: Kind) -> Any:
+    """One sample, for the functions of an output basis."""
+    fill_trial, invert = output_values(out), inverse_of(level_of(out))
+
+    def output_error_work(
+        m: Array, p: Places, own: Array, theta: Array, phi: Array, q: Array, w: Array, S: Array, P: Array, row: Array,
+        moved: Array,
+    ) -> None:  # fmt: skip
+        n_out, d, free, n_w, n_x = p[N_OUT], p[D_NOW], at_d(p), len(w), len(theta)
+        for i in range(n_x):
+            for j in range(i + 1):
+                S[n_w + i, n_w + j] += q[i, j] * own[TIME]
+        for k in range(n_out - 1):
+            m[d + k + 1, 0] = theta[free + k]
+        if own[BEGUN] == 0.0 and m[STARTED, 0] > 0.0:
+            past_levels(m, p, w, S, own[P_W])
+            own[BEGUN] = 1.0
+        power = unknown_power(m, p, theta, own)
+        known = power == 0.0
+        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power)
+        hold(m, p, w)
+        y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
+        able = abs(y_hat) < np.inf
+        fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])
+        slope = 0.0
+        for k in range(n_out):
+            slope += m[d + k, 0] * m[p[TRIAL_BEND] + k, 0]
+        valid, seen = known and able and own[BEGUN] > 0.0, abs(y) < np.inf
+        used = valid and seen and m[GIVEN, 0] < np.inf
+        own[VALID], own[SEEN], own[OK] = 1.0 if valid else 0.0, 1.0 if seen else 0.0, 1.0 if used else 0.0
+        own[E] = y - y_hat if used else 0.0
+        r = own[R] * m[GIVEN, 0] if used else own[R]
+        own[S2] = absorb(own[E], max(slope, FLATTEST), m, p, r, used, theta, w, S, row, moved)
+        m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
+        follow_power(m, p, theta, own)
+        for i in range(n_x):
+            for j in range(i + 1):
+                P[i, j] = S[n_w + i, n_w + j]
+
+    return core(output_error_work)
+
+
+@lru_cache
+def output_error(out: Kind, p: tuple[int, ...]) -> Any:
+    """The machine for the functions of an output basis and the places of a model."""
+    work, orders = _work(out), np.array(p)
+
+    def machine_output_error(
+        blocks: int, theta: int, phi: int, q: int, w: int, S: int, scratch: int, own: int, P: int, n_x: int, n: int,
+    ) -> None:  # fmt: skip
+        n_w, size = max(orders[NA], 1), V_POWER + orders[INPUTS]
+        N = n_w + n_x
+        work(
+            floats(blocks, 1, 1), orders, floats(own, 1, size)[0], floats(theta, 1, n_x)[0], floats(phi, 1, n)[0],
+            floats(q, n_x, n_x), floats(w, 1, n_w)[0], floats(S, N, N), floats(P, n_x, n_x), floats(scratch, 2, N)[0],
+            floats(scratch, 2, N)[1],
+        )  # fmt: skip
+
+    return outside(machine_output_error)

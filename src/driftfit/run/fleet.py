@@ -1,0 +1,404 @@
+"""Fleets: many series, or many settings over one series, side by side in the lanes of tiles, on all cores.
+
+A tile holds up to thirty-two series of one model and one kind of tracker; the compiled step works on all its lanes at
+once. Tiles are handed to a pool of threads, which run at the same time because compiled code releases the GIL. Every
+lane does the arithmetic that its series alone would do, in the same order, so results agree bit for bit.
+
+Series are sorted by length, so that those of one tile end at about the same time. A lane that has ended is driven on
+with dt = 0 and no output, which changes nothing but the lags of its model; its state is taken at its own end.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import warnings
+from collections import defaultdict
+from collections.abc import Hashable, Iterator, KeysView, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from driftfit.data.record import Records
+from driftfit.engine.drivers import drivers, make_tile, output_type, repeat_tile
+from driftfit.engine.kernel import Array, Driver
+from driftfit.models.base import Model
+from driftfit.results import JudgedMany
+from driftfit.run.result import Track
+from driftfit.run.warm_start import carried, first_interval
+from driftfit.trackers.base import Tracker
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.show.fleet_summary import FleetSummary
+
+BLOCK = 256
+"""Samples that are brought into lane order at a time: a block of a tile stays in the second-level cache."""
+
+FEWEST = 10
+"""Fewer series than this run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
+
+LARGEST = 10
+"""With more parameters than this loops over lanes stay scalar and are slower than single lanes (docs/design.md)."""
+
+SHOWN = 1_000_000
+"""Samples above which a progress bar appears."""
+
+
+_thread = threading.local()
+
+
+class Place(NamedTuple):
+    """Where the result of one series is: what was written for its tile, the tile's end state, the lane."""
+
+    out: Array
+    tile: Array
+    lane: int
+
+
+class Fleet(JudgedMany):
+    """Results of many series, from key to `Track` like a dict, in the order of the table.
+
+    ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        trackers: Sequence[Tracker],
+        records: Records,
+        places: Sequence[Place | None],
+        failed: Mapping[Hashable, str],
+        starts: Mapping[int, Mapping[str, Array]],
+    ) -> None:
+        self.model = model
+        self.records = records
+        self.failed = dict(failed)
+        self._trackers = trackers
+        self._places = places
+        self._starts = starts
+        self._index = {key: k for k, key in enumerate(records.keys) if places[k] is not None}
+
+    def __getitem__(self, key: Hashable) -> Track:
+        try:
+            k = self._index[key]
+        except KeyError:
+            raise KeyError(self._absent(key)) from None
+        return self._track(k)
+
+    def _track(self, k: int) -> Track:
+        y, u, time, known = self.records.part(k)
+        place = self._places[k]
+        assert place is not None
+        return Track(
+            self.model, self._trackers[k], y, u, time, known, place.out[: len(y)], place.tile, place.lane,
+            self.records.labels_of(k), self._starts.get(k),
+        )  # fmt: skip
+
+    def _absent(self, key: Hashable) -> str:
+        if key in self.failed:
+            return f"{key!r} has no result: {self.failed[key]}"
+        some = ", ".join(repr(k) for k in list(self._index)[:5])
+        return f"the fleet has no {key!r}; it has {len(self)} keys: {some}{', ...' if len(self) > 5 else ''}"
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._index
+
+    def keys(self) -> KeysView[Hashable]:
+        """Keys of the series that have a result."""
+        return self._index.keys()
+
+    def values(self) -> Iterator[Track]:
+        """The results."""
+        return (self._track(k) for k in self._index.values())
+
+    def items(self) -> Iterator[tuple[Hashable, Track]]:
+        """Keys and results."""
+        return ((key, self._track(k)) for key, k in self._index.items())
+
+    def _runs(self) -> dict[Hashable, Track]:
+        return dict(self.items())
+
+    def __iter__(self) -> Iterator[Hashable]:
+        return iter(self._index)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __repr__(self) -> str:
+        samples = sum(int(self.records.length[k]) for k in self._index.values())
+        return f"Fleet of {len(self)} series, {samples} samples: {self.model!r}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self._trackers[0].names_for(self.model)
+
+    def stack(self, name: str) -> Array:
+        """One result of every series in natural order, (series, T, ...), NaN after a series' end.
+
+        ``name`` is that of an attribute of `Track`: "theta", "std", "prediction", "innovation", "innovation_std".
+        """
+        parts = [np.asarray(getattr(run, name), dtype=float) for run in self.values()]
+        longest = max(len(part) for part in parts)
+        stacked = np.full((len(parts), longest, *parts[0].shape[1:]), np.nan)
+        for row, part in zip(stacked, parts, strict=True):
+            row[: len(part)] = part
+        return stacked
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.data.export`."""
+        from driftfit.data.export import to_table
+
+        return to_table(self, kind)
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """The same table as an Arrow stream, for whatever reads one."""
+        return self.to_table().__arrow_c_stream__(requested_schema)
+
+    def to_parquet(self, path: str | os.PathLike[str]) -> None:
+        """Write the same table as Parquet."""
+        from driftfit.data.export import to_parquet
+
+        to_parquet(self, path)
+
+    def forecast(self, h: int, u: Any = None) -> Any:
+        """The h nominal samples after the end of every series as one polars table, a row a sample.
+
+        Columns: what tells the series apart, ``step`` (1 .. h), the time where the record has one, ``y_hat`` and
+        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
+        inputs (h,) or (h, m), or one array for all; a key that is not in it has none. See `driftfit.use.forecast`.
+        """
+        from driftfit.data.export import forecasts_table
+
+        return forecasts_table(self._runs(), self.records.labels, h, u)
+
+    def crossing(
+        self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,
+        level: float = 0.9,
+    ) -> Any:  # fmt: skip
+        """When a parameter or the output of every series crosses a limit, as one polars table, the first on top.
+
+        Limits are one for all, or a mapping from every key. Columns: what tells the series apart, ``probability``
+        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times where the
+        record has them. See `driftfit.use.crossing`.
+        """
+        from driftfit.use.crossing import crossings
+
+        return crossings(self._runs(), self.records.labels.by, what, below, above, horizon, u, level)
+
+    def summary(self) -> FleetSummary:
+        """Series ranked by how much their parameters moved; print it."""
+        from driftfit.show.fleet_summary import summarise
+
+        return summarise(self)
+
+    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
+        """Small multiples of one parameter for the series that moved most; a matplotlib figure."""
+        from driftfit.show.plots import plot_fleet
+
+        return plot_fleet(self, which, most, level)
+
+
+def run_fleet(
+    model: Model,
+    trackers: Sequence[Tracker],
+    records: Records,
+    keep: str = "std",
+    failed: Mapping[Hashable, str] | None = None,
+    before: Fleet | None = None,
+) -> Fleet:
+    """Run every series of ``records`` with its tracker and return the results.
+
+    ``model`` is bound; ``failed`` gives the reasons of what could not become a series. An interrupt (Ctrl-C) stops the
+    fleet and returns what is finished, with a warning.
+    """
+    places: list[Place | None] = [None] * len(trackers)
+    starts, records = _warm(model, trackers, records, before)
+    jobs = [job for group in _groups(model, trackers) for job in _jobs(model, trackers, records, group, keep)]
+    for job in jobs:
+        for lane, k in enumerate(job.series):
+            for name, value in starts.get(int(k), {}).items():
+                job.tile[name][0, ..., lane] = value
+    jobs.sort(key=lambda job: -len(job.out))
+    _run_jobs(jobs, records)
+    for job in jobs:
+        if job.done:
+            for lane, k in enumerate(job.series[: job.live]):
+                places[k] = Place(job.out, job.tile, lane)
+    absent = {records.keys[k]: "interrupted before it was run" for k, place in enumerate(places) if place is None}
+    if absent:
+        warnings.warn(
+            f"interrupted: {len(trackers) - len(absent)} of {len(trackers)} series are finished; "
+            "the others are listed in fleet.failed.",
+            stacklevel=3,
+        )
+    return Fleet(model, trackers, records, places, {**(failed or {}), **absent}, starts)
+
+
+def _warm(
+    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None
+) -> tuple[dict[int, dict[str, Array]], Records]:
+    """(fields that each series takes over, by its number; the records with the intervals since the runs before)."""
+    if before is None:
+        return {}, records
+    starts: dict[int, dict[str, Array]] = {}
+    known = records.known.copy()
+    for k, key in enumerate(records.keys):
+        if key in before:
+            run = before[key]
+            starts[k] = carried(run, model, trackers[k])
+            if records.time is not None:
+                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], records.labels)
+    return starts, replace(records, known=known)
+
+
+class Job:
+    """One tile and the series in its lanes; lanes beyond ``live`` repeat the last series and are not looked at."""
+
+    def __init__(self, run: Any, tile: Array, series: Array, live: int, out: Array) -> None:
+        self.run = run
+        self.tile = tile
+        self.series = series
+        self.live = live
+        self.out = out
+        self.done = False
+
+
+def _groups(model: Model, trackers: Sequence[Tracker]) -> list[list[int]]:
+    """Series whose trackers have the same steps and fields, so that they can share tiles."""
+    groups: dict[Any, list[int]] = defaultdict(list)
+    kinds: dict[Tracker, Any] = {}
+    for k, tracker in enumerate(trackers):
+        if tracker not in kinds:
+            shapes = tuple((name, np.shape(value)) for name, value in tracker.state_for(model).items())
+            kinds[tracker] = (tracker.steps_for(model), tracker.outputs, shapes)
+        groups[kinds[tracker]].append(k)
+    return list(groups.values())
+
+
+def lanes(tracker: Tracker, model: Model, count: int) -> int:
+    """Lanes of the tiles for ``count`` series."""
+    return 1 if count < FEWEST or model.n > LARGEST else tracker.width
+
+
+def _jobs(
+    model: Model, trackers: Sequence[Tracker], records: Records, group: Sequence[int], keep: str
+) -> Iterator[Job]:
+    """Tiles for the series of one group, longest first."""
+    tracker = trackers[group[0]]
+    L = lanes(tracker, model, len(group))
+    order = np.array(group)[np.argsort(-records.length[group], kind="stable")]
+    padded = np.concatenate([order, np.full(-len(order) % L, order[-1])]).reshape(-1, L)
+    tiles = _tiles(model, trackers, padded)
+    longest = records.length[padded[:, 0]]
+    ends = np.cumsum(longest)
+    # one allocation for all tiles, so that it is large enough for huge pages
+    out = np.empty(int(ends[-1]), output_type(tiles[:1], tracker.outputs, keep))
+    run = drivers(model.steps, tracker.steps_for(model), keep).run
+    for k, series in enumerate(padded):
+        live = min(L, len(order) - k * L)
+        yield Job(run, tiles[k : k + 1], series, live, out[ends[k] - longest[k] : ends[k]])
+
+
+def _tiles(model: Model, trackers: Sequence[Tracker], padded: Array) -> Array:
+    """Tiles at their start, one record per row of ``padded``."""
+    count, L = padded.shape
+    starts = {tracker: tracker.state_for(model) for tracker in {trackers[k] for k in padded.ravel()}}
+    first = starts[trackers[padded[0, 0]]]
+    tiles = repeat_tile(make_tile(model.n, model.m, model.memory(), [first] * L), count)
+    if len(starts) > 1:
+        for name in first:
+            values = np.array([starts[trackers[k]][name] for k in padded.ravel()])
+            tiles[name][...] = np.moveaxis(values.reshape(count, L, *values.shape[1:]), 1, -1)
+    return tiles
+
+
+def _run_jobs(jobs: Sequence[Job], records: Records) -> None:
+    """Run all jobs on a pool of threads and mark those that are done."""
+    for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
+        _drive(job, records, 0)  # compiles, before the threads wait for each other to do it
+    total = sum(len(job.out) * job.live for job in jobs)
+    with (
+        Progress(console=Console(stderr=True), transient=True, disable=total <= SHOWN) as progress,
+        ThreadPoolExecutor(cores()) as pool,
+    ):
+        task = progress.add_task("tracking", total=total)
+        waiting = {pool.submit(_drive, job, records, len(job.out)): job for job in jobs}
+        try:
+            for future in as_completed(waiting):
+                future.result()
+                waiting[future].done = True
+                progress.advance(task, len(waiting[future].out) * waiting[future].live)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=True, cancel_futures=True)
+            for future, job in waiting.items():
+                job.done = not future.cancelled()
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _drive(job: Job, records: Records, stop: int) -> None:
+    """Run one tile over its first ``stop`` samples, block by block."""
+    L = len(job.series)
+    first, length = records.first[job.series], records.length[job.series]
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)), records.known.shape[1])
+    finals: dict[int, Array] = {}
+    bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
+    for a, b in pairwise(bounds) if stop else [(0, 0)]:
+        _gather(records.y, records.u, records.known, first, length, a, b, y, u, known)
+        factors = known if len(known) == 1 else known[: b - a]
+        job.run(job.tile, y[: b - a], u[: b - a], factors, job.out[a:b])
+        for lane in np.flatnonzero(length == b).tolist():
+            finals[lane] = _words(job.tile, L)[:, lane].copy()
+    for lane, words in finals.items():
+        _words(job.tile, L)[:, lane] = words
+
+
+def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
+    """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
+    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
+    if getattr(_thread, "shapes", None) != shapes:
+        _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
+    block: tuple[Array, Array, Array] = _thread.block
+    return block
+
+
+def _words(tile: Array, L: int) -> Array:
+    """The fields of a tile as (words, L): one column is the whole state of one lane."""
+    flat = tile.view(np.int64).reshape(-1)
+    return flat[: len(flat) // L * L].reshape(-1, L)
+
+
+@Driver
+def _gather(
+    y: Array, u: Array, known: Array, first: Array, length: Array, a: int, b: int,
+    to_y: Array, to_u: Array, to_known: Array,
+) -> None:  # fmt: skip
+    """Bring samples a to b of every lane's series into lane order; a lane that has ended gets NaN, and dt = 0.
+
+    Sample by sample and not lane by lane: then the block is written row after row (4 ns per series and step with four
+    inputs; lane by lane it is 12, because each store opens another cache line).
+    """
+    L, m = len(first), u.shape[1]
+    changing = known.shape[0] > 1
+    there, start = b <= length, np.where(b <= length, first + a, 0)
+    for t in range(b - a):
+        for l in range(L):
+            to_y[t, l] = y[start[l] + t] if there[l] else np.nan
+        for j in range(m):
+            for l in range(L):
+                to_u[t, j, l] = u[start[l] + t, j] if there[l] else np.nan
+    for t in range(b - a if changing else 1):
+        for j in range(known.shape[1]):
+            for l in range(L):
+                to_known[t, j, l] = known[(start[l] + t) * changing, j] if there[l] else 1.0 * (j > 0)

@@ -1,0 +1,1 @@
+"""Streams: one sample at a time, bit for bit as a record."""

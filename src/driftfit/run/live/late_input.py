@@ -1,0 +1,69 @@
+"""Inputs that come after the output of their sample, as in a control loop: y_t is read, then u_t is chosen and applied.
+
+What the model remembers is as if u_t had stood beside y_t in a record (`driftfit.models.base.Model.apply`).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.kernel import Array, Driver, Step
+from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
+
+
+class _Later:
+    """Stands for an input that was left out, unlike None, which is one that is not known."""
+
+    def __repr__(self) -> str:
+        return "LATER"
+
+
+LATER: Any = _Later()
+
+NOTHING, INPUT, IGNORED = 0, 1, 2
+"""What `Live.apply` is expected to bring: nothing, the input of the last sample, or that of one that was ignored."""
+
+
+def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
+    """``apply(tile, u)`` for the tiles of this type; ValueError where outputs need the input of their own sample."""
+    step = tracker.apply_for(model)
+    if step is None:
+        raise ValueError(
+            f"Live.update: no input was given, but {model!r} needs the input of a sample to predict its output "
+            "(a regression, or nk = 0): update(y, u), with u=None where it is not known. In a control loop, where u is "
+            "chosen after y has been read, take a model with nk of at least 1, and update(y), then apply(u)."
+        )
+    return _compiled(step).entry(tile_type(tile), INPUTS)
+
+
+@lru_cache(maxsize=256)
+def _compiled(step: Step) -> Driver:
+    @Driver
+    def apply(tile: Array, u: Array) -> None:
+        s = tile[0]
+        for l in range(s.theta.shape[1]):
+            for j in range(u.shape[0]):
+                s.u[j, l] = u[j]
+            step(s, l)
+
+    return apply
+
+
+def check_applied(expected: int) -> None:
+    """Refuse the next sample while the input of the last one is outstanding."""
+    if expected != NOTHING:
+        raise ValueError(
+            "Live.update: the input of the last sample has not come yet: apply(u) after update(y), or apply(None) "
+            "where it is not known."
+        )
+
+
+def check_expected(expected: int) -> None:
+    """Refuse an input that no sample waits for."""
+    if expected == NOTHING:
+        raise ValueError(
+            "Live.apply: no sample waits for its input. The order is update(y) without u, then apply(u), once a sample."
+        )

@@ -1,0 +1,312 @@
+"""Record mode for several outputs: arrays, tables, fleets and grids; see `driftfit.track`."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.data.clock import LABEL, Clock, warn_of_gaps
+from driftfit.data.labels import Held, held, order_of, ordered, times_of, together
+from driftfit.data.limits import Limits, within_each
+from driftfit.data.record import PLAIN, Labels, Reading
+from driftfit.data.signals import as_inputs, as_numbers, factor, intervals, noise_of
+from driftfit.engine.drivers import output_type
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
+from driftfit.models.base import Model
+from driftfit.results import JudgedMany
+from driftfit.run.output_lanes import drive, joint_tile, taken_over, trackers_of
+from driftfit.run.outputs import Outputs
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared, row_model
+from driftfit.run.warm_start import Run, first_interval
+from driftfit.show.fleet_summary import FleetSummary, summary_of
+from driftfit.trackers.base import Tracker
+
+
+class Signals(NamedTuple):
+    """A checked record: y (T, ny), time (T,) or None, and what is known of every sample."""
+
+    y: Array
+    u: Array
+    """(T, m), or (T, ny, m) where the outputs share one theta."""
+    time: Array | None
+    gaps: Array
+    """(T,): nominal intervals."""
+    noise: Array
+    """(T, ny): factors of the noise variance."""
+    drift: Array
+    """(T,) or (T, n): factors of the drift."""
+    labels: Labels = PLAIN
+
+
+class OutputsFleet(JudgedMany, dict[Hashable, Any]):
+    """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result.
+
+    Verdict, diagnosis, summary and report are over every output of every record, with keys (key, output); over every
+    record where its outputs share one theta.
+    """
+
+    def __init__(
+        self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str], by: Sequence[str] = ("series",)
+    ) -> None:
+        super().__init__(runs)
+        self.failed, self.by = dict(failed), tuple(by)
+
+    def __repr__(self) -> str:
+        return f"Records of several outputs: {', '.join(map(repr, self))}"
+
+    def _runs(self) -> dict[Hashable, Track]:
+        found: dict[Hashable, Track] = {}
+        for key, run in self.items():
+            found |= {key: run.rows} if run.model.shared else {(key, name): run[name] for name in run.outputs}
+        return found
+
+    def summary(self) -> FleetSummary:
+        """Which outputs of which records moved most; printing it shows the first twenty."""
+        model = next((repr(run.model) for run in self.values()), "")
+        return summary_of(self._runs(), model, self.failed, {})
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """All results as one table, the keys first."""
+        from driftfit.data.export import outputs_table
+
+        return outputs_table(self, kind)
+
+
+def track_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, data: Any, by: Any, reading: Reading, keep: str, before: Any
+) -> Any:
+    """Follow a model with several outputs; the arguments are those of `track`."""
+    one_of("track", "keep", keep, ("std", "cov"))
+    failed: Mapping[Hashable, str] = {}
+    if reading.units is not None:
+        raise ValueError("track: units= is for single outputs; several outputs carry none.")
+    if data is not None:
+        model, found, failed = of_table(model, y, u, data, by, reading)
+    elif by == "row":
+        found = of_rows(model, y, u, reading)
+    elif by is not None:
+        raise ValueError(f"track: by={by!r} names a column of a table, so data= is needed; rows are by='row'.")
+    else:
+        model, one = of_arrays(model, y, u, reading)
+        found = {0: one}
+    found = restricted(model, found, reading)
+    _warn(model, found)
+    if by is None and not isinstance(tracker, Sequence):
+        return run_one(model, tracker, found[0], keep, before)
+    if by is None:
+        return OutputsFleet({k: run_one(model, one, found[0], keep, before) for k, one in enumerate(tracker)}, {})
+    if isinstance(tracker, Sequence):
+        raise ValueError("track: a grid of trackers over several outputs is for one record; leave by= out.")
+    if before is not None and not isinstance(before, Mapping):
+        raise ValueError(f"warm_start: with by= it is what such a run gave, from key to record; got {before!r}.")
+    starts = before or {}
+    runs = {key: run_one(model, tracker, one, keep, starts.get(key)) for key, one in found.items()}
+    return OutputsFleet(runs, failed, ("series",) if by == "row" else (by,) if isinstance(by, str) else by)
+
+
+def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None) -> Outputs | Shared:
+    """One record."""
+    y, u, time = signals.y, signals.u, signals.time
+    gaps = signals.gaps.copy()
+    if before is not None:
+        gaps[0] *= first_interval(before, None if time is None else time[0], signals.labels)
+    if model.shared:
+        return run_shared(model, tracker, signals._replace(gaps=gaps), keep, before)
+    bound = model.bind(signals.labels.u or u.shape[1])
+    trackers = trackers_of(bound, tracker)
+    starts = taken_over(before, bound, trackers)
+    known = known_of(bound, trackers, signals._replace(gaps=gaps))
+    tile = joint_tile(bound, trackers, starts)
+    out = np.empty(len(y), output_type(tile, trackers[0].outputs, keep_of(keep, trackers[0])))
+    drive(bound, trackers[0].steps_for(bound), keep, tile, y, u, known, out)
+    return Outputs(bound, trackers, y, u, time, known, out, tile, starts, signals.labels)
+
+
+def restricted(model: Model, found: Mapping[Hashable, Signals], reading: Reading) -> dict[Hashable, Signals]:
+    """The records with NaN for what is outside valid ranges or in a stretch to leave out, counted."""
+    if not reading.limits and not reading.exclude:
+        return dict(found)
+    keys, out = list(found), {}
+    for k, (key, one) in enumerate(found.items()):
+        m = one.u.shape[-1]
+        limits = Limits(reading.limits or {}, model.outputs, one.labels.u or model.input_names, m)
+        out_y, out_u = limits.outside(one.y, one.u)
+        number = np.arange(len(one.y))
+        excluded = within_each(reading.exclude, keys, np.full(len(number), k), one.time, number, one.labels.zone)
+        inputs = np.moveaxis(out_u, -1, 0).reshape(m, len(number), -1).sum(axis=2)
+        counts = [*(out_y & ~excluded[:, None]).sum(axis=0), *(inputs * ~excluded).sum(axis=1)]
+        said = {f"of {name} outside its limits": int(c) for name, c in zip(limits.names, counts, strict=True) if c}
+        said |= {"excluded": int(excluded.sum())} if excluded.any() else {}
+        y = np.where(out_y | excluded[:, None], np.nan, one.y)
+        u = np.where(out_u | excluded.reshape(-1, *(1,) * (one.u.ndim - 1)), np.nan, one.u)
+        out[key] = one._replace(y=y, u=u, labels=replace(one.labels, missing=said))
+    return out
+
+
+def _warn(model: Model, found: Mapping[Hashable, Signals]) -> None:
+    """Say it where most samples cannot be used because of dt."""
+    timed = [one for one in found.values() if one.time is not None]
+    if timed:
+        time, gaps = (np.concatenate(parts) for parts in zip(*((one.time, one.gaps) for one in timed), strict=True))
+        length = np.array([len(one.gaps) for one in timed])
+        labels = timed[0].labels
+        warn_of_gaps(Clock.of(labels.dt), time, gaps, np.cumsum(length) - length, model.reach, labels.zone)
+
+
+def keep_of(keep: str, tracker: Tracker) -> str:
+    """What is kept of a tracker that has it."""
+    if keep == "cov" and not tracker.covariance:
+        raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
+    return keep
+
+
+def known_of(model: Model, trackers: Sequence[Tracker], signals: Signals) -> Array:
+    """What the driver is told of every sample, (T, k, ny)."""
+    gaps, noise, drift = signals.gaps, signals.noise, signals.drift
+    T, ny = noise.shape
+    common = np.ones(T) if drift.ndim == 2 else drift
+    known = np.stack([np.repeat(gaps[:, None], ny, axis=1), noise, np.repeat(common[:, None], ny, axis=1)], axis=1)
+    if drift.ndim == 1:
+        return known
+    columns = trackers[0].beside(model, T, None, drift)
+    return np.concatenate([known, np.repeat(columns[:, :, None], ny, axis=2)], axis=1)
+
+
+def run_shared(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None) -> Shared:
+    """Rows of one instant as successive samples between which no time passes."""
+    from driftfit.run.track import drive as drive_one
+
+    (T, ny), time = signals.y.shape, signals.time
+    (one,) = trackers_of(model, tracker)
+    rows = row_model(model, one, signals.u.shape[2])
+    starts = taken_over(before, rows, (one,))
+    tile = joint_tile(rows, (one,), starts)
+    known = np.moveaxis(known_of(rows, (one,), signals), 1, 2).reshape(T * ny, -1)
+    known[np.arange(T * ny) % ny > 0, 0] = 0.0
+    flat, inputs = np.ascontiguousarray(signals.y.ravel()), np.ascontiguousarray(signals.u.reshape(T * ny, -1))
+    out = drive_one(rows, one, tile, flat, inputs, known, keep_of(keep, one))
+    times = None if time is None else np.repeat(time, ny)
+    start = starts[0] if starts else None
+    labels = replace(signals.labels, u=())
+    return Shared(Track(rows, one, flat, inputs, times, known, out, tile, 0, labels, start), model, time)
+
+
+def of_arrays(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Signals]:
+    """(the model with its outputs named, a record) from arrays or data frames."""
+    given = {"y": held("y", y), "u": Held(u) if model.shared else held("u", u)}
+    together(**given, weights=held("weights", reading.weights), drift=held("drift", reading.drift))
+    model, place = named_outputs(model, given["y"].names)
+    ny = len(model.outputs)
+    output = as_numbers("y", given["y"].values)
+    if output.ndim != 2 or output.shape[1] != ny or len(output) == 0:
+        raise ValueError(f"y must be (T, {ny}) for the outputs {', '.join(model.outputs)}; got shape {output.shape}.")
+    T = len(output)
+    times = times_of(reading.time, list(given.values()))
+    dt = LABEL if times.labels and reading.dt is None else reading.dt
+    axis, gaps = (None, np.ones(T)) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
+    each = as_numbers("drift", reading.drift) if np.ndim(reading.drift) == 2 else None
+    factors = np.broadcast_to(factor("drift", reading.drift, T), T) if each is None else each
+    regressors = shared_inputs(u, T, ny) if model.shared else as_inputs(given["u"].values, T)
+    inputs, names = ordered(model, regressors, given["u"].names)
+    labels = replace(PLAIN, u=names, time=times.name, zone=times.zone, dt=Clock.of(dt).plain)
+    noise = noise_of_each(reading.weights, T, ny)[:, place]
+    return model, Signals(np.ascontiguousarray(output[:, place]), inputs, axis, gaps, noise, factors, labels)
+
+
+def named_outputs(model: Model, names: Sequence[str]) -> tuple[Model, list[int]]:
+    """(the model, its outputs named; the columns of y in their order), for columns of y with names."""
+    ny = len(model.outputs)
+    if len(names) != ny:
+        return model, list(range(ny))
+    if isinstance(getattr(model, "ny", None), int):
+        return replace(model, ny=tuple(names)), list(range(ny))  # type: ignore[type-var]
+    return model, order_of(type(model).__name__, model.outputs, names, "outputs")
+
+
+def shared_inputs(u: Any, T: int, ny: int) -> Array:
+    """Regressors (T, ny, m): a row for each output."""
+    regressors = as_numbers("u", u)
+    if regressors.ndim != 3 or regressors.shape[:2] != (T, ny):
+        raise ValueError(
+            f"u must be (T, ny, m) = ({T}, {ny}, m) with shared=True: a row of regressors for each output; "
+            f"got shape {regressors.shape}."
+        )
+    return regressors
+
+
+def noise_of_each(weights: Any, T: int, ny: int) -> Array:
+    """Factors of the noise variance, (T, ny), from weights: a number, (T,), or (T, ny) for outputs of unlike noise."""
+    given = as_numbers("weights", weights)
+    if given.ndim < 2:
+        return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)
+    if given.shape != (T, ny):
+        raise ValueError(f"weights must be one number, ({T},) or ({T}, {ny}); got shape {given.shape}.")
+    return noise_of(given.ravel(), given.size).reshape(T, ny)
+
+
+def of_rows(model: Model, y: Any, u: Any, reading: Reading) -> dict[Hashable, Signals]:
+    """Records as the first axis of arrays: y (units, T, ny), u (units, ..), time (T,) or (units, T)."""
+    outputs = as_numbers("y", y)
+    if outputs.ndim != 3:
+        raise ValueError(f'by="row": y must be (units, T, {len(model.outputs)}); got shape {outputs.shape}.')
+    inputs = None if u is None else as_numbers("u", u)
+    if inputs is not None and inputs.shape[:2] != outputs.shape[:2]:
+        raise ValueError(f'by="row": y has shape {outputs.shape}, so u cannot have shape {inputs.shape}.')
+    axes = None if reading.time is None else np.asarray(reading.time)
+    found: dict[Hashable, Signals] = {}
+    for k, one in enumerate(outputs):
+        time = axes[k] if axes is not None and axes.ndim > 1 else axes
+        _, found[k] = of_arrays(model, one, None if inputs is None else inputs[k], replace(reading, time=time))
+    return found
+
+
+def of_table(
+    model: Model, y: Any, u: Any, data: Any, by: Any, reading: Reading
+) -> tuple[Model, dict[Hashable, Signals], Mapping[Hashable, str]]:
+    """(the model with its outputs named, a record for each unit, the reasons of units without one) from a table.
+
+    ``y`` lists the columns of the outputs, ``u`` those of the inputs (with shared=True a list for each output).
+    """
+    from driftfit.data.tables import read_records
+
+    outputs = [y] if isinstance(y, str) else list(y)
+    ny = len(model.outputs)
+    if len(outputs) != ny:
+        raise ValueError(f"track: y must name {ny} columns, one for each output; got {y!r}.")
+    model, place = named_outputs(model, outputs)
+    outputs = [outputs[j] for j in place]
+    inputs = [] if u is None else [u] if isinstance(u, str) else list(u)
+    if model.shared:
+        inputs = [name for row in inputs for name in ([row] if isinstance(row, str) else row)]
+    weights = reading.weights
+    many = [] if isinstance(weights, str) or np.ndim(weights) == 0 else list(weights)
+    many = [many[j] for j in place] if len(many) == ny else many
+    columns = [*outputs[1:], *inputs, *many]
+    common = replace(reading, weights=1.0 if many else weights, units=None)
+    records, failed = read_records(data, outputs[0], columns, by, common)
+    labels = replace(PLAIN, time=records.labels.time, zone=records.labels.zone, dt=records.labels.dt)
+    found = {}
+    for k, key in enumerate(records.keys):
+        first, rest, axis, known = records.part(k)
+        T, end = len(first), ny - 1 + len(inputs)
+        known = np.broadcast_to(known, (T, 3))
+        each = rest[:, end:]
+        noise = (
+            noise_of_each(np.where(np.isfinite(each), each, 1.0), T, ny) if many else np.repeat(known[:, 1:2], ny, 1)
+        )
+        rows = slice(int(records.first[k]), int(records.first[k]) + T)
+        factors = known[:, 2].copy() if records.drifts is None else records.drifts[rows]
+        names: tuple[str, ...] = ()
+        signals = np.ascontiguousarray(rest[:, ny - 1 : end])
+        if model.shared:
+            signals = signals.reshape(T, ny, -1)
+        else:
+            signals, names = ordered(model, signals, inputs)
+        both = np.column_stack([first, rest[:, : ny - 1]])
+        found[key] = Signals(both, signals, axis, known[:, 0].copy(), noise, factors, replace(labels, u=names))
+    return model, found, failed

@@ -1,0 +1,122 @@
+"""What was wrong, on a page: the dates of labels, the alarms with dates and causes, and their picture."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.alarms.onsets import onsets
+from driftfit.judge.plots import plot_alarms
+from driftfit.judge.verdict import p_text
+from driftfit.show.page_parts import picture, table
+from driftfit.show.summary import key_text
+
+if TYPE_CHECKING:
+    from driftfit.judge.alarms.detect import Alarms
+    from driftfit.judge.alarms.many import ManyAlarms
+    from driftfit.run.result import Track
+
+LISTED = 100
+"""Rows of a table."""
+
+PICTURED = 4
+"""Pictures of alarms on a page about many."""
+
+PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm is on. Grey: labelled as wrong."
+
+
+def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
+    """The section: labels, alarms, and the picture of the alarms."""
+    wrong = None if labels is None else _checked(run, labels)
+    parts = [] if wrong is None else [_labels(run, alarms, wrong)]
+    if alarms is not None:
+        parts += [_said(alarms, wrong), _alarms(alarms), picture(plot_alarms(alarms, wrong), run, PICTURE)]
+    return "".join(parts)
+
+
+def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, labels: Mapping[Hashable, Array]) -> str:
+    """The section about many: a row for each with labels or alarms, and pictures of the most extreme."""
+    watched = {} if alarms is None else {row.key: row for row in alarms.rows}
+    strange = [key for key in labels if key not in runs]
+    if strange:
+        raise ValueError(f"report: labels name {strange[0]!r}, which has no result.")
+    rows = []
+    for key in dict.fromkeys([*watched, *labels]):
+        wrong = _checked(runs[key], labels[key]) if key in labels else np.zeros(len(runs[key]), bool)
+        begun, row = onsets(wrong), watched.get(key)
+        marked = escape(runs[key].time_text(int(begun[0]))) if len(begun) else ""
+        cells: tuple[str, ...] = (escape(key_text(key)), str(len(begun)) if key in labels else "", marked)
+        if row is not None and (len(begun) or len(row.alarms.onsets)):
+            score = row.alarms.score(wrong)
+            found = (str(score.found), str(score.false)) if key in labels else ("", "")
+            cells += (str(len(row.alarms.onsets)), escape(row.first), escape(p_text(row.q)), *found)
+        if len(cells) > 3 or len(begun):
+            rows.append((*cells, *[""] * (8 - len(cells))))
+    heads = ("", "labelled", "the first", "alarms", "the first", "q", "found", "false")
+    shown = [row for row in watched.values() if len(row.alarms.onsets)][:PICTURED]
+    pictures = (
+        f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
+        f"{picture(plot_alarms(row.alarms, _given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        for row in shown
+    )
+    return table(f"Stretches labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
+        pictures
+    )
+
+
+def _given(runs: Mapping[Hashable, Track], labels: Mapping[Hashable, Array], key: Hashable) -> Array | None:
+    return _checked(runs[key], labels[key]) if key in labels else None
+
+
+def _checked(run: Track, labels: Array) -> Array:
+    wrong = np.asarray(labels).astype(bool)
+    if wrong.shape != (len(run),):
+        raise ValueError(f"report: labels have shape {wrong.shape}, but the record has {len(run)} samples.")
+    return wrong
+
+
+def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
+    rows = []
+    for first in onsets(wrong):
+        last = int(first) + int(np.argmin(np.append(wrong[first:], False)))
+        row = [escape(run.time_text(int(first))), escape(run.time_text(last - 1)), str(last - int(first))]
+        if alarms is not None:
+            begun = alarms.onsets[(alarms.onsets >= first) & (alarms.onsets < last)]
+            missed = '<span class="bad">no alarm</span>'
+            row.append(
+                f"{escape(run.time_text(int(begun[0])))}, {int(begun[0] - first)} later" if len(begun) else missed
+            )
+        rows.append(tuple(row))
+    heads = ("from", "to", "samples", "first alarm")[: 3 if alarms is None else 4]
+    return table(f"Labelled as wrong.{_more(rows)}", heads, rows[:LISTED], (1, 3))
+
+
+def _said(alarms: Alarms, wrong: Array | None) -> str:
+    text = (
+        f"Alarm: {alarms.kind}, one false alarm in {alarms.every:g} samples. {len(alarms.onsets)} alarms; "
+        f"{p_text(alarms.p)} is the chance that a record without a fault gets as extreme as this one."
+    )
+    if wrong is not None:
+        score = alarms.score(wrong)
+        text += f" {score.found} of {score.events} labelled stretches found, {score.false} false alarms."
+    return f"<p>{escape(text)}</p>"
+
+
+def _alarms(alarms: Alarms) -> str:
+    rows = []
+    for t in alarms.onsets:
+        cause = alarms.cause(int(t))
+        j = alarms.names.index(cause)
+        first, last = alarms.span(int(t))
+        numbers = f"{alarms.statistic[t, j]:.4g}", f"{alarms.limits[j]:.4g}"
+        rows.append((escape(first), escape(last), escape(cause), *numbers))
+    heads = ("from", "to", "cause", "statistic", "limit")
+    return table(f"Alarms.{_more(rows)}", heads, rows[:LISTED], (1, 2))
+
+
+def _more(rows: Sequence[tuple[str, ...]]) -> str:
+    return f" The first {LISTED} of {len(rows)}." if len(rows) > LISTED else ""

@@ -1,0 +1,127 @@
+"""Report of many runs: one self-contained page about a fleet, or about the outputs of one record.
+
+The verdict over all of them first, then one table with a row for each, pictures of those that move most clearly, and
+how often each diagnostic is out of bounds. The page has the looks of `driftfit.show.report`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from html import escape
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.judge.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.verdict import p_text
+from driftfit.show.page_parts import document, picture, section, table
+from driftfit.show.page_style import READING
+from driftfit.show.report import PARAMETERS, parameter_figure
+from driftfit.show.report_faults import many_faults
+from driftfit.show.summary import key_text
+
+if TYPE_CHECKING:
+    from driftfit.engine.kernel import Array
+    from driftfit.judge.alarms.many import ManyAlarms
+    from driftfit.run.result import Track
+
+LISTED = 200
+"""Rows of the table."""
+PICTURED = 4
+"""Runs with pictures."""
+NAMED = 4
+"""Fewer runs, or models, than these are named and not counted."""
+LEVEL = 0.05
+
+MANY = """<p>Each row was judged by itself. Where many are tested some look as if they moved by chance: q is the share
+of false ones among all with a q this small or smaller (false discovery rate).</p>"""
+
+
+def page_of_many(
+    runs: Mapping[Hashable, Track],
+    title: str | None,
+    failed: Mapping[Hashable, str],
+    alarms: ManyAlarms | None = None,
+    labels: Mapping[Hashable, Array] | None = None,
+) -> str:
+    """The page as text; ``failed`` says why some have no result; ``labels`` of a key are true where it was wrong."""
+    if not runs:
+        raise ValueError("report: there is no run with a result to report on.")
+    said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
+    heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
+    samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
+    counted = f"{len(runs)} series, {samples} samples, {used} used, {samples - used} skipped"
+    shown = [row for row in said.rows[:PICTURED] if row.drifts] or list(said.rows[:1])
+    return document(
+        heading,
+        [
+            f"<h1>{escape(heading)}</h1>",
+            f'<p class="soft">{escape(counted)}</p>',
+            _verdict(said, health),
+            *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
+            section("All series", _rows(said, health)),
+            section(
+                "Those that move most clearly" if said.drifting else "The clearest",
+                "".join(_pictured(row, runs[row.key]) for row in shown),
+            ),
+            section("Diagnostics", _health(health)),
+            section("Settings, and what was left out", _settings(runs, failed)),
+            section("How to read this", MANY + READING),
+        ],
+    )
+
+
+def _verdict(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+    out = sum(not one.ok for one in health.of.values())
+    state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
+    if not any(np.isfinite(check.value) for one in health.of.values() for check in one.checks):
+        state = "No diagnostic can be told."
+    lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
+    return f'<div class="verdict">{lines}</div>'
+
+
+def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
+    rows = []
+    for row in said.rows[:LISTED]:
+        out = len(health[row.key].sentences)
+        numbers = (escape(p_text(row.said.p)), escape(p_text(row.q)))
+        errors = (f"{row.said.rms:.4g}", f"{row.said.rivals[1].rms:.4g}", "yes" if row.pays else "")
+        marked = f'<span class="bad">{out}</span>' if out else "0"
+        rows.append((escape(key_text(row.key)), escape(row.change), *numbers, *errors, marked))
+    heads = ("", "what moves", "p", "q", "error", "of constants", "pays", "out of bounds")
+    more = f" The first {LISTED} of {len(said)}." if len(said) > LISTED else ""
+    return table(f"The clearest first.{more}", heads, rows, (1,))
+
+
+def _pictured(row: Judgement, run: Track) -> str:
+    told = escape(" ".join(row.said.sentences))
+    shown = picture(parameter_figure(run), run, PARAMETERS)
+    return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{told}</p>{shown}</div>'
+
+
+def _health(health: ManyDiagnoses) -> str:
+    counts = table(
+        "How many are out of bounds.", ("check", "series"), [(name, str(k)) for name, k in health.counts.items()]
+    )
+    worst = [key for key in health.worst[:PICTURED] if not health[key].ok]
+    told = "".join(
+        f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
+    )
+    return counts + (f"<ul>{told}</ul>" if told else "")
+
+
+def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:
+    from driftfit import __version__
+
+    trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
+    models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
+    pairs = [
+        ("Model", "; ".join(models) if len(models) < NAMED else f"{len(models)} different ones"),
+        ("Tracker", trackers[0] if len(trackers) == 1 else f"{len(trackers)} different settings"),
+        (
+            "Without a result",
+            "; ".join(f"{key_text(key)}: {reason}" for key, reason in list(failed.items())[:20]) or "none",
+        ),
+        ("Made by", f"driftfit {__version__}"),
+    ]
+    return f"<dl>{''.join(f'<dt>{escape(name)}</dt><dd>{escape(value)}</dd>' for name, value in pairs)}</dl>"

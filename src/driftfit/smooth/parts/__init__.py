@@ -1,0 +1,1 @@
+"""The exact smoother inside: the problem, elimination, two filters that meet, rank."""

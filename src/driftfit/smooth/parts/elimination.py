@@ -1,0 +1,212 @@
+"""The fast path of the exact smoother: elimination of one increment at a time, a refinement, and a test of both.
+
+For a diagonal q, with U, z the information on theta_t (U theta = z), the increment of parameter i before sample t has
+variance g = q_i drift_t each_ti^2, and leaves
+
+    f = 1 / (1 + g U_ii);   a_i = f,  a_j = -g f U_ji;   b = g f z_i
+    U_jk <- U_jk + a_j U_ik,  U_ij <- f U_ij;   z_j <- z_j + a_j z_i,  z_i <- f z_i          forwards
+    theta_i <- a' theta + b;   C_ii <- a' C a + g f,  C_ij <- (C a)_j                        backwards
+
+between which the sample adds w phi phi' to U and w phi y to z. This is the recursion of flexible least squares,
+theta_t = e_t + M_t theta_{t+1}, with M_t as a product of n steps, so O(n^2) for means and no matrix to invert.
+
+Refinement: the same a with the residuals of the path in the place of y and its increments x as known shifts,
+z_i + x_i / g in the place of z_i, give the correction delta, whose size tells the error of the path before it.
+
+The result is accepted when delta is small, no step cancelled more than six digits (f), and no sample has a leverage so
+near to 1 that its leave-one-out residual is lost. Otherwise `driftfit.smooth.parts.two_filters` solves the problem:
+drift far above the noise and collinear regressors fail the test.
+
+Sources: Kalaba and Tesfatsion (1989); Wilkinson (1963) for refinement. Cost: O(T n^3), mostly means at O(T n^2).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, Driver
+from driftfit.smooth.parts.walk import Path, Walk
+
+CORRECTION = 1e-10
+"""Largest correction, relative to the largest value of the parameter."""
+
+CANCELLED = 1e-6
+"""Least f: below it U has lost more than six digits in one step."""
+
+LEVERAGE = 1e-5
+"""Least 1 - h: below it 1 - h has lost more than five digits."""
+
+
+def smooth(walk: Walk) -> Path | None:
+    """Solve a problem with a diagonal q and a diffuse start of full rank; None where the result is not good enough."""
+    T, n = walk.phi.shape
+    work = workspace(n).copy()
+    a, b = np.empty((T, n, n)), np.empty((T, n))
+    q, each = np.diag(walk.q).copy(), walk.each if len(walk.each) else np.ones((1, n))
+    moved = walk.drift, np.ascontiguousarray(each), q
+    least = forwards(work, walk.phi, walk.y, walk.weight, *moved, a, b)
+    C = inverse(work["U"][0])
+    if C is None or least < CANCELLED:
+        return None
+    work["C"], work["theta"] = C, C @ work["z"][0]
+    theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
+    backwards(work, walk.phi, walk.weight, *moved, a, b, theta, var, left)
+    cost = residuals(work, walk.phi, walk.y, walk.weight, *moved, a, b, theta)
+    work["theta"] = C @ work["z"][0]
+    correct(work, a, b, theta)
+    correction = work["correction"][0] / np.maximum(work["size"][0], 1e-300)
+    if not (correction.max() <= CORRECTION and left.min() > LEVERAGE and var.min() > 0.0):
+        return None
+    c, empty = np.sqrt(left), np.zeros((0, n, n))
+    rho = np.where(walk.weight > 0.0, np.sqrt(walk.weight) * walk.residual(theta) / c, np.nan)
+    return Path(theta, var, rho, c, cost, empty, empty, "fast")
+
+
+def inverse(U: Array) -> Array | None:
+    """U^-1 after scaling its diagonal to 1; None where U is singular to the machine."""
+    size = np.sqrt(np.diag(U))
+    if not (size > 0.0).all():
+        return None
+    cross = np.outer(size, size)
+    try:
+        C: Array = np.linalg.inv(U / cross) / cross
+    except np.linalg.LinAlgError:
+        return None
+    return C
+
+
+@lru_cache
+def workspace(n: int) -> Array:
+    """Scratch space, to be copied; a record so that the compiler knows n."""
+    square, vector = (np.float64, (n, n)), (np.float64, (n,))
+    vectors = ("z", "theta", "v", "correction", "size")
+    return np.zeros(1, np.dtype([("U", *square), ("C", *square), *((name, *vector) for name in vectors)]))
+
+
+@Driver
+def forwards(
+    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array
+) -> float:
+    """Eliminate every increment; leaves the last U and z in the work space and returns the least f."""
+    s = work[0]
+    n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
+    least = 1.0
+    for t in range(phi.shape[0]):
+        for i in range(n):
+            g = q[i] * drift[t] * each[t * many, i] ** 2
+            f = 1.0 / (1.0 + g * s.U[i, i])
+            least = min(least, f)
+            for j in range(n):
+                s.v[j] = -g * f * s.U[i, j]
+            s.v[i] = f
+            z = s.z[i]
+            for j in range(n):
+                a[t, i, j] = s.v[j]
+                s.z[j] = (s.z[j] if j != i else 0.0) + s.v[j] * z
+            b[t, i] = g * f * z
+            for j in range(n):
+                if j != i:
+                    for k in range(j + 1):
+                        if k != i:
+                            s.U[j, k] += s.v[j] * s.U[i, k]
+                            s.U[k, j] = s.U[j, k]
+            for j in range(n):
+                s.U[i, j] *= f
+                s.U[j, i] = s.U[i, j]
+        w = weight[t]
+        for j in range(n):
+            for k in range(n):
+                s.U[j, k] += w * phi[t, j] * phi[t, k]
+            s.z[j] += w * phi[t, j] * y[t]
+    return least
+
+
+@Driver
+def backwards(
+    work: Array, phi: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
+    theta: Array, var: Array, left: Array,
+) -> None:  # fmt: skip
+    """theta, variances and 1 - leverage, from the last theta and C in the work space."""
+    s = work[0]
+    n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
+    for t in range(phi.shape[0] - 1, -1, -1):
+        h = 0.0
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += s.C[j, k] * phi[t, k]
+            h += phi[t, j] * total
+            theta[t, j] = s.theta[j]
+            var[t, j] = s.C[j, j]
+        left[t] = 1.0 - weight[t] * h
+        for i in range(n - 1, -1, -1):
+            x = b[t, i]
+            for j in range(n):
+                x += a[t, i, j] * s.theta[j]
+            s.theta[i] = x
+            own = q[i] * drift[t] * each[t * many, i] ** 2 * a[t, i, i]
+            for j in range(n):
+                total = 0.0
+                for k in range(n):
+                    total += s.C[j, k] * a[t, i, k]
+                s.v[j] = total
+            for j in range(n):
+                own += a[t, i, j] * s.v[j]
+            for j in range(n):
+                s.C[i, j] = s.v[j]
+                s.C[j, i] = s.v[j]
+            s.C[i, i] = own
+
+
+@Driver
+def residuals(
+    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
+    theta: Array,
+) -> float:  # fmt: skip
+    """The forward pass of the refinement: b of the residuals; returns the cost of the path."""
+    s = work[0]
+    n = s.z.shape[0]
+    many = 1 if each.shape[0] > 1 else 0
+    cost = 0.0
+    for i in range(n):
+        s.z[i] = 0.0
+    for t in range(phi.shape[0]):
+        for i in range(n):
+            g = q[i] * drift[t] * each[t * many, i] ** 2
+            x = theta[t, i] - theta[t - 1, i] if t > 0 else 0.0
+            shift = x / g if g > 0.0 else 0.0
+            cost += x * shift
+            z = s.z[i] + shift
+            b[t, i] = g * a[t, i, i] * z
+            for j in range(n):
+                s.z[j] = (s.z[j] if j != i else -shift) + a[t, i, j] * z
+        e = y[t]
+        for j in range(n):
+            e -= phi[t, j] * theta[t, j]
+        cost += weight[t] * e * e
+        for j in range(n):
+            s.z[j] += weight[t] * phi[t, j] * e
+    return cost
+
+
+@Driver
+def correct(work: Array, a: Array, b: Array, theta: Array) -> None:
+    """The backward pass of the refinement: adds the correction to theta and notes its size and theta's."""
+    s = work[0]
+    n = s.z.shape[0]
+    for i in range(n):
+        s.correction[i] = s.size[i] = 0.0
+    for t in range(theta.shape[0] - 1, -1, -1):
+        for i in range(n):
+            theta[t, i] += s.theta[i]
+            s.correction[i] = max(s.correction[i], abs(s.theta[i]))
+            s.size[i] = max(s.size[i], abs(theta[t, i]))
+        for i in range(n - 1, -1, -1):
+            x = b[t, i]
+            for j in range(n):
+                x += a[t, i, j] * s.theta[j]
+            s.theta[i] = x

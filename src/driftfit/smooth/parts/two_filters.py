@@ -1,0 +1,265 @@
+"""Two filters of square-root information that meet at every sample: the safe path of the exact smoother.
+
+    forwards    (S-, d-)_t   what the prior and the samples before t say of theta_t
+    backwards   (S+, d+)_t   what the samples after t say of theta_t
+    T_t         = (S-, d-) with the rows of (S+, d+) rotated in: theta_t without sample t
+    theta_t, C_t              from T_t with the row of sample t rotated in: theta_t = T^-1 d, C_t = T^-1 T^-T
+
+The last rotation leaves rho and the product c of the cosines, which give without cancellation
+
+    leverage h_t            1 - h_t = c^2
+    residual                y_t - phi_t' theta_t = rho c / sqrt(weight_t)
+    with t left out         y_t - phi_t' theta_t(without t) = rho / (c sqrt(weight_t))
+
+It serves every ratio of drift to noise, any prior, zero and singular q, a drift of its own for every parameter and
+sample (rows of G scaled by ``each``), slopes (a shear of S by ``trend``), collinear and badly scaled regressors. Both
+filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), 8 (n + 1) (n + 2) bytes a sample.
+
+Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the rotations
+(`driftfit.trackers.parts.information`). Departure: leverage and leave-one-out residuals from the cosines.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import WIDTH, make_tile
+from driftfit.engine.kernel import Array, Driver
+from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.trackers.parts import information
+
+KNOWN_EXACTLY = 1e8
+"""How much more is known of what the prior fixes than all samples together could say; its square is beyond rounding."""
+STANDS_STILL = 1e-60
+"""The drift of a direction that does not move, in scaled units: its weight is the square of the inverse."""
+
+
+class Start(NamedTuple):
+    """What is known before the first sample, ``rows theta_1 = values``, and which parameters stay undetermined."""
+
+    rows: Array
+    values: Array
+    hidden: Array
+    """(n,) or (T, n) bool"""
+
+
+def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") -> Path:
+    """Solve the problem with columns divided by ``scale``; G is the root of q in these units."""
+    cross, hidden = np.outer(scale, scale), begin.hidden
+    scaled = walk._replace(phi=walk.phi / scale)
+    found, blocks = meeting(scaled, G, begin.rows, begin.values, keep)
+    found.rho[walk.weight == 0.0] = np.nan
+    lag_cov = gains(scaled, G, blocks) @ found.cov[1:] if keep == "cov" else found.cov
+    return found._replace(
+        theta=found.theta / scale, var=np.where(hidden, np.inf, found.var / scale**2),
+        cov=found.cov / cross, lag_cov=lag_cov / cross,
+    )  # fmt: skip
+
+
+def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
+    """Let the two filters run and meet, from ``rows theta_1 = values`` and G G' = q; also what they knew on the way."""
+    T, n = walk.phi.shape
+    root, drift = np.sqrt(walk.weight), np.sqrt(np.append(walk.drift, 0.0))
+    blocks = np.zeros(-(-T // WIDTH), block_type(n))
+    filters, meet = compiled()
+    pair = workspace(n, 2).copy()
+    pair["G"] = G[:, :, None]
+    cost = filters(pair, walk.phi, walk.y, root, drift, *changes(walk), rows, values, blocks)
+    theta, var, rho, c = np.empty((T, n)), np.empty((T, n)), np.empty(T), np.empty(T)
+    R = np.empty((T if keep == "cov" else 0, n, n))
+    meet(workspace(n, WIDTH).copy(), walk.phi, walk.y, root, blocks, theta, var, rho, c, R)
+    cov = R @ R.swapaxes(1, 2)
+    return Path(theta, var, rho, c, cost, cov, cov, "safe"), blocks
+
+
+def changes(walk: Walk) -> tuple[Array, Array]:
+    """``each`` and ``trend`` with an entry after the last sample, where nothing happens any more."""
+    each, trend = walk.each, walk.trend.ravel()
+    each = np.vstack([each, np.ones((1, each.shape[1]))]) if len(each) else each
+    return each, np.append(trend, 0.0) if len(trend) else trend
+
+
+def start(walk: Walk, scale: Array, unseen: Array) -> Start:
+    """The start of a problem whose regressors, divided by ``scale``, see none of the vectors ``unseen`` (n, k).
+
+    A proper prior gives a row for each of its axes. Without one, a row that fixes the first point is needed in every
+    direction that the regressors never span; it costs nothing there, so its weight does not matter.
+    """
+    theta0 = walk.theta0 * scale
+    if walk.p0 is not None:
+        variance, axes = np.linalg.eigh(walk.p0 * np.outer(scale, scale))
+        sure = KNOWN_EXACTLY * np.sqrt(1.0 + walk.weight.sum() * len(scale))
+        rows = axes.T / np.sqrt(np.maximum(variance, sure**-2.0))[:, None]
+        return Start(rows, rows @ theta0, np.zeros(len(scale), bool))
+    if unseen.shape[1] == 0:
+        return Start(np.zeros((0, len(scale))), np.zeros(0), np.zeros(len(scale), bool))
+    natural = unspanned(unseen, scale)
+    rows = natural / scale
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return Start(rows, rows @ theta0, undetermined(natural))
+
+
+def unspanned(unseen: Array, scale: Array) -> Array:
+    """Orthonormal basis, in rows, of the theta that regressors do not see, from such vectors for scaled regressors."""
+    basis: Array = np.linalg.qr(unseen / scale[:, None])[0].T
+    return basis
+
+
+def undetermined(hidden: Array) -> Array:
+    """Which parameters have a share in unseen directions."""
+    share: Array = np.linalg.norm(hidden, axis=0) > 1e-8
+    return share
+
+
+def gains(walk: Walk, G: Array, blocks: Array) -> Array:
+    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}.
+
+    With M the root of the information of the samples up to t on F theta_t = x, g = E G sqrt(drift_{t+1}) = V s W' and F
+    moving theta along its slope (1 where it has none), x minimises
+
+        |M x|^2 + |s^-1 V' (x - theta_{t+1})|^2
+
+    by Householder reflections with the rows in the order of their size. M'M would lose what the past says where the
+    drift is far above the noise, and the gain as 1 less something would cancel there.
+    """
+    T, n = walk.phi.shape
+    M = np.zeros((T, n + 1, n))
+    rows, columns = np.triu_indices(n)
+    M[:, rows, columns] = np.moveaxis(blocks["S"][:, 0], 1, 2).reshape(-1, len(rows))[:T]
+    M[:, n] = np.sqrt(walk.weight)[:, None] * walk.phi
+    g = G * np.sqrt(walk.drift[1:, None, None])
+    if len(walk.each):
+        g = walk.each[1:, :, None] * g
+    back = np.broadcast_to(np.eye(n), (T - 1, n, n))
+    if len(walk.trend):
+        back = back - np.eye(n, k=n // 2) * walk.trend[1:, None, None]
+    V, s, _ = np.linalg.svd(g)
+    held = (V / np.maximum(s, STANDS_STILL)[:, None, :]).swapaxes(1, 2)
+    A = np.concatenate([M[:-1] @ back, held], axis=1)
+    b = np.concatenate([np.zeros((T - 1, n + 1, n)), held], axis=1)
+    order = np.argsort(-np.abs(A).max(axis=2), axis=1)[:, :, None]
+    A, b = np.take_along_axis(A, order, axis=1), np.take_along_axis(b, order, axis=1)
+    pivots = np.argsort(-np.abs(A[:, 0]), axis=1)
+    Q, R = np.linalg.qr(np.take_along_axis(A, pivots[:, None, :], axis=2))
+    found, gain = np.linalg.solve(R, Q.swapaxes(1, 2) @ b), np.empty((T - 1, n, n))
+    np.put_along_axis(gain, pivots[:, :, None], found, axis=1)
+    return np.asarray(back @ gain)
+
+
+def block_type(n: int) -> np.dtype[Any]:
+    """`WIDTH` samples of what the two filters know before they see the sample: packed S and d, lane 0 and 1."""
+    packed = n * (n + 1) // 2
+    return np.dtype([("S", np.float64, (2, packed, WIDTH)), ("d", np.float64, (2, n, WIDTH))])
+
+
+@lru_cache
+def workspace(n: int, L: int) -> Array:
+    """Scratch space of L lanes, to be copied."""
+    square, vector = np.zeros((n, n)), np.zeros(n)
+    names = {"S": square, "R": square, "G": square, "H": square, "d": vector, "x": vector, "row": vector}
+    names |= {"pivot": vector}
+    return make_tile(n, 0, {}, [{"theta": vector, "rho": 0.0, "c": 0.0, **names}] * L)
+
+
+@lru_cache
+def compiled() -> tuple[Any, Any]:
+    """The two loops; closures, so that the cache on disk sees when a kernel changes."""
+    absorb, spread, solve, invert = information.absorb, information.spread, information.solve, information.invert
+    shear, width = information.shear, WIDTH
+
+    @Driver
+    def filters(
+        work: Array, phi: Array, y: Array, root: Array, drift: Array, each: Array, trend: Array,
+        rows: Array, values: Array, blocks: Array,
+    ) -> float:  # fmt: skip
+        """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0."""
+        s = work[0]
+        T, n = phi.shape[0], s.d.shape[0]
+        s.H[:] = s.G
+        for k in range(rows.shape[0]):
+            for i in range(n):
+                s.row[i, 0] = rows[k, i]
+            absorb(s.S, s.d, s.row, values[k], 0)
+        cost = 0.0
+        for t in range(T):
+            if each.shape[0] > 0:
+                for l in range(2):
+                    for i in range(n):
+                        for j in range(i, n):
+                            s.H[i, j, l] = each[t if l == 0 else T - t, i] * s.G[i, j, l]
+            if trend.shape[0] > 0:
+                shear(s.S, -trend[t], 0)
+            for l in range(2):
+                spread(s.S, s.d, s.H, drift[t if l == 0 else T - t], s.pivot, l)
+            if trend.shape[0] > 0:
+                shear(s.S, trend[T - t], 1)
+            for l in range(2):
+                at = t if l == 0 else T - 1 - t
+                block, lane = blocks[at // width], at % width
+                k = 0
+                for i in range(n):
+                    block.d[l, i, lane] = s.d[i, l]
+                    for j in range(i, n):
+                        block.S[l, k, lane] = s.S[i, j, l]
+                        k += 1
+                for i in range(n):
+                    s.row[i, l] = root[at] * phi[at, i]
+                s.y[l] = root[at] * y[at]
+            for l in range(2):
+                s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
+            cost += s.rho[0] * s.rho[0]
+        return cost
+
+    @Driver
+    def meet(
+        work: Array, phi: Array, y: Array, root: Array, blocks: Array,
+        theta: Array, var: Array, rho: Array, c: Array, inverse: Array,
+    ) -> None:  # fmt: skip
+        s = work[0]
+        T, n = phi.shape[0], s.d.shape[0]
+        for b in range(blocks.shape[0]):
+            block, first = blocks[b], b * width
+            count = min(width, T - first)
+            k = 0
+            for i in range(n):
+                for l in range(width):
+                    s.d[i, l] = block.d[0, i, l]
+                    for j in range(i, n):
+                        s.S[i, j, l] = block.S[0, k + j - i, l]
+                k += n - i
+            k = 0
+            for i in range(n):
+                for l in range(width):
+                    for j in range(n):
+                        s.row[j, l] = block.S[1, k + j - i, l] if j >= i else 0.0
+                    absorb(s.S, s.d, s.row, block.d[1, i, l], l)
+                k += n - i
+            for l in range(count):
+                for i in range(n):
+                    s.row[i, l] = root[first + l] * phi[first + l, i]
+                s.y[l] = root[first + l] * y[first + l]
+            for l in range(width):
+                s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
+            for l in range(width):
+                solve(s.S, s.d, s.x, l)
+                invert(s.S, s.R, l)
+                for i in range(n):
+                    total = 0.0
+                    for j in range(i, n):
+                        total += s.R[i, j, l] * s.R[i, j, l]
+                    s.var[i, l] = total
+            for l in range(count):
+                rho[first + l], c[first + l] = s.rho[l], s.c[l]
+                for i in range(n):
+                    theta[first + l, i] = s.x[i, l]
+                    var[first + l, i] = s.var[i, l]
+            if inverse.shape[0] > 0:
+                for l in range(count):
+                    for i in range(n):
+                        for j in range(n):
+                            inverse[first + l, i, j] = s.R[i, j, l]
+
+    return filters, meet

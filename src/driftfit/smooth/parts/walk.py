@@ -1,0 +1,221 @@
+"""The problem that smoothers solve: a regression whose coefficients walk at random, as a run left it.
+
+    y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
+    theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(each_t)
+    theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
+
+The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
+once to collect them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.data.signals import as_numbers
+from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type
+from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.trackers.base import RandomWalk
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+COLLECTED = ("phi", "y", "dt", "valid")
+
+NONE = np.zeros((0, 0))
+"""No parameter drifts otherwise than q says, and none has a slope."""
+
+
+class Walk(NamedTuple):
+    """T samples of a regression on n parameters that walk at random; q and p0 are relative to the noise variance."""
+
+    phi: Array
+    """(T, n), finite."""
+    y: Array
+    """(T,), finite."""
+    weight: Array
+    """(T,): 0 for samples that are not used."""
+    drift: Array
+    """(T,): nominal intervals of drift before each sample."""
+    q: Array
+    """(n, n), drift covariance per nominal interval."""
+    theta0: Array
+    """(n,)"""
+    p0: Array | None
+    """(n, n), or None for the diffuse start."""
+    r: float | None
+    """Noise variance; None where it is to be estimated."""
+    each: Array = NONE
+    """(T, n): roots of the factors of each parameter's drift before each sample; empty where there are none."""
+    trend: Array = NONE
+    """(T,): intervals of motion along a slope before each sample, where q is the drift of that slope; else empty."""
+
+    @property
+    def used(self) -> int:
+        """Number of samples with a positive weight."""
+        return int(np.count_nonzero(self.weight))
+
+    def residual(self, theta: Array) -> Array:
+        """y - phi' theta, (T,)."""
+        residual: Array = self.y - np.einsum("ti,ti->t", self.phi, theta)
+        return residual
+
+    def pull(self, residual: Array) -> Array:
+        """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the force on each increment.
+
+        At the minimum of J its first row is zero (without a prior), and `moves` of it are the increments.
+        """
+        weighted = self.phi * (self.weight * residual)[:, None]
+        forces: Array = np.cumsum(weighted[::-1], axis=0)[::-1]
+        return forces
+
+    def moves(self, pull: Array) -> Array:
+        """theta_{t+1} - theta_t under forces (T, n) as `pull` gives them: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
+
+        Where theta has a slope, slope_{t+1} - slope_t, with sum over i > t of trend_i pull_i in the place of pull.
+        """
+        if len(self.trend):
+            pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
+        each = self.each[1:] if len(self.each) else 1.0
+        moves: Array = self.drift[1:, None] * each * ((each * pull[1:]) @ self.q)
+        return moves
+
+
+def constants(n: int) -> RandomWalk:
+    """Parameters that never change, of which nothing is known."""
+    return RandomWalk(np.zeros((n, n)), None, np.zeros(n), None, at_first_sample=True)
+
+
+def free(n: int) -> RandomWalk:
+    """Parameters whose drift is given for every sample, and the noise too, of which nothing is known."""
+    return RandomWalk(np.eye(n), 1.0, np.zeros(n), None)
+
+
+class Path(NamedTuple):
+    """What a smoother found; covariances are relative to the noise variance."""
+
+    theta: Array
+    """(T, n)"""
+    var: Array
+    """(T, n): inf for parameters that the record does not determine."""
+    rho: Array
+    """(T,): NaN where there was no sample."""
+    c: Array
+    """(T,): sqrt(1 - leverage)."""
+    cost: float
+    """The least J."""
+    cov: Array
+    """(T, n, n), or empty."""
+    lag_cov: Array
+    """(T - 1, n, n), of theta_t and theta_{t+1}, or empty."""
+    method: str
+    """"fast" or "safe"."""
+    rank: Array = np.zeros(0, np.int64)
+    """(T,): rank of the regressors up to each sample."""
+    slope: Array = NONE
+    """(T, n), per nominal interval; empty where theta has none."""
+    slope_var: Array = NONE
+    """(T, n), or empty."""
+
+
+@kernel
+def collect(o: State, s: State, l: int) -> None:
+    """Store what the tracker saw, after the model and the missing-data rule have spoken."""
+    for i in range(s.phi.shape[0]):
+        o.phi[i, l] = s.phi[i, l]
+    o.y[l] = s.y[l]
+    o.dt[l] = s.dt[l]
+    o.valid[l] = s.valid[l]
+
+
+@lru_cache
+def attentive(steps: TrackerSteps) -> TrackerSteps:
+    """Steps that note the factor of the noise variance when the tracker is at work, and what the tracker notes itself.
+
+    A model may make it larger than what the user gave (measurement noise that comes in through a curve).
+    """
+    predict, begin, note = steps.predict, steps.begin, steps.note
+
+    @kernel
+    def collect_all(o: State, s: State, l: int) -> None:
+        collect(o, s, l)
+        note(o, s, l)
+        o.used_noise[l] = s.used_noise[l]
+
+    @kernel
+    def noting(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        predict(s, l)
+
+    if begin is None:
+        return steps._replace(predict=noting, store=collect_all)
+    first: Step = begin
+
+    @kernel
+    def noting_first(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        first(s, l)
+
+    return steps._replace(predict=noting, begin=noting_first, store=collect_all)
+
+
+def replay(run: Track) -> Array:
+    """Run the tracker over its record again and return what it saw, (T,) records.
+
+    Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
+    """
+    model, tracker = run.model, run.tracker
+    tile = make_tile(model.n, model.m, model.memory(), [{**tracker.state_for(model), "used_noise": 1.0}])
+    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *tracker.noted)))
+    steps = attentive(tracker.steps_for(model))
+    drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
+    return out
+
+
+def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
+    """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
+
+    ``prior`` replaces what the tracker takes theta to be.
+    """
+    own, tracker = prior is None, run.tracker
+    each = run._known[:, 3:] if own and run._known.shape[1] > 3 else NONE
+    if prior is None:
+        prior = free(run.model.n) if tracker.noted else tracker.random_walk(run.model)
+    seen = replay(run)
+    dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
+    weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
+    drift = dt * run._known[:, 2]
+    if own and tracker.noted:
+        noted = {name: seen[name][..., 0] for name in tracker.noted}
+        q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
+        each, weight, drift = np.sqrt(q), weight / r_of, np.ones(len(drift))
+    trend = dt if prior.slopes else NONE
+    if prior.at_first_sample or prior.p0 is None:
+        first = int(np.argmax(dt > 0.0)) + 1
+        drift[:first], trend[:first] = 0.0, 0.0
+    r = 1.0 if prior.r is None else prior.r
+    p0 = None if prior.p0 is None else prior.p0 / r
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
+    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
+
+
+def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
+    """(walk, order): the samples sorted by a state variable, one nominal step apart; equal values stay in time order.
+
+    A sample whose value is missing comes last and is not used.
+    """
+    value = as_numbers("order_by", by)
+    if value.shape != walk.y.shape:
+        raise ValueError(f"order_by has shape {value.shape}, but the record has {len(walk.y)} samples.")
+    order = np.argsort(value, kind="stable")
+    weight = np.where(np.isfinite(value), walk.weight, 0.0)
+    drift = np.ones(len(order))
+    drift[:1] = 0.0 if walk.p0 is None else 1.0
+    trend = drift.copy() if len(walk.trend) else NONE
+    arranged = walk._replace(
+        phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift, each=NONE, trend=trend
+    )
+    return arranged, order

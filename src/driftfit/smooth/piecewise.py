@@ -1,0 +1,100 @@
+"""Piecewise constant parameters: least squares on each stretch between two changes.
+
+    theta_k = argmin sum_{t in segment k} w_t (y_t - phi_t' theta)^2,   cov = r (Phi' W Phi)^-1
+
+It is the limit of the smoother given events as the covariance of a jump grows and that of the drift vanishes; it is not
+a method of its own. Changes come from a `Bank`, or from the user; what a bank takes for
+a fault of the sensor is left out. r is pooled over the segments unless it is given. A
+segment that does not determine a direction takes the solution of least norm there, and its std is inf.
+
+Use it when parameters stand still between changes and the stretches are what matters. Cost: O(T n^2).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.smooth.parts.walk import replay
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+
+
+class Segments:
+    """Stretches of a record with constant parameters.
+
+    ``bounds`` (k + 1,): segment j is ``bounds[j]`` to ``bounds[j + 1]``, the end left out; ``theta``, ``std`` (k, n);
+    ``covs`` (k, n, n); ``used`` (k,) samples; ``r`` the noise variance.
+    """
+
+    def __init__(self, run: Track, breaks: Any = None, r: float | None = None) -> None:
+        if breaks is None:
+            breaks = [event.span.date for event in run.hypotheses.events() if event.kind == "change"]
+        T = len(run)
+        inner = sorted({int(b) for b in breaks})
+        if inner and not 0 < inner[0] <= inner[-1] < T:
+            raise ValueError(f"piecewise: breaks must be samples within 1 .. {T - 1}; got {inner}.")
+        self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
+        seen = replay(run)
+        known = seen["ok"][:, 0] > 0.0
+        if run.tracker.weighs:  # a sensor at fault tells nothing of the segment
+            from driftfit.trackers.bank.results.decided_path import faults
+
+            known &= faults(run.tracker, run, run.hypotheses.events()) == 1.0  # type: ignore[arg-type]
+        self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
+        self._weight = 1.0 / seen["used_noise"][:, 0]
+        self._solve(r)
+
+    def _solve(self, r: float | None) -> None:
+        n, thetas, covs, rest, free = self._phi.shape[1], [], [], 0.0, 0
+        used = []
+        for a, b in zip(self.bounds[:-1], self.bounds[1:], strict=True):
+            rows = np.flatnonzero(self._ok[a:b]) + a
+            root = np.sqrt(self._weight[rows])
+            A, d = self._phi[rows] * root[:, None], self._y[rows] * root
+            theta, _, rank, _ = np.linalg.lstsq(A, d, rcond=None)
+            thetas.append(theta)
+            cov = np.linalg.pinv(A.T @ A, hermitian=True)
+            if rank < n:
+                loose = np.diag(np.eye(n) - np.linalg.pinv(A) @ A) > 1e-9
+                cov[loose, loose] = np.inf
+            covs.append(cov)
+            rest += float(np.sum((d - A @ theta) ** 2))
+            free += len(rows) - int(rank)
+            used.append(len(rows))
+        self.r = r if r is not None else rest / free if free > 0 else float("nan")
+        self.theta, self.covs, self.used = np.array(thetas), self.r * np.array(covs), np.array(used)
+
+    @property
+    def std(self) -> Array:
+        return np.asarray(np.sqrt(np.einsum("kii->ki", self.covs)))
+
+    @property
+    def path(self) -> Array:
+        """(T, n)"""
+        return np.repeat(self.theta, np.diff(self.bounds), axis=0)
+
+    def table(self) -> Any:
+        """One row a segment, as a polars table: start, end, samples, parameters and their standard deviations."""
+        import polars as pl
+
+        columns: dict[str, Any] = {"start": self.bounds[:-1], "end": self.bounds[1:] - 1, "samples": self.used}
+        for i, name in enumerate(self.names):
+            columns |= {name: self.theta[:, i], f"std_{name}": self.std[:, i]}
+        return pl.DataFrame(columns)
+
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters of the segments with bands, over the tracked path."""
+        from driftfit.show.plots import plot_segments
+
+        return plot_segments(self, level)
+
+
+def piecewise(run: Track, breaks: Any = None, r: float | None = None) -> Segments:
+    """Segments between ``breaks``: the first samples of new segments, or the changes that a bank found."""
+    return Segments(run, breaks, r)

@@ -1,0 +1,84 @@
+"""The smoothed path of outputs that share one theta: one theta an instant, one residual an output.
+
+Rows of one instant are successive samples between which theta does not move, so what holds after its last row holds for
+the instant, and the lag from one instant to the next is that from its last row to the first of the next.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from driftfit.engine.kernel import Array
+from driftfit.smooth.smoothed import Smoothed
+
+if TYPE_CHECKING:
+    from driftfit.run.shared_outputs import Shared
+
+
+class SmoothedShared(Smoothed):
+    """Shared parameters of a record, each from all of it.
+
+    As `Smoothed`, with ``theta``, ``std``, ``slope`` (T, n), ``rank`` (T,) and ``residual``, ``loo``, ``leverage``
+    (T, ny). ``rows`` is the path of the T ny rows.
+    """
+
+    def __init__(self, rows: Smoothed, run: Shared) -> None:
+        self.rows, self._ny = rows, len(run.outputs)
+        self.run: Any = run
+        self.walk, self._path, self.order_by = rows.walk, rows._path, None
+        self.theta, self.rank = self._last(rows.theta), self._last(rows.rank)
+        self.cost, self.method, self.r = rows.cost, rows.method, rows.r
+
+    def _last(self, values: Array) -> Array:
+        """Of each instant what holds after all its rows."""
+        return values[self._ny - 1 :: self._ny]
+
+    def _by_output(self, values: Array) -> Array:
+        return values.reshape(-1, self._ny)
+
+    @cached_property
+    def std(self) -> Array:
+        return self._last(self.rows.std)
+
+    @property
+    def slope(self) -> Array:
+        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        return self._last(self.rows.slope)
+
+    @cached_property
+    def slope_std(self) -> Array:
+        """Standard deviation of the slope, (T, n)."""
+        return self._last(self.rows.slope_std)
+
+    @cached_property
+    def leverage(self) -> Array:
+        return self._by_output(self.rows.leverage)
+
+    @cached_property
+    def residual(self) -> Array:
+        return self._by_output(self.rows.residual)
+
+    @cached_property
+    def loo(self) -> Array:
+        return self._by_output(self.rows.loo)
+
+    @cached_property
+    def press(self) -> float:
+        return self.rows.press
+
+    @cached_property
+    def alone(self) -> int:
+        return self.rows.alone
+
+    @cached_property
+    def measurement_cost(self) -> float:
+        return self.rows.measurement_cost
+
+    def cov(self, t: int) -> Array:
+        """Covariance (n, n) of theta at sample t; entries of undetermined parameters are inf on the diagonal."""
+        return self.rows.cov(range(len(self.theta))[t] * self._ny + self._ny - 1)
+
+    def lag_cov(self, t: int) -> Array:
+        """Covariance (n, n) of theta at samples t and t + 1, rows for t."""
+        return self.rows.lag_cov(range(len(self.theta) - 1)[t] * self._ny + self._ny - 1)

@@ -1,0 +1,212 @@
+"""Smoothed: the path of a complete record, with what judges it."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cached_property
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
+from driftfit.smooth import exact
+from driftfit.smooth.parts.walk import Path, Walk, ordered, walk_of
+
+ALONE = 1e-12
+"""Below this sqrt(1 - leverage) a sample alone determines a direction, and says nothing when it is left out."""
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+
+
+class Smoothed:
+    """Parameters of a record, each from all of it.
+
+    Attributes
+    ----------
+    theta, std : (T, n)
+        Posterior mean and standard deviation; std is inf for parameters that the record does not determine.
+    residual, loo : (T,)
+        y - phi' theta; and the same with theta from all samples but this one. The first is *not* a measure of fit: it
+        is shrunk by 1 - leverage. NaN where there is no sample; loo also where a sample alone determines a direction.
+    leverage : (T,)
+        Share of a sample in its own fit, in [0, 1].
+    press, alone : float, int
+        Weighted mean square of ``loo``, and how many samples it leaves out because they alone determine a direction.
+    cost, measurement_cost, dynamic_cost : float
+        The least J, and its two parts: weighted squared residuals, and the rest.
+    r : float
+        Noise variance: the tracker's, or J / (N - rank) where it carries none (J / N under a proper prior).
+    rank : (T,) int
+        Rank of the regressors up to each sample.
+    method : "fast" or "safe"
+        Which path the solver took; it tests its own result.
+    walk : Walk
+        The problem that was solved.
+
+    Bands hold under the random-walk model and its drift; they do not cover a drift that is set wrongly.
+    """
+
+    def __init__(self, walk: Walk, path: Path, run: Track, order_by: Any = None) -> None:
+        self.walk = walk
+        self.run = run
+        self._path = path
+        self.order_by = order_by
+        self.theta = path.theta
+        self.rank = path.rank
+        self.cost = path.cost
+        self.method = path.method
+        self.r = noise_variance(walk, path) if walk.r is None else walk.r
+
+    @classmethod
+    def of(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
+        """Smooth a run."""
+        one_of("smooth", "keep", keep, ("std", "cov"))
+        one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
+        walk = walk_of(run)
+        smoothed = cls(walk, solve(walk, keep, order_by), run, order_by)
+        unknown = np.isinf(smoothed._path.var)
+        if undetermined == "raise" and unknown.any():
+            names = ", ".join(
+                name for name, one in zip(run.names, np.any(unknown, axis=0).tolist(), strict=True) if one
+            )
+            size = len(run.names) * (2 if len(walk.trend) else 1)
+            raise ValueError(
+                f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
+                'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
+            )
+        if undetermined == "nan":
+            smoothed.theta[unknown] = np.nan
+        return smoothed
+
+    def __repr__(self) -> str:
+        run = self.run
+        return f"Smoothed path of {len(run)} samples, {self.walk.used} used: {run.model!r}, {run.tracker!r}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.run.names
+
+    @property
+    def time(self) -> Array:
+        """Times given, or sample numbers."""
+        return self.run.time
+
+    @cached_property
+    def std(self) -> Array:
+        return np.sqrt(self.r * self._path.var)
+
+    @property
+    def slope(self) -> Array:
+        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        return self._of_slopes(self._path.slope)
+
+    @cached_property
+    def slope_std(self) -> Array:
+        """Standard deviation of the slope, (T, n)."""
+        return np.sqrt(self.r * self._of_slopes(self._path.slope_var))
+
+    def _of_slopes(self, values: Array) -> Array:
+        if not len(self.walk.trend):
+            raise ValueError("slope: theta itself walks at random here; FLS(mu, differences=2) gives it a slope.")
+        return values
+
+    @cached_property
+    def leverage(self) -> Array:
+        leverage: Array = 1.0 - self._path.c**2
+        return leverage
+
+    @cached_property
+    def residual(self) -> Array:
+        return self._scaled(self._path.rho * self._path.c)
+
+    @cached_property
+    def loo(self) -> Array:
+        c = np.where(self._path.c > ALONE, self._path.c, np.nan)
+        return self._scaled(self._path.rho / c)
+
+    @cached_property
+    def press(self) -> float:
+        terms = self.walk.weight * self.loo**2
+        return float(np.nanmean(terms)) if np.isfinite(terms).any() else float("nan")
+
+    @cached_property
+    def alone(self) -> int:
+        return int(np.count_nonzero((self.walk.weight > 0.0) & np.isnan(self.loo)))
+
+    def _scaled(self, values: Array) -> Array:
+        """Values in units of y; NaN where there is no sample."""
+        weight = np.where(self.walk.weight > 0.0, self.walk.weight, np.nan)
+        scaled: Array = values / np.sqrt(weight)
+        return scaled
+
+    @cached_property
+    def measurement_cost(self) -> float:
+        return float(np.nansum((self._path.rho * self._path.c) ** 2))
+
+    @property
+    def dynamic_cost(self) -> float:
+        return self.cost - self.measurement_cost
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        return self.theta - half, self.theta + half
+
+    def cov(self, t: int) -> Array:
+        """Covariance (n, n) of theta at sample t; entries of undetermined parameters are inf on the diagonal."""
+        cov: Array = self.r * self._covariances.cov[t]
+        np.fill_diagonal(cov, self.std[t] ** 2)
+        return cov
+
+    def lag_cov(self, t: int) -> Array:
+        """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` where given."""
+        lag: Array = self.r * self._covariances.lag_cov[t]
+        return lag
+
+    @cached_property
+    def _covariances(self) -> Path:
+        """The path with its covariances; solved again unless they were kept."""
+        return self._path if len(self._path.cov) else solve(self.walk, "cov", self.order_by)
+
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters with bands, smoothed and filtered; a matplotlib figure."""
+        from driftfit.show.plots import plot_smoothed
+
+        return plot_smoothed(self, level)
+
+
+def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
+    """The smoothed path in time order; with ``order_by`` theta walks along that variable instead of along time."""
+    if order_by is None:
+        return exact.smooth(walk, keep)
+    arranged, order = ordered(walk, order_by)
+    path, back = exact.smooth(arranged, keep), np.argsort(order)
+    slopes = ("slope", "slope_var") if len(walk.trend) else ()
+    in_time = {name: getattr(path, name)[back] for name in ("theta", "var", "rho", "c", "rank", *slopes)}
+    cov = path.cov[back] if len(path.cov) else path.cov
+    nowhere = ~np.isfinite(np.asarray(order_by, float))
+    in_time["theta"][nowhere] = in_time["var"][nowhere] = np.nan
+    return path._replace(**in_time, cov=cov)
+
+
+def noise_variance(walk: Walk, path: Path) -> float:
+    """J / (N - rank); NaN, with a warning, where nothing is left over to estimate it from."""
+    free = walk.used - (int(path.rank.max()) if walk.p0 is None else 0)
+    least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
+    if free <= 0 or path.cost <= least:
+        warnings.warn(
+            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual to estimate the noise from; "
+            "the path is given without bands.",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+        return float("nan")
+    return path.cost / free

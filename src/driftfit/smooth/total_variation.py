@@ -1,0 +1,121 @@
+"""Group total variation: a path of few jumps, constant in between.
+
+    minimise  F = sum_t weight_t (y_t - phi_t' theta_t)^2 + penalty sum_t |theta_{t+1} - theta_t|_2
+
+by reweighting: solve flexible least squares with D_t = penalty / (2 sqrt(|Delta_t|^2 + eta^2)) I. Each step minimises a
+quadratic that lies on or above F (with eta) and touches it, so that cost never rises; F is convex.
+
+Certificate: with g_t = 2 sum_{i > t} weight_i phi_i (y_i - phi_i' theta_i), the minimum has |g_t| <= penalty everywhere
+and g_t = penalty Delta_t / |Delta_t| at a jump. A path with |g_t| <= penalty costs at most
+sum(penalty |Delta_t| - g_t' Delta_t) more than the best one: that gap is what stops the iteration. At
+penalty >= penalty_max = max |g_t| of constant least squares the path is constant.
+
+Use it for parameters that jump (switching systems). It shrinks jumps towards each other; `refit` estimates each segment
+anew. The norm couples parameters, so put them into comparable units first. Source: Rudin, Osher and Fatemi (1992) for
+the penalty, Yuan and Lin (2006) for groups. Cost: 100 to 1,000 exact smoothings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import numbers, whole
+from driftfit.smooth import exact
+from driftfit.smooth.parts.walk import Walk, constants, walk_of
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+SMOOTHING = 1e-6
+"""eta, relative to the size of theta."""
+
+
+class Piecewise(NamedTuple):
+    """A path of few jumps."""
+
+    theta: Array
+    """(T, n)"""
+    jumps: Array
+    """Samples at which a new segment begins."""
+    refit: Array
+    """(T, n): least squares on each segment by itself."""
+    penalty_max: float
+    """From this penalty on the path is constant."""
+    costs: Array
+    """F with eta after every step; it never rises."""
+    pull: float
+    """max |g_t| / penalty: at most 1 at the minimum."""
+    gap: float
+    """How much more than the least F this path may cost, as a share of F."""
+
+
+def total_variation(run: Track, penalty: float, tol: float = 1e-4, max_steps: int = 1000) -> Piecewise:
+    """Smooth a run under a price for jumps.
+
+    Parameters
+    ----------
+    run : Track
+        Of any tracker; only its regressors and outputs are used.
+    penalty : number
+        Price of a jump of size 1, in squared units of y; positive.
+    tol : number
+        Stop when the gap is below this share of the cost and |g_t| above the penalty by at most a thousandth.
+    max_steps : int
+        Stop at the latest here; ``pull`` and ``gap`` say how far it got.
+
+    Raises
+    ------
+    ValueError
+        If penalty is not positive.
+    """
+    price = float(numbers("total_variation", "penalty", penalty, ndim=0, low=0.0, strict=True))
+    whole("total_variation", "max_steps", max_steps, 1)
+    fixed = walk_of(run, constants(run.model.n))
+    walk = fixed._replace(q=np.eye(run.model.n))
+    open_ = fixed.drift > 0.0
+    theta = exact.smooth(fixed).theta
+    penalty_max = float(2.0 * np.linalg.norm(walk.pull(walk.residual(theta))[open_], axis=1).max(initial=0.0))
+    theta = exact.smooth(walk).theta
+    eta = SMOOTHING * max(float(np.abs(theta).max()), 1e-300)
+    costs, pull, gap = [], np.inf, np.inf
+    for _ in range(max_steps):
+        length = np.sqrt(jump_sizes(theta, open_) ** 2 + eta**2)
+        theta = exact.smooth(walk._replace(drift=np.where(open_, 2.0 * length / price, 0.0))).theta
+        cost, pull, gap = judge(walk, theta, open_, price)
+        costs.append(cost + price * float(np.sum(np.sqrt(jump_sizes(theta, open_) ** 2 + eta**2)[open_])))
+        if pull <= 1.001 and gap <= tol:
+            break
+    sizes = jump_sizes(theta, open_)
+    jumps = np.flatnonzero(sizes > 1e3 * eta)
+    return Piecewise(theta, jumps, refitted(fixed, jumps), penalty_max, np.array(costs), pull, gap)
+
+
+def jump_sizes(theta: Array, possible: Array) -> Array:
+    """|theta_t - theta_{t-1}|, (T,); 0 where no time passes."""
+    sizes = np.zeros(len(theta))
+    sizes[1:] = np.linalg.norm(np.diff(theta, axis=0), axis=1)
+    return np.where(possible, sizes, 0.0)
+
+
+def judge(walk: Walk, theta: Array, possible: Array, price: float) -> tuple[float, float, float]:
+    """(squared residuals, max |g| / penalty, gap as a share of F)."""
+    residual = walk.residual(theta)
+    g = 2.0 * walk.pull(residual)[possible]
+    moves = np.diff(theta, axis=0, prepend=theta[:1])[possible]
+    squares = float(np.sum(walk.weight * residual**2))
+    variation = price * float(np.linalg.norm(moves, axis=1).sum())
+    pull = float(np.linalg.norm(g, axis=1).max(initial=0.0)) / price
+    gap = variation - float(np.sum(g * moves)) + max(0.0, pull - 1.0) * (squares + variation)
+    return squares, pull, gap / max(squares + variation, 1e-300)
+
+
+def refitted(fixed: Walk, jumps: Array) -> Array:
+    """Least squares between the jumps."""
+    parts = []
+    for a, b in zip([0, *jumps], [*jumps, len(fixed.y)], strict=True):
+        rows = {name: getattr(fixed, name)[a:b] for name in ("phi", "y", "weight", "drift")}
+        parts.append(exact.smooth(fixed._replace(**rows)).theta)
+    return np.concatenate(parts)

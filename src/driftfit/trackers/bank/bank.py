@@ -1,0 +1,378 @@
+"""A bank of hypotheses: Kalman filters along the histories of what may have happened, weighed by what they predict.
+
+    theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j), sensor j
+    p(history, event | data) proportional to N(y_t; phi' m, phi' C- phi + r_j) p(event | history) p(history | data)
+
+(a jump Markov linear system). Every history of events is a leaf with its own Gaussian; a reduction keeps their number
+bounded (`driftfit.trackers.bank.reduction`). What is reported at t, the mixture over all leaves, is computed after the
+tree has grown by sample t and before it is reduced.
+
+Use it where parameters stand still and sometimes jump, or where the sensor may fail: jumps are seen by their fit, not
+by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper.
+Jumps show only through the regressors: no excitation, no detection.
+
+`Bank()` alone has no scale: see `driftfit.trackers.bank.change`. With unknown noise variance (r of the nominal sensor
+left None) q and p0 are in units of it, unless a ``guess`` of it is given.
+
+A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
+Until the regressors have full rank (and, with unknown noise, four residuals are there) only the first change acts.
+
+form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
+numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
+time.
+
+Source: fixed-lag decisions and trees of hypotheses after the paper on Bayesian tracking of parameters with alternative
+developments; Bar-Shalom, Li and Kirubarajan (2001), chapter 11; Andersson (1985) for the beam. Departures: leaves are
+merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) a leaf update.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.models.base import Model
+from driftfit.trackers.bank import change as changes_
+from driftfit.trackers.bank import reduction as reductions
+from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.leaves import forget, square_root_form
+from driftfit.trackers.bank.leaves.factored import factorise, widened
+from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
+from driftfit.trackers.bank.machine.advance import bank
+from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
+from driftfit.trackers.bank.machine.memory import SINGLE, arrays_of, packed
+from driftfit.trackers.bank.machine.start import GROWTH, begin
+from driftfit.trackers.bank.machine.steps import STEPS
+from driftfit.trackers.bank.prior import chains, events, per_sample
+from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
+from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.diffuse import ALMOST_ANY, knowing, knowing_nothing
+from driftfit.trackers.parts.information import triangular_root
+from driftfit.trackers.parts.resolution import resolution, unresolved
+
+FAR = 100.0
+"""Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
+
+
+@dataclass(frozen=True)
+class Bank(Tracker):
+    """Bank of hypotheses: parameters that may jump, sensors that may fail.
+
+    Parameters
+    ----------
+    changes : list of Change
+        What may happen to theta between samples; the first is the ordinary course. None: a small drift, and a rare
+        jump of any parameter, free of scale.
+    sensors : list of Sensor
+        What the sensor may do; the first must be nominal. None: nominal, with unknown noise variance.
+    transition : None, (H_d, H_d), (H, H), or a pair
+        Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
+        sensors). None: events are independent, with the probabilities that changes and sensors carry.
+    reduce : Reduction
+        How histories are kept few. None: Beam(9), or Hybrid(9) with more than one sensor.
+    theta0, p0
+        Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
+    initial : (H,) or None
+        Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+    lag_variance : bool
+        Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
+        are; see `driftfit.trackers.bank.leaves.lags`. False takes them for certain.
+    form : "covariance" or "sqrt"
+        "sqrt" for collinear or badly scaled regressors, a wide prior and little noise: leaves keep factors U D U' of
+        their covariances (`driftfit.trackers.bank.leaves.factored`), whose variances are positive by construction.
+
+    Raises
+    ------
+    ValueError
+        If probabilities do not sum to 1, a matrix has the wrong shape or orientation, or the tree is too large.
+    """
+
+    changes: Any = None
+    sensors: Any = None
+    transition: Any = None
+    reduce: Any = None
+    theta0: Any = 0.0
+    p0: Any = None
+    initial: Any = None
+    lag_variance: bool = True
+    form: str = "covariance"
+
+    width: ClassVar[int] = 1
+    outputs: ClassVar[tuple[str, ...]] = ("report",)
+    density: ClassVar[str] = "report"
+    weighs: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        for name, kind, what in (("changes", Change, "a Change"), ("sensors", Sensor, "a Sensor")):
+            given = getattr(self, name)
+            if given is not None:
+                given = (given,) if isinstance(given, kind) else tuple(given)
+                if not given or not all(isinstance(one, kind) for one in given):
+                    raise ValueError(f"Bank: {name} must list at least one hypothesis, each {what}; got {given!r}.")
+                self._set(name, given)
+        if self.reduce is not None and not isinstance(self.reduce, Reduction):
+            raise ValueError(f"Bank: reduce must be a reduction such as Beam(9) or Decide(3); got {self.reduce!r}.")
+        if self.p0 is not None:
+            self._set("p0", covariance("Bank", "p0", self.p0))
+        self._set("theta0", numbers("Bank", "theta0", self.theta0))
+        one_of("Bank", "form", self.form, ("covariance", "sqrt"))
+        for name in ("transition", "initial"):
+            value = getattr(self, name)
+            self._set(name, None if value is None else _tuples(value))
+        self._check()
+
+    def _check(self) -> None:
+        nominal, others = self.all_sensors[0], self.all_sensors[1:]
+        if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
+            raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
+        self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        if self.all_changes[0].reset:
+            raise ValueError("Bank: the first change is the ordinary course of things, and cannot be a reset.")
+        if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
+            raise ValueError("Bank: FirstFloor knows random walks only; changes that forget need another reduction.")
+        self.reduction.losses(self._count)
+        kinds = {other.kind for other in others}
+        reduce = self.reduction
+        if isinstance(reduce, Decide) and reduce.deepest == 1 and kinds & {"outlier", "additive"} and not reduce.force:
+            raise ValueError(
+                "Bank: Decide(1) with outliers always prefers the outlier and never adapts; use Decide(2) or deeper, "
+                "Hybrid(9), or Decide(1, force=True)."
+            )
+        if "frozen" in kinds and self._alike:
+            import warnings
+
+            warnings.warn(
+                "Bank: a frozen sensor stays frozen for a while, but events are independent here; give transition=.",
+                stacklevel=4,
+            )
+
+    @property
+    def all_changes(self) -> tuple[Change, ...]:
+        """The changes, also those that `Bank()` supplies."""
+        return self.changes or changes_.usual()
+
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, likewise."""
+        return self.sensors or (Sensor.nominal(limit=FAR),)
+
+    @property
+    def reduction(self) -> Reduction:
+        """How histories are kept few, also where none was given."""
+        return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
+
+    @property
+    def _count(self) -> int:
+        return len(self.all_changes) * len(self.all_sensors)
+
+    @property
+    def _shape(self) -> Shape:
+        return self.reduction.shape(len(self.all_changes), len(self.all_sensors))
+
+    @property
+    def _events(self) -> tuple[Array, Array]:
+        return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
+
+    @property
+    def _alike(self) -> bool:
+        P = self._events[0]
+        return bool((P[0] == P).all())
+
+    @property
+    def _apart(self) -> bool:
+        """Whether changes are events that know nothing of earlier ones, so that a gap is one floor."""
+        Hd, Hm = len(self.all_changes), len(self.all_sensors)
+        if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
+            return False
+        P = self._events[0].reshape(-1, Hd, Hm)
+        product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
+        return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
+
+    @property
+    def change_names(self) -> tuple[str, ...]:
+        """Names of the changes."""
+        named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
+        return tuple(named)
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensor hypotheses."""
+        return tuple(sensor.name for sensor in self.all_sensors)
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """Names of the joint events, in their order."""
+        if len(self.all_sensors) == 1:
+            return self.change_names
+        return tuple(f"{change}, {sensor.name}" for change in self.change_names for sensor in self.all_sensors)
+
+    def settings(self) -> dict[str, Any]:
+        plain = super().settings()
+        for name in ("changes", "sensors"):
+            plain[name] = None if plain[name] is None else tuple(one.settings() for one in plain[name])
+        if self.reduce is not None:
+            plain["reduce"] = {"kind": type(self.reduce).__name__, **self.reduce.settings()}
+        return plain
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any]) -> Self:
+        given = dict(settings)
+        for name, kind in (("changes", Change), ("sensors", Sensor)):
+            if given.get(name) is not None:
+                given[name] = tuple(kind.from_settings(one) for one in given[name])
+        if given.get("reduce") is not None:
+            reduce = dict(given["reduce"])
+            given["reduce"] = getattr(reductions, reduce.pop("kind")).from_settings(reduce)
+        return cls(**given)
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        return self._state(n, 0)
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        cleans = any(one.cleans for one in self.all_sensors)
+        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        if len(model.outputs) == 1 or model.shared:
+            return state
+        sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
+        return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
+
+    def _state(self, n: int, na: int) -> Mapping[str, Any]:
+        nominal = self.all_sensors[0]
+        guessed = nominal.r is None and nominal.guess is not None
+        unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
+        P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
+        theta0 = vector("Bank", "theta0", self.theta0, n)
+        now, many = np.zeros(SIZE), np.zeros(COUNT, int)
+        now[LAST], now[R], now[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
+        squares *= nominal.guess or 0.0
+        arrays = arrays_of(self, n, na, unit, theta0)
+        scale = 1.0 if nominal.r is not None else np.nan
+        if self.p0 is not None and (nominal.r is not None or guessed):
+            arrays["theta0"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
+            begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            if self.form == "sqrt":
+                factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
+            arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
+        q0, Q0 = arrays["Q"][0, : n * (n + 1) // 2], np.zeros((n, n))
+        Q0[np.tril_indices(n)] = q0
+        return {  # memory first, where a cache line begins
+            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
+            "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
+            "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
+            "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
+            **(knowing_nothing(n, ALMOST_ANY) if self.p0 is None else knowing(n)),
+            "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
+            "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
+        }  # fmt: skip
+
+    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
+        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where nothing is given; then
+        factors of the changes (T, H_d).
+        """
+        Hd, H = len(self.all_changes), self._count
+        columns = np.hstack([np.full((T, H + Hd * Hd), np.nan), np.ones((T, Hd))])
+        if prob is not None:
+            given = as_numbers("prob", prob)
+            if given.ndim == 3:
+                columns[:, H : H + Hd * Hd] = chains("Bank", given, T, Hd)
+            else:
+                given = np.broadcast_to(given, (T, given.shape[-1]))
+                columns[:, :H] = per_sample("Bank", given, self._events[1], Hd)
+        if drift is not None:
+            factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
+            if factors.size not in (Hd, T * Hd):
+                raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
+            columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
+        return columns
+
+    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+        prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
+        columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
+        for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
+            start = lane["table"][PACKED.index(name), 0] // 8
+            lane["memory"][start : start + len(values)] = values
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        super().widen(lane, p)
+        n = len(p)
+        diagonal = np.array([i * (i + 3) // 2 for i in range(n)])
+        B = self._leaves(lane)
+        factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
+        more, C = p[:, None] / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
+        if self.form == "sqrt":
+            widened(C, more)
+        else:
+            C[diagonal] += more
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        """All leaves are moved alike, so that the mixture stands where it is said to."""
+        B, at = self._leaves(lane), list(which)
+        B[FIRST + np.array(at)] += (values - lane["theta"][at])[:, None]
+        super().place(lane, which, values)
+
+    def _leaves(self, lane: Mapping[str, Array]) -> Array:
+        """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
+        start, rows, columns = lane["table"][PACKED.index("B")]
+        B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
+        return B[:, : max(int(lane["many"][LEAVES]), 1)]
+
+    def told(self, report: Array, name: str) -> Array:
+        """evidence, window, kept, leaves, lag_prob (of the floors `floors_told`, H) or decided (held, 3) from reports
+        (.., size).
+        """
+        if name in SINGLE:
+            return report[..., SINGLE.index(name)]
+        shape = self._shape
+        floors = len(self.floors_told)
+        start, rows, columns = {
+            "lag_prob": (HEAD, floors, self._count), "decided": (HEAD + floors * self._count, shape.held, 3),
+        }[name]  # fmt: skip
+        return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
+
+    @property
+    def floors_told(self) -> tuple[int, ...]:
+        """The floors that a report tells of, counted back from the present: the newest, and the oldest."""
+        W = self._shape.floors
+        return (*range(min(W, TOLD) - 1), W - 1)
+
+    def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
+        """One of the packed arrays of a lane, as a view."""
+        table = lane["table"] if "table" in lane else self.state_for(model)["table"]
+        start, rows, columns = table[PACKED.index(name)]
+        part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
+        return part.view(np.int64) if name in ("links", "group", "slots") else part
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        told = run.hypotheses
+        kinds = [event.kind for event in told.found()]
+        wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
+        said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
+        faults = int(run._tile["many"][0, FAULTS, run._lane])
+        if faults:
+            said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
+        if told.impossible:
+            said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
+        lane = run.end().state
+        return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+
+    @property
+    def steps(self) -> TrackerSteps:
+        machine, steps = square_root_form.made() if self.form == "sqrt" else (bank, STEPS)
+        machine.load()
+        return steps
+
+
+def _tuples(value: Any) -> Any:
+    if isinstance(value, list | tuple | np.ndarray):
+        return tuple(_tuples(one) for one in value)
+    return None if value is None else float(value)

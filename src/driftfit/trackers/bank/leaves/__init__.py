@@ -1,0 +1,1 @@
+"""The leaves of the hypothesis tree: one Kalman filter for each history."""

@@ -1,0 +1,187 @@
+"""Changes on factors: what may happen to eight leaves whose covariances are U D U'.
+
+A walk is an `add` for every column of its factor, exponential forgetting scales D, the directional one is an `add`, the
+stabilised one n of `absorb`, and a reset of some parameters adds up what is left of the columns. The formulas are those
+of `driftfit.trackers.bank.leaves.forget`, the operations those of `driftfit.trackers.bank.leaves.factored`. Every
+function works on the eight columns from ``l``; V are narrow rows that may be overwritten.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from driftfit.engine.kernel import Array, kernel
+from driftfit.engine.simd import fill, higher, load, lower, minus, over, plus, reaches, store, times
+from driftfit.trackers.bank.leaves.factored import absorb, add, along, raised
+from driftfit.trackers.bank.leaves.forget import (
+    ANCHORS,
+    BEFORE,
+    CAP,
+    DIRECTIONAL,
+    EXPONENTIAL,
+    GAIN,
+    KEEP,
+    KIND,
+    MEAN,
+    PARTIAL,
+    RESET,
+    STABILISED,
+)
+from driftfit.trackers.bank.leaves.leaves import FIRST
+
+
+@kernel
+def guard(C: Array, n: int, l: int, keep: float, cap: float) -> None:
+    """`forget.guard` on what was divided by the factor, before its walk."""
+    total, at = fill(0.0), 0
+    for j in range(n):
+        squares = fill(1.0)
+        for i in range(j):
+            squares = plus(squares, times(load(C, at + i, l), load(C, at + i, l)))
+        total = plus(total, times(load(C, at + j, l), squares))
+        at += j + 1
+    most = over(higher(fill(cap), over(total, fill(keep))), total)
+    for j in range(n):
+        at = j * (j + 3) // 2
+        store(C, at, l, times(load(C, at, l), lower(fill(1.0), most)))
+
+
+@kernel
+def renew(C: Array, m: Array, n: int, l: int, which: Array, mean: Array, V: Array) -> None:
+    """`forget.renew`: what is left of the columns; the new covariance is added as a walk."""
+    tri = n * (n + 1) // 2
+    for k in range(tri):
+        store(V, n + k, 0, load(C, k, l))
+        store(C, k, l, fill(0.0))
+    for i in range(n):
+        if which[i] > 0.0:
+            store(m, i, l, fill(mean[i]))
+    for k in range(n):
+        at = k * (k + 1) // 2
+        for i in range(k):
+            store(V, i, 0, fill(0.0) if which[i] > 0.0 else load(V, n + at + i, 0))
+        store(V, k, 0, fill(0.0 if which[k] > 0.0 else 1.0))
+        add(C, k + 1, l, V, load(V, n + at + k, 0))
+
+
+@kernel
+def toward(C: Array, n: int, l: int, z: Array, gain: float, V: Array) -> None:
+    """`forget.toward`."""
+    for i in range(n):
+        store(V, 2 * n + i, 0, fill(z[i]))
+    h, at = along(C, n, l, V[2 * n :], 0, V[n:], 0), 0
+    for j in range(n):
+        v = times(load(C, at + j, l), load(V, n + j, 0))
+        store(V, j, 0, v)
+        for i in range(j):
+            store(V, i, 0, plus(load(V, i, 0), times(load(C, at + i, l), v)))
+        at += j + 1
+    none = reaches(fill(0.0), h)
+    add(C, n, l, V, over(times(fill(gain), minus(fill(1.0), none)), plus(h, none)))
+
+
+@kernel
+def measure(C: Array, m: Array, n: int, l: int, w: Array, mean: Array, r: float, V: Array) -> None:
+    """`forget.measure`."""
+    away = fill(0.0)
+    for i in range(n):
+        store(V, 2 * n + i, 0, fill(w[i]))
+        away = plus(away, times(fill(w[i]), minus(fill(mean[i]), load(m, i, l))))
+    along(C, n, l, V[2 * n :], 0, V[n:], 0)
+    gain = over(away, absorb(C, l, n, V[n:], 0, fill(r), V, C, 0, l))
+    for i in range(n):
+        store(m, i, l, plus(load(m, i, l), times(gain, load(V, i, 0))))
+
+
+@kernel
+def develop_eight(
+    A: Array, of: int, n: int, c: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, to: int, V: Array
+) -> None:  # fmt: skip
+    """Eight leaves of A with change c, to the columns from ``to``; V has n + max(tri, 2 n) narrow rows."""
+    keep, kind = maps[c, KEEP], int(maps[c, KIND])
+    for k in range(n * (n + 1) // 2):
+        store(C, k, to, load(A, FIRST + n + k, of))
+    for j in range(n):
+        at = j * (j + 3) // 2
+        store(C, at, to, times(load(C, at, to), fill(keep)))
+        store(m, j, to, fill(places[MEAN, j]) if maps[c, RESET] > 0.0 else load(A, FIRST + j, of))
+    if kind == EXPONENTIAL:
+        guard(C, n, to, keep, places[CAP, 0])
+    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
+        renew(C, m, n, to, places[ANCHORS + c * n], places[MEAN], V)
+    raised(C, n, to, Q[c], fill(1.0), V)
+    if kind == DIRECTIONAL:
+        toward(C, n, to, places[BEFORE], maps[c, GAIN], V)
+    elif kind == STABILISED and maps[c, GAIN] > 0.0:
+        for k in range(n):
+            measure(C, m, n, to, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], V)
+
+
+@kernel
+def chance_of(prior: Array, c: int, Hm: int, l: int) -> Any:
+    """The probability of a change under any sensor."""
+    chance = load(prior, c * Hm, l)
+    for j in range(1, Hm):
+        chance = plus(chance, load(prior, c * Hm + j, l))
+    return chance
+
+
+@kernel
+def blur(B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, V: Array) -> None:
+    """`leaves.blur` of eight leaves."""
+    for k in range(n * (n + 1) // 2):
+        store(C, k, l, load(B, FIRST + n + k, l))
+    for c in range(len(Q)):
+        raised(C, n, l, Q[c], chance_of(prior, c, Hm, l), V)
+
+
+@kernel
+def average(
+    B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, V: Array
+) -> None:  # fmt: skip
+    """`forget.average` of eight leaves. Changes are merged one after the other, with their chances p so far and now:
+
+        C <- C + p_c C_c + p p_c / (p + p_c) d d',   m <- m + p_c / (p + p_c) d,   d = m_c - m
+
+    which subtracts nothing.
+    """
+    tri = n * (n + 1) // 2
+    one, mean, V, so_far = V[:tri], V[tri : tri + n], V[tri + n :], fill(0.0)
+    for k in range(tri):
+        store(C, k, l, fill(0.0))
+    for i in range(n):
+        store(m, i, l, load(B, FIRST + i, l))
+    for c in range(len(Q)):
+        chance = chance_of(prior, c, Hm, l)
+        develop_eight(B, l, n, c, Q, maps, places, one, mean, 0, V)
+        for k in range(n):
+            at = k * (k + 1) // 2
+            for i in range(k):
+                store(V, i, 0, load(one, at + i, 0))
+            store(V, k, 0, fill(1.0))
+            add(C, k + 1, l, V, times(chance, load(one, at + k, 0)))
+        both = plus(so_far, chance)
+        share = over(chance, plus(both, reaches(fill(0.0), both)))
+        for i in range(n):
+            away = minus(load(mean, i, 0), load(m, i, l))
+            store(V, i, 0, away)
+            store(m, i, l, plus(load(m, i, l), times(share, away)))
+        add(C, n, l, V, times(so_far, share))
+        so_far = both
+
+
+@kernel
+def walked(n: int, Q: Array, prior: Array, Hm: int, Z: Array, zl: int, l: int) -> Any:
+    """sum_c p_c z'Q_c z of eight leaves."""
+    total = fill(0.0)
+    for c in range(len(Q)):
+        wide = fill(0.0)
+        for k in range(n):
+            at = k * (k + 1) // 2
+            if Q[c, at + k] > 0.0:
+                f = load(Z, k, zl)
+                for i in range(k):
+                    f = plus(f, times(fill(Q[c, at + i]), load(Z, i, zl)))
+                wide = plus(wide, times(fill(Q[c, at + k]), times(f, f)))
+        total = plus(total, times(chance_of(prior, c, Hm, l), wide))
+    return total

@@ -1,0 +1,221 @@
+"""Changes that forget: what may happen to a leaf N(m, C) beside a random walk.
+
+    exponential   C <- C / lam, which is a walk with Q = (1/lam - 1) C; its trace never grows above the cap
+    directional   C <- C + (1/lam - 1) g g' / (z' g),   g = C z, z the regressor of the last sample that was used
+    stabilised    C^-1 <- lam C^-1 + (1 - lam) A^-1,   C^-1 m <- lam C^-1 m + (1 - lam) A^-1 theta0
+    reset         m <- theta0, C <- Q; of some parameters: these, independent of the others
+
+lam is the forgetting factor of this interval, ``forget`` to the power dt; directional forgetting belongs to samples and
+not to time. Stabilised forgetting is exponential forgetting and then a measurement of theta0 with noise A / (1 - lam):
+n measurements by the rows w_k of W, W'W = A^-1, each with noise 1 / (1 - lam). So C stays below A / (1 - lam), whatever
+the regressors do, and unexcited parameters return to theta0.
+
+Source: Kulhavy and Zarrop (1993) for stabilised forgetting; Hagglund (1983), Kulhavy and Karny (1984) for directional.
+Cost: O(n^2) a leaf, O(n^3) where it is stabilised.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, exp, part
+from driftfit.trackers.bank.leaves.leaves import FIRST, blur, spread
+
+KEEP, RESET, KIND, GAIN = range(4)
+"""Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an
+interval 1/lam - 1 (directional), 1 - lam (stabilised), or whether time passes.
+"""
+WALK, EXPONENTIAL, DIRECTIONAL, STABILISED, PARTIAL = range(5)
+MEAN, BEFORE, CAP, ANCHORS = range(4)
+"""Rows of the table of places: theta0, the regressor of the last used sample, the cap of the trace of C, and from
+ANCHORS on n rows for every change: W, or in the first of them which parameters are reset.
+"""
+
+
+@core
+def for_interval(settings: Array, dt: float, maps: Array) -> None:
+    """The maps for an interval, of which the settings are those of the nominal one."""
+    for i in range(len(settings)):
+        kind = int(settings[i, KIND])
+        for k in range(4):
+            maps[i, k] = settings[i, k]
+        if kind == DIRECTIONAL:
+            maps[i, GAIN] = settings[i, KEEP] - 1.0
+            maps[i, KEEP] = 1.0
+        elif dt == 0.0:
+            maps[i, KEEP], maps[i, RESET], maps[i, GAIN] = 1.0, 0.0, 0.0
+        elif kind == PARTIAL:
+            maps[i, GAIN] = 1.0
+        elif kind != WALK:
+            if dt != 1.0:
+                maps[i, KEEP] = exp(-dt * settings[i, GAIN])
+            maps[i, GAIN] = 1.0 - 1.0 / maps[i, KEEP]
+
+
+@core
+def apply(C: Array, m: Array, a: int, b: int, c: int, maps: Array, places: Array, Q: Array, g: Array, h: Array) -> None:
+    """The rest of change c in the columns a .. b, which have taken in KEEP, RESET and Q."""
+    kind, n = int(maps[c, KIND]), len(m)
+    if kind == EXPONENTIAL:
+        guard(C, n, a, b, maps[c, KEEP], places[CAP, 0], Q[c], h)
+    elif kind == DIRECTIONAL:
+        toward(C, n, a, b, places[BEFORE], maps[c, GAIN], g, h)
+    elif kind == STABILISED and maps[c, GAIN] > 0.0:
+        for k in range(n):
+            measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], g, h)
+    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
+        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], Q[c])
+
+
+@core
+def guard(C: Array, n: int, a: int, b: int, keep: float, cap: float, q: Array, h: Array) -> None:
+    """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
+    for l in range(a, b):
+        h[l] = 0.0
+    for i in range(n):
+        at = i * (i + 3) // 2
+        for l in range(a, b):
+            h[l] += abs(C[at, l] - q[at])
+    for l in range(a, b):
+        h[l] = max(cap, h[l] / keep) / h[l] if h[l] > cap else 1.0
+    for k in range(n * (n + 1) // 2):
+        for l in range(a, b):
+            C[k, l] = (C[k, l] - q[k]) * h[l] + q[k] if h[l] != 1.0 else C[k, l]
+
+
+@core
+def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> None:
+    """g = C z, h = z' C z."""
+    for l in range(a, b):
+        h[l] = 0.0
+    for i in range(n):
+        for l in range(a, b):
+            g[i, l] = 0.0
+        for j in range(n):
+            at = i * (i + 1) // 2 + j if j <= i else j * (j + 1) // 2 + i
+            for l in range(a, b):
+                g[i, l] += C[at, l] * z[j]
+        for l in range(a, b):
+            h[l] += z[i] * g[i, l]
+
+
+@core
+def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, g: Array, h: Array) -> None:
+    """Directional forgetting; nothing where z or C z is zero."""
+    along(C, n, a, b, z, g, h)
+    for l in range(a, b):
+        h[l] = gain / h[l] if h[l] > 0.0 else 0.0
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            for l in range(a, b):
+                C[at, l] += h[l] * g[i, l] * g[j, l]
+            at += 1
+
+
+@core
+def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, g: Array, h: Array) -> None:
+    """A measurement of w' theta with noise r that says w' mean."""
+    n = len(m)
+    along(C, n, a, b, w, g, h)
+    for l in range(a, b):
+        h[l] = 1.0 / (h[l] + r)
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            for l in range(a, b):
+                C[at, l] -= h[l] * g[i, l] * g[j, l]
+            at += 1
+    for l in range(a, b):
+        away = 0.0
+        for j in range(n):
+            away += w[j] * (mean[j] - m[j, l])
+        h[l] *= away
+    for i in range(n):
+        for l in range(a, b):
+            m[i, l] += h[l] * g[i, l]
+
+
+@core
+def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
+    """Some parameters begin anew."""
+    at = 0
+    for i in range(len(m)):
+        if which[i] > 0.0:
+            for l in range(a, b):
+                m[i, l] = mean[i]
+        for j in range(i + 1):
+            if which[i] > 0.0 or which[j] > 0.0:
+                for l in range(a, b):
+                    C[at, l] = q[at]
+            at += 1
+
+
+@core
+def average(
+    B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, X: Array
+) -> None:  # fmt: skip
+    """Mean and covariance of every leaf if any change may happen and no data come: the first two moments.
+
+    Needs tri + 2 n + 2 rows of X.
+    """
+    tri = n * (n + 1) // 2
+    chance, h, g = X[0], X[1], X[2 : 2 + n]
+    one, mean = X[2 + n : 2 + n + tri], X[2 + n + tri : 2 + 2 * n + tri]
+    for k in range(tri):
+        for l in range(L):
+            C[k, l] = 0.0
+    for i in range(n):
+        for l in range(L):
+            m[i, l] = 0.0
+    for c in range(len(Q)):
+        for l in range(L):
+            chance[l] = 0.0
+        for j in range(Hm):
+            for l in range(L):
+                chance[l] += prior[c * Hm + j, l]
+        for k in range(tri):
+            for l in range(L):
+                one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
+        for i in range(n):
+            for l in range(L):
+                mean[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
+        apply(one, mean, 0, L, c, maps, places, Q, g, h)
+        at = 0
+        for i in range(n):
+            for l in range(L):
+                m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
+            for j in range(i + 1):
+                for l in range(L):
+                    away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
+                    C[at, l] += chance[l] * (one[at, l] + away)
+                at += 1
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            for l in range(L):
+                C[at, l] -= m[i, l] * m[j, l]
+            at += 1
+    for i in range(n):
+        for l in range(L):
+            m[i, l] += B[FIRST + i, l]
+
+
+@part
+def foresee(
+    B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
+    used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
+) -> None:  # fmt: skip
+    """The rows z'C z and z'm of ``expected`` for every leaf with all that may happen to it, and m; and C, which no
+    caller needs where the sample is ``used``.
+    """
+    if walks:
+        blur(B, L, n, prior, Hm, Q, C, m, X[0])
+    else:
+        average(B, L, n, prior, Hm, Q, maps, places, C, m, X)
+    spread(C, Z, m, L, n, na, g, expected)
+
+
+def anchors_of(covariance: Array) -> Array:
+    """W with W'W = A^-1, (n, n)."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))

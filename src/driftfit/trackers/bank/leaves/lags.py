@@ -1,0 +1,100 @@
+"""Output lags that leaves keep of their own, and how uncertain they are.
+
+A leaf that believes its sensor at fault puts its own prediction into its lags. Taken for certain, a wrong prediction is
+worse than a wrong output: while a sensor is frozen, predictions feed on themselves, and the first good sample is
+believed for its huge regressor. So leaves carry the covariance V of their lags too. With a the leaf's coefficients of
+the output lags,
+
+    s = z' C z + a' V a + r,          V+ = [[s, (V a)'], [V a, V]]  without its last row and column
+
+after a prediction was put in, and a zero row for an output that was measured. It is a plug-in still: that a and the
+lags are wrong together is left out, and so is what later outputs tell of earlier ones. Merged leaves take the spread of
+their lags into V.
+"""
+
+from __future__ import annotations
+
+from driftfit.engine.kernel import Array, core
+from driftfit.trackers.bank.leaves.leaves import FIRST
+
+
+@core
+def covariance_row(n: int, na: int) -> int:
+    """The first row of V, whose lower triangle is the last thing in a leaf."""
+    return FIRST + n + n * (n + 1) // 2 + na
+
+
+@core
+def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) -> None:
+    """Output lags of leaves that took no sample in: y where it was seen, else what each expected."""
+    at = FIRST + n + n * (n + 1) // 2
+    for i in range(na - 1, 0, -1):
+        for l in range(L):
+            B[at + i, l] = B[at + i - 1, l]
+    if na > 0:
+        for l in range(L):
+            B[at, l] = y if seen else y_hat[l]
+
+
+@core
+def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
+    """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
+    at = covariance_row(n, na)
+    if at >= len(B):
+        return
+    for i in range(na):
+        for j in range(i + 1):
+            twice = 1.0 if i == j else 2.0
+            for start in range(0, columns, K):
+                for l in range(K):
+                    h[start + l] += twice * m[i, start + l] * m[j, start + l] * B[at, l]
+            at += 1
+
+
+@core
+def shift_covariance(
+    A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, h: Array, r: float, X: Array
+) -> None:  # fmt: skip
+    """V of the children: one lag later, and the variance of what was put in, zero where that was measured.
+
+    A may be B. Needs na rows of X.
+    """
+    first = covariance_row(n, na)
+    if first >= len(B):
+        return
+    for i in range(na - 1):
+        for l in range(block.stop - block.start):
+            X[i, l] = 0.0
+        for j in range(na):
+            entry = A[first + (i * (i + 1) // 2 + j if j <= i else j * (j + 1) // 2 + i)]
+            for start in range(0, block.stop - block.start, K):
+                for l in range(K):
+                    X[i, start + l] += entry[l] * m[j, start + l]
+    for i in range(na - 1, 0, -1):
+        for j in range(i, 0, -1):
+            to, was = B[first + i * (i + 1) // 2 + j, block], A[first + (i - 1) * i // 2 + j - 1]
+            for start in range(0, len(to), K):
+                for l in range(K):
+                    to[start + l] = was[l]
+    for i in range(na - 1, 0, -1):
+        to = B[first + i * (i + 1) // 2, block]
+        for l in range(len(to)):
+            to[l] = X[i - 1, l] if own else 0.0
+    to = B[first, block]
+    for l in range(len(to)):
+        to[l] = h[l] + r if own else 0.0
+
+
+@core
+def merge_covariance(B: Array, members: Array, n: int, na: int, share: Array, A: Array, to: int) -> None:
+    """Column ``to`` of A: the average of V and the spread of the lags, whose mean stands there already."""
+    first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
+    if first >= len(B):
+        return
+    for k in range(len(members)):
+        l, at = members[k], first
+        for i in range(na):
+            away = B[lags + i, l] - A[lags + i, to]
+            for j in range(i + 1):
+                A[at, to] += share[k] * (B[at, l] + away * (B[lags + j, l] - A[lags + j, to]))
+                at += 1

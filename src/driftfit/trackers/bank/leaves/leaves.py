@@ -1,0 +1,261 @@
+"""Leaves: the columns of one matrix, and what all of them together say.
+
+A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves lie side by side along the last axis,
+which is what the compiler vectorises over; the rows of a column are
+
+    log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
+
+nu and S are those of the inverse gamma distribution of the noise variance where that is unknown, C then in its units.
+Codes are the newest events as the digits of a number; what they are for is the reduction's business. What a leaf
+remembers of its past floors, for the user and not for the recursion, are marginals of events in a table of their own,
+which the children of a leaf share: block k of it has the joint events k floors back, and the probability of no change
+since.
+
+Everything here is compiled once for all sizes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, kernel, log, part, sized
+from driftfit.engine.simd import (
+    WIDTH,
+    exp_of,
+    fill,
+    load,
+    minus,
+    only,
+    over,
+    plus,
+    reaches,
+    row_sums,
+    store,
+    sum_of,
+    times,
+)
+
+LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
+"""Rows of a leaf; the mean begins at FIRST."""
+
+
+@kernel
+def total(x: Array, count: int) -> float:
+    """Sum of the first entries in four interleaved parts: a single chain of additions would be the longest part."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = count // 4 * 4
+    for l in range(0, whole, 4):
+        a += x[l]
+        b += x[l + 1]
+        c += x[l + 2]
+        d += x[l + 3]
+    for l in range(whole, count):
+        a += x[l]
+    return (a + c) + (b + d)
+
+
+@kernel
+def largest(x: Array, count: int) -> float:
+    """Largest of the first entries, in four interleaved parts."""
+    a, b, c, d = -np.inf, -np.inf, -np.inf, -np.inf
+    whole = count // 4 * 4
+    for l in range(0, whole, 4):
+        a = x[l] if x[l] > a else a
+        b = x[l + 1] if x[l + 1] > b else b
+        c = x[l + 2] if x[l + 2] > c else c
+        d = x[l + 3] if x[l + 3] > d else d
+    for l in range(whole, count):
+        a = x[l] if x[l] > a else a
+    return max(max(a, b), max(c, d))
+
+
+@core
+def normalise(B: Array, L: int) -> float:
+    """Weights from their logarithms, zeros beyond; returns log sum, or NaN where no leaf is possible."""
+    top = largest(B[LOG], L)
+    if not abs(top) < np.inf:
+        return np.nan
+    store(B, LOG, L, fill(-np.inf))
+    sums = fill(0.0)
+    for l in range(0, L, WIDTH):
+        far = minus(load(B, LOG, l), fill(top))
+        w = times(exp_of(far), reaches(far, fill(-700.0)))
+        store(B, WEIGHT, l, w)
+        sums = plus(sums, w)
+    store(B, WEIGHT, L, fill(0.0))
+    mass = sum_of(sums)
+    gone = top + log(mass)
+    each = 1.0 / mass
+    for l in range(0, L, WIDTH):
+        store(B, WEIGHT, l, times(load(B, WEIGHT, l), fill(each)))
+        store(B, LOG, l, minus(load(B, LOG, l), fill(gone)))
+    return float(gone)
+
+
+@core
+def variance_factor(B: Array, L: int, unknown: bool, X: Array, row: int) -> None:
+    """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2)."""
+    for l in range(0, L, WIDTH):
+        ratio = over(load(B, S, l), minus(load(B, NU, l), fill(2.0))) if unknown else fill(1.0)
+        store(X, row, l, only(ratio, load(B, WEIGHT, l)))
+
+
+@sized
+def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
+    """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
+    variance_factor(B, L, unknown, X, n)
+    parts, tri = n + 1, n * (n + 1) // 2
+    for i in range(n):
+        sums = fill(0.0)
+        for l in range(0, L, WIDTH):
+            sums = plus(sums, times(load(B, WEIGHT, l), load(B, FIRST + i, l)))
+        store(X, parts + i, 0, sums)
+    for i in range(0, n, WIDTH):
+        store(X, parts + i, 0, row_sums(X, parts + i))
+    for i in range(n):
+        theta[i] = X[parts + (i & -WIDTH), i & (WIDTH - 1)]
+        for l in range(0, L, WIDTH):
+            store(X, i, l, minus(load(B, FIRST + i, l), fill(theta[i])))
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            sums = fill(0.0)
+            for l in range(0, L, WIDTH):
+                inner = times(load(B, FIRST + n + at, l), load(X, n, l))
+                sums = plus(sums, times(load(B, WEIGHT, l), plus(inner, times(load(X, i, l), load(X, j, l)))))
+            store(X, parts + at, 0, sums)
+            at += 1
+    for at in range(0, tri, WIDTH):
+        store(X, parts + at, 0, row_sums(X, parts + at))
+    at = 0
+    for i in range(n):
+        for j in range(i + 1):
+            P[i, j] = X[parts + (at & -WIDTH), at & (WIDTH - 1)]
+            at += 1
+
+
+@core
+def priors(
+    T: Array, event: Array, expanded: bool, first: bool, same: bool, L: int, P: Array, row: Array, prior: Array
+) -> None:
+    """prior[e, l] = p(next event is e | leaf): the same row for all, or the row of P for the leaf's last event."""
+    H = len(row)
+    if first or same:
+        for e in range(H):
+            for l in range(L):
+                prior[e, l] = row[e]
+        return
+    for e in range(H):
+        for l in range(L):
+            prior[e, l] = 0.0
+        if expanded:
+            for last in range(H):
+                if P[last, e] > 0.0:
+                    for l in range(L):
+                        prior[e, l] += P[last, e] * T[l, last]
+        else:
+            for l in range(L):
+                prior[e, l] = P[event[l], e]
+
+
+@core
+def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
+    """Further steps of the chain of events; X has a row for each of them."""
+    H = len(prior)
+    for _ in range(steps):
+        for e in range(H):
+            for l in range(L):
+                X[e, l] = 0.0
+            for last in range(H):
+                for l in range(L):
+                    X[e, l] += P[last, e] * prior[last, l]
+        for e in range(H):
+            for l in range(L):
+                prior[e, l] = X[e, l]
+
+
+@core
+def standstill(prior: Array, L: int, Hm: int) -> None:
+    """No time passes, so nothing changes: the sensors keep their shares, all changes but the first have none."""
+    for l in range(L):
+        for j in range(Hm):
+            share = 0.0
+            for e in range(j, len(prior), Hm):
+                share += prior[e, l]
+                prior[e, l] = 0.0
+            prior[j, l] = share
+
+
+@part
+def increments(
+    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, each: float, factors: Array, out: Array
+) -> None:  # fmt: skip
+    """out[i] = lower triangle of the covariance that change i adds in this interval; ``sizes`` may have no columns.
+
+    The first change takes ``time``, the others ``each``.
+    """
+    for i in range(len(Q)):
+        span = (time if i == 0 else each) * factors[i]
+        for k in range(0, Q.shape[1], WIDTH):
+            store(out, i, k, times(load(Q, i, k), fill(span)))
+        for k in range(sizes.shape[1]):
+            if sizes[i, k] > 0.0 and c[k] > 0.0:
+                out[i, k * (k + 1) // 2 + k] += sizes[i, k] * ((1.0 if unknown else r) / c[k]) * span
+
+
+@part
+def ready(Q: Array, n: int) -> None:
+    """Covariances of changes as leaves take them in: as they are."""
+
+
+@part
+def regressors(phi: Array, B: Array, L: int, copies: int, n: int, na: int, Z: Array) -> None:
+    """The regressor of every leaf, with its own output lags where it keeps some; else phi, for the first eight."""
+    lags = FIRST + n + n * (n + 1) // 2
+    for i in range(na):
+        for at in range(0, copies * L, L):
+            for l in range(L):
+                Z[i, at + l] = B[lags + i, l]
+    for i in range(na, n):
+        for l in range(0, copies * L if na > 0 else 1, WIDTH):
+            store(Z, i, l, fill(phi[i]))
+
+
+@part
+def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
+    """g = C z, and the rows h = z' C z and y = z' m of ``expected``, for every leaf; C is a lower triangle."""
+    for l in range(0, L, WIDTH):
+        h, y, k = fill(0.0), fill(0.0), l if na > 0 else 0
+        for i in range(n):
+            z, sums, row = load(Z, i, k), fill(0.0), i * (i + 1) // 2
+            for j in range(i + 1):
+                sums = plus(sums, times(load(C, row + j, l), load(Z, j, k)))
+            for j in range(i + 1, n):
+                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(Z, j, k)))
+            store(g, i, l, sums)
+            h = plus(h, times(z, sums))
+            y = plus(y, times(z, load(m, i, l)))
+        store(expected, 0, l, h)
+        store(expected, 1, l, y)
+
+
+@core
+def blur(B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, m: Array, chance: Array) -> None:
+    """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
+    at = FIRST + n
+    for i in range(n):
+        for l in range(L):
+            m[i, l] = B[FIRST + i, l]
+    for k in range(n * (n + 1) // 2):
+        for l in range(L):
+            C[k, l] = B[at + k, l]
+    for c in range(len(Q)):
+        for l in range(L):
+            chance[l] = 0.0
+        for j in range(Hm):
+            for l in range(L):
+                chance[l] += prior[c * Hm + j, l]
+        for k in range(n * (n + 1) // 2):
+            if Q[c, k] != 0.0:
+                for l in range(L):
+                    C[k, l] += chance[l] * Q[c, k]

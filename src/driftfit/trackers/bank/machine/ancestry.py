@@ -1,0 +1,139 @@
+"""What leaves remember of their past, for tables of probabilities: marginals of events, and of no change since.
+
+Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k floors back | leaf), entry
+k (H + 1) + H is p(no change in the newest k + 1 floors | leaf). A leaf's memory is one piece, so that handing it on is
+one copy and a marginal one sum of rows; the last row of the table is for such sums. What an event adds is a row of
+`news`, after which come two rows of factors for what was remembered: where nothing changed, and where something did.
+After growth the table is still that of the parents; a sample that is not used writes it out for every leaf.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
+from driftfit.trackers.bank.leaves.leaves import WEIGHT
+
+
+def news_of(H: int, Hm: int, width: int) -> Array:
+    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
+    is what an eight may reach into.
+    """
+    news = np.zeros((H + 3, width))
+    news[range(H), range(H)] = 1.0
+    news[:Hm, H] = 1.0
+    news[H:] = 1.0
+    news[H + 1, H :: H + 1] = 0.0
+    return news
+
+
+@kernel
+def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, to: int) -> None:
+    """Row ``to`` of T2: what the child of leaf ``of`` with event e remembers, without a branch. It may write into the
+    row after it.
+    """
+    block, width = H + 1, T.shape[1]
+    quiet = H if e < Hm else H + 1
+    for k in range(0, block, WIDTH):
+        store(T2, to, k, load(news, e, k))
+    for k in range(0, width - block, WIDTH):
+        store(T2, to, block + k, times(load(T, of, k), load(news, quiet, block + k)))
+
+
+@core
+def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, news: Array, T2: Array) -> None:
+    """The table of the children, from that of their parents."""
+    for l in range(L):
+        hand_on(T, parent[l], event[l], H, Hm, news, T2, l)
+
+
+@core
+def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
+    """One more floor of which nothing was seen: its events are as likely as before."""
+    H = len(prior)
+    block = H + 1
+    for l in range(L):
+        for k in range(T.shape[1] - 1, block - 1, -1):
+            T[l, k] = T[l, k - block]
+        for e in range(H):
+            T[l, e] = prior[e, l]
+        quiet = 0.0
+        for e in range(Hm):
+            quiet += prior[e, l]
+        T[l, H] = quiet
+        for k in range(block + H, T.shape[1], block):
+            T[l, k] *= quiet
+
+
+@part
+def pick(
+    T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, order: Array, G: int, news: Array,
+    T2: Array,
+) -> None:  # fmt: skip
+    """The table of leaves that were kept as they were."""
+    for k in range(G):
+        l = order[k]
+        if expanded:
+            for at in range(T.shape[1]):
+                T2[k, at] = T[l, at]
+        else:
+            hand_on(T, parent[l], event[l], H, Hm, news, T2, k)
+
+
+@core
+def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
+    """Row ``to`` of T2: the average over the members."""
+    for at in range(0, T.shape[1], WIDTH):
+        total = fill(0.0)
+        for k in range(len(members)):
+            total = plus(total, times(fill(share[k]), load(T, members[k], at)))
+        store(T2, to, at, total)
+
+
+@core
+def summary(lags: Array, brief: Array) -> None:
+    """The newest floors, and the oldest."""
+    last = len(brief) - 1
+    for k in range(len(brief)):
+        row = k if k < last else len(lags) - 1
+        for e in range(lags.shape[1]):
+            brief[k, e] = lags[row, e]
+
+
+@part
+def marginals(
+    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, event: Array, X: Array, K: int, lags: Array
+) -> float:
+    """lags[k, e] = p(event e, k floors back); returns the probability of a change among the floors of the table.
+
+    Leaves are blocks of the children of K parents, in their order. The first two rows of X are overwritten.
+    """
+    block, W, sums, mass, steady = H + 1, len(lags), len(T) - 1, X[0], X[1]
+    back, quiet, last = 1, 0.0, W * block - 1
+    if expanded:
+        K, back = L, 0
+    for l in range(0, K, WIDTH):
+        own, still = fill(0.0), fill(0.0)
+        for at in range(l, L, K):
+            p = load(B, WEIGHT, at)
+            own, still = plus(own, p), plus(still, times(p, below(event, at, Hm)))
+        store(X, 0, l, own)
+        store(X, 1, l, still)
+    if not expanded:
+        for e in range(H):
+            own = fill(0.0)
+            for l in range(0, L, WIDTH):
+                own = plus(own, times(load(B, WEIGHT, l), equal(event, l, e)))
+            lags[0, e] = sum_of(own)
+        for l in range(K):
+            quiet += steady[l] * (T[l, last - block] if W > 1 else 1.0)
+    for at in range(0, T.shape[1], WIDTH):
+        total = fill(0.0)
+        for l in range(K):
+            total = plus(total, times(fill(mass[l]), load(T, l, at)))
+        store(T, sums, at, total)
+    for k in range(back, W):
+        for e in range(H):
+            lags[k, e] = T[sums, (k - back) * block + e]
+    return 1.0 - min(T[sums, last] if expanded else quiet, 1.0)

@@ -1,0 +1,140 @@
+"""Gaps: what may have happened since the last sample that was used, as one floor of the tree.
+
+A tree that grew by a floor at every missing sample would fill up with histories that no data tell apart: for events
+that are independent of each other it does not matter when in the gap a jump was. So leaves take in the ordinary course
+only, sample by sample, and beside them stands what else there may have been: the probability a_0 that nothing but the
+ordinary course was, and for every other change i the probability a_i that it was the first, with the mean A_i of what
+it and all further changes add to the covariance. An interval in which change i is the first with probability r_i, none
+with r_0, and adds Q_i, makes of them
+
+    a_i A_i <- a_i (A_i + D) + a_0 r_i (Q_i + M),    a_i <- a_i + a_0 r_i,    a_0 <- a_0 r_0
+
+where D is the mean of all changes of the interval and M that of those after its first. An interval of dt nominal
+samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one floor with the
+probabilities a and the covariances A. Its event stands for the whole gap.
+
+That is exact in the probability of any change, in the first two moments of the parameters after the gap given the
+first change, and wholly where at most one change falls into a gap; the ordinary course, a drift, is not taken back for
+the samples at which another change was in its place. Priors that follow a Markov chain of changes are about what lasts:
+there the chain goes on and leaves take in the mean of all changes.
+
+Cost: O(H n^2) for each sample that is not used.
+"""
+
+from __future__ import annotations
+
+from driftfit.engine.kernel import Array, core, exp, log
+from driftfit.engine.simd import WIDTH
+
+SINCE, NOW, SCALE, MORE = range(4)
+"""Columns of the table of a gap after the covariances: a_i; r_i; r_i over the prior probability for one nominal sample;
+and in the first row how many changes follow the first of an interval on average.
+"""
+
+
+@core
+def odds(gap: Array, row: Array, Hm: int, dt: float, told: bool) -> None:
+    """The chances of this interval; those that were ``told`` are of the interval, whatever its length."""
+    at = gap.shape[1] - WIDTH
+    none, rest = 0.0, 0.0
+    for e in range(len(row)):
+        none, rest = (none + row[e], rest) if e < Hm else (none, rest + row[e])
+    quiet, scale, more = none, 1.0, 0.0
+    if dt != 1.0 and not told and rest > 0.0:
+        quiet = exp(dt * log(none)) if none > 0.0 else 0.0
+        scale = (1.0 - quiet) / rest
+        more = max(dt / scale - 1.0, 0.0) if scale > 0.0 else 0.0
+    gap[0, at + NOW], gap[0, at + SCALE] = quiet, quiet / none if none > 0.0 else 1.0
+    gap[0, at + MORE] = more
+    for i in range(1, len(gap)):
+        gap[i, at + NOW], gap[i, at + SCALE] = 0.0, scale
+        for j in range(Hm):
+            gap[i, at + NOW] += row[i * Hm + j] * scale
+    if dt == 0.0:  # nothing changes
+        for i in range(len(gap)):
+            gap[i, at + NOW], gap[i, at + SCALE] = 1.0 if i == 0 else 0.0, 1.0
+
+
+@core
+def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
+    """Q, of one change each, becomes that of the floor. A sample that is not ``used`` leaves it to the next one."""
+    at = gap.shape[1] - WIDTH
+    before, more, chance = gap[0, at + SINCE], gap[0, at + MORE], 0.0
+    for i in range(1, len(gap)):
+        chance += gap[i, at + NOW]
+    apart = max(dt - 1.0 - more, 0.0) / dt if dt > 0.0 else 0.0
+    for k in range(Q.shape[1]):
+        mean = 0.0
+        for i in range(1, len(gap)):
+            mean += gap[i, at + NOW] * Q[i, k] / chance if chance > 0.0 else 0.0
+        for i in range(1, len(gap)):
+            earlier, now = gap[i, at + SINCE], before * gap[i, at + NOW]
+            both = earlier + now
+            if both > 0.0:
+                kept = earlier * (gap[i, k] + chance * (1.0 + more) * mean) + now * (Q[i, k] + more * mean)
+                if earlier + more + apart > 0.0:
+                    Q[i, k] = (kept + (earlier + now * apart) * Q[0, k]) / both
+                    kept = kept / both
+                else:  # one nominal sample: to the last bit what it would be if it were used
+                    kept = Q[i, k]
+                if not used:
+                    gap[i, k] = kept
+
+
+@core
+def chances(prior: Array, L: int, Hm: int, gap: Array, whole: bool) -> None:
+    """The prior of one nominal sample becomes that of the interval, or of the ``whole`` gap."""
+    at = gap.shape[1] - WIDTH
+    for j in range(Hm):
+        for l in range(L):
+            share = 0.0
+            for i in range(len(gap)):
+                share += prior[i * Hm + j, l]
+            for i in range(len(gap)):
+                first = gap[i, at + SINCE] if whole and i > 0 else 0.0
+                now = gap[i, at + SCALE] * (gap[0, at + SINCE] if whole else 1.0)
+                prior[i * Hm + j, l] = now * prior[i * Hm + j, l] + first * share
+
+
+@core
+def extend(gap: Array) -> None:
+    """A sample that is not used makes the gap longer."""
+    at = gap.shape[1] - WIDTH
+    for i in range(1, len(gap)):
+        gap[i, at + SINCE] += gap[0, at + SINCE] * gap[i, at + NOW]
+    gap[0, at + SINCE] *= gap[0, at + NOW]
+
+
+@core
+def close(gap: Array) -> None:
+    """A sample was used."""
+    for i in range(len(gap)):
+        gap[i, gap.shape[1] - WIDTH + SINCE] = 1.0 if i == 0 else 0.0
+
+
+@core
+def widen(gap: Array, unit: float, P: Array) -> None:
+    """The covariance of the mixture with what may have happened in the gap; ``unit`` is what that is in units of."""
+    at = gap.shape[1] - WIDTH
+    for c in range(1, len(gap)):
+        share, k = unit * gap[c, at + SINCE], 0
+        for i in range(len(P)):
+            for j in range(i + 1):
+                P[i, j] += share * gap[c, k]
+                k += 1
+
+
+@core
+def take_back(T: Array, L: int, floors: int, gap: Array, H: int, Hm: int) -> None:
+    """The floors of a gap, whose changes are told of by the floor that ends it: they changed nothing themselves."""
+    block, width = H + 1, T.shape[1]
+    quiet = gap[0, gap.shape[1] - WIDTH + SINCE]
+    for l in range(L):
+        for k in range(0, width - block + 1, block):
+            if k < floors * block:
+                for e in range(Hm, H):
+                    T[l, k + e % Hm] += T[l, k + e]
+                    T[l, k + e] = 0.0
+                T[l, k + H] = 1.0
+            else:
+                T[l, k + H] = T[l, k + H] / quiet if quiet > 0.0 else 0.0

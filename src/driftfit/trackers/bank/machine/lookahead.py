@@ -1,0 +1,134 @@
+"""The risk that the next sample is expected to leave, for deciding whether to wait for it.
+
+    ER = int min_k sum_e L[e, k] f_e(y) dy,   f_e(y) = sum over leaves with oldest event e, and next events e',
+         w_l P[e_l, e'] N(y; z'm_l + b_e', r_e' + z'(C_l + Q_e') z)
+
+A minimum of averages is at most the average of minima, so ER <= R*: waiting never costs information, only time. The
+integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union of
+them. The next regressor is not known; the last one before the events that are open stands for it. One that the leaves
+have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x nodes;
+used only while a decision is open.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, exp
+from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
+
+NODES = 33
+"""Nodes for every distinct component."""
+SMALL = 1e-9
+"""Components of less weight than this are left out of the nodes, though not of the integral."""
+
+
+@core
+def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
+    """z' (keep C + Q) z of a leaf."""
+    lags, at, wide = FIRST + n + n * (n + 1) // 2, 0, 0.0
+    for i in range(n):
+        z = B[lags + i, l] if i < na else phi[i]
+        for j in range(i + 1):
+            other = B[lags + j, l] if j < na else phi[j]
+            wide += z * other * (keep * B[FIRST + n + at, l] + q[at]) * (1.0 if i == j else 2.0)
+            at += 1
+    return wide
+
+
+@core
+def density_parts(
+    B: Array, L: int, top: float, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
+    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array,
+    mass: float, out: Array,
+) -> int:  # fmt: skip
+    """Components of the predictive density as columns of out: oldest event, weight, mean, standard deviation."""
+    n, Hm, count = len(phi), len(sensors), 0
+    lags = FIRST + n + n * (n + 1) // 2
+    for l in range(L):
+        if group[l] < 0:
+            continue
+        unit = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
+        for c in range(len(Q)):
+            mean, wide = 0.0, width(B, l, n, na, phi, maps[c, 0], Q[c])
+            for i in range(n):
+                z = B[lags + i, l] if i < na else phi[i]
+                mean += z * (theta0[i] if maps[c, 1] > 0.0 else B[FIRST + i, l])
+            for j in range(Hm):
+                e = c * Hm + j
+                chance = (row[e] if same else P[event[l], e]) * B[WEIGHT, l] / mass
+                frozen = sensors[j, FROZEN] > 0.0
+                if chance <= 0.0 or count >= out.shape[1] or (frozen and not abs(last) < np.inf):
+                    continue
+                out[0, count], out[1, count] = B[CODE, l] // top, chance
+                if frozen:
+                    stuck = sensors[j, STUCK]
+                    out[2, count] = last
+                    out[3, count] = math.sqrt(stuck if stuck > 0.0 else -stuck * r * unit)
+                else:
+                    out[2, count] = mean + sensors[j, VALUE]
+                    out[3, count] = math.sqrt((wide + sensors[j, FACTOR] * r) * unit)
+                count += 1
+    return count
+
+
+@core
+def sort(x: Array, count: int) -> None:
+    """Ascending, in place, by Shell's method."""
+    gap = count // 2
+    while gap > 0:
+        for i in range(gap, count):
+            value, j = x[i], i
+            while j >= gap and x[j - gap] > value:
+                x[j] = x[j - gap]
+                j -= gap
+            x[j] = value
+        gap = gap * 5 // 11 if gap != 2 else 1
+
+
+@core
+def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> float:
+    """int min_k sum_e L[e, k] f_e(y) dy over all components."""
+    H = len(loss)
+    used = 0
+    for a in range(count):
+        if parts[1, a] > SMALL:
+            for k in range(NODES):
+                nodes[used] = parts[2, a] + parts[3, a] * 12.0 * (k / (NODES - 1) - 0.5)
+                used += 1
+    sort(nodes, used)
+    total, before, y_before = 0.0, 0.0, 0.0
+    for k in range(used):
+        y = nodes[k]
+        for e in range(H):
+            f[e] = 0.0
+        for a in range(count):
+            far = (y - parts[2, a]) / parts[3, a]
+            if abs(far) < 9.0:
+                f[int(parts[0, a])] += parts[1, a] / parts[3, a] * exp(-0.5 * far * far) * 0.3989422804014327
+        least = np.inf
+        for d in range(H):
+            risk = 0.0
+            for e in range(H):
+                risk += loss[e, d] * f[e]
+            least = min(least, risk)
+        if k > 0:
+            total += 0.5 * (least + before) * (y - y_before)
+        before, y_before = least, y
+    return total
+
+
+@core
+def expected_risk(
+    B: Array, L: int, top: float, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
+    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array, mass: float,
+    parts: Array, X: Array,
+) -> float:  # fmt: skip
+    """ER for the oldest event held; ``parts`` has 4 rows and then NODES for the nodes."""
+    count = density_parts(
+        B, L, top, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event, group, mass, parts
+    )
+    return float(integrate(parts, count, loss, X[0], parts[4:].reshape(NODES * parts.shape[1])))

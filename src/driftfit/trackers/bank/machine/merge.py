@@ -1,0 +1,199 @@
+"""Leaves into fewer leaves: those of a group become one that keeps their mean and covariance.
+
+    W = sum w,   m = sum w m_l / W,   C = sum w (C_l + d_l d_l') / W,   d_l = m_l - m
+
+With unknown noise variance the one is the normal-inverse-gamma nearest in Kullback-Leibler divergence: with
+g_l = nu_l / S_l and g = sum w g_l,
+
+    m = sum w g_l m_l / g,   C = sum w (C_l + g_l d_l d_l'),
+    psi(nu/2) - log(nu/2) = sum w (psi(nu_l/2) - log(S_l/2)) - log g,   S = nu / g
+
+which keeps the expectations of 1/s2, log s2, theta/s2 and theta theta'/s2. A group of one leaf is that leaf.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, part
+from driftfit.engine.simd import WIDTH, gathered, store
+from driftfit.trackers.bank.leaves.lags import merge_covariance
+from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
+from driftfit.trackers.bank.machine.ancestry import average
+
+
+@core
+def digamma(x: float) -> float:
+    total = 0.0
+    while x < 8.0:
+        total -= 1.0 / x
+        x += 1.0
+    f = 1.0 / (x * x)
+    return (
+        total + math.log(x) - 0.5 / x
+        - f * (1.0 / 12.0 - f * (1.0 / 120.0 - f * (1.0 / 252.0 - f * (1.0 / 240.0 - f / 132.0))))
+    )  # fmt: skip
+
+
+@core
+def trigamma(x: float) -> float:
+    total = 0.0
+    while x < 8.0:
+        total += 1.0 / (x * x)
+        x += 1.0
+    f = 1.0 / (x * x)
+    return total + (1.0 + 0.5 / x + f * (1.0 / 6.0 - f * (1.0 / 30.0 - f * (1.0 / 42.0 - f / 30.0)))) / x
+
+
+@core
+def freedom(t: float, start: float) -> float:
+    """nu with psi(nu/2) - log(nu/2) = t < 0, by Newton's method in log nu."""
+    x = 0.5 * start
+    for _ in range(50):
+        error = digamma(x) - math.log(x) - t
+        step = error / (x * trigamma(x) - 1.0)
+        step = min(2.0, max(-2.0, step))
+        x *= math.exp(-step)
+        if abs(step) < 1e-13:
+            break
+    return 2.0 * x
+
+
+@core
+def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
+    """The covariance of column ``to`` of A, whose mean stands there already; X is spare."""
+    for k in range(len(members)):
+        l = members[k]
+        pull = B[NU, l] / B[S, l] if unknown else 1.0
+        at = FIRST + n
+        for i in range(n):
+            away = pull * (B[FIRST + i, l] - A[FIRST + i, to])
+            for j in range(i + 1):
+                A[at, to] += share[k] * (B[at, l] + away * (B[FIRST + j, l] - A[FIRST + j, to]))
+                at += 1
+
+
+@core
+def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
+    """Column ``to`` of A from the members, which have the given shares, summing to 1; X is spare."""
+    C, tri = FIRST + n, n * (n + 1) // 2
+    heaviest, g, t = 0, 0.0, 0.0
+    for k in range(len(members)):
+        heaviest = k if share[k] > share[heaviest] else heaviest
+    best = members[heaviest]
+    for row in range(LOG, FIRST):
+        A[row, to] = B[row, best]
+    for row in range(FIRST, len(A)):
+        A[row, to] = 0.0
+    for k in range(len(members)):
+        l = members[k]
+        g += share[k] * (B[NU, l] / B[S, l] if unknown else 1.0)
+    for k in range(len(members)):
+        l = members[k]
+        pull = share[k] * (B[NU, l] / B[S, l] if unknown else 1.0) / g
+        for i in range(n):
+            A[FIRST + i, to] += pull * B[FIRST + i, l]
+        for i in range(na):
+            A[C + tri + i, to] += share[k] * B[C + tri + i, l]
+        if unknown:
+            t += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
+    pool(B, members, n, unknown, share, A, to, X)
+    merge_covariance(B, members, n, na, share, A, to)
+    if unknown:
+        A[NU, to] = freedom(t - math.log(g), B[NU, best])
+        A[S, to] = A[NU, to] / g
+
+
+@core
+def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
+    """Members of group k are order[start[k] : start[k + 1]]; returns how many leaves are in some group."""
+    for k in range(G + 1):
+        start[k] = 0
+    for l in range(L):
+        if group[l] >= 0:
+            start[group[l] + 1] += 1
+    for k in range(G):
+        start[k + 1] += start[k]
+    for l in range(L):
+        if group[l] >= 0:
+            order[start[group[l]]] = l
+            start[group[l]] += 1
+    for k in range(G, 0, -1):
+        start[k] = start[k - 1]
+    start[0] = 0
+    return int(start[G])
+
+
+@core
+def combine(
+    B: Array, group: Array, L: int, G: int, n: int, na: int, unknown: bool, A: Array, start: Array, order: Array,
+    X: Array, T: Array, T2: Array,
+) -> float:  # fmt: skip
+    """A leaf in A, and a row of the table, for every group that `sort` put in order; T is that of the leaves. Returns
+    the mass that is left.
+    """
+    kept, share = 0.0, X[0]
+    for k in range(G):
+        members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
+        mass = 0.0
+        for l in members:
+            mass += B[WEIGHT, l]
+        kept += mass
+        for at in range(len(members)):
+            part[at] = B[WEIGHT, members[at]] / mass
+        if len(members) == 1:
+            for row in range(len(A)):
+                A[row, k] = B[row, members[0]]
+        else:
+            match(B, members, n, na, unknown, part, A, k, X[1:])
+            A[LOG, k] = math.log(mass)
+        average(T, members, part, T2, k)
+    return kept
+
+
+@part
+def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
+    """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
+    for k in range(0, G, WIDTH):
+        for row in range(LOG, CODE):
+            if unknown or row < NU:
+                store(A, row, k, gathered(B, row, order, k))
+        store(A, AGE, k, gathered(B, AGE, order, k))
+        for i in range(3):
+            if bases[i] > 1.0:
+                row = (CODE, SENSORS, CHANGES)[i]
+                store(A, row, k, gathered(B, row, order, k))
+        for row in range(FIRST, rows):
+            store(A, row, k, gathered(B, row, order, k))
+    kept = 0.0
+    for k in range(G):
+        kept += A[WEIGHT, k]
+    return kept
+
+
+@core
+def mix(
+    B: Array, L: int, prior: Array, n: int, na: int, unknown: bool, A: Array, order: Array, X: Array, T: Array,
+    T2: Array,
+) -> int:  # fmt: skip
+    """Interaction: leaf e of A goes on from all leaves that may lead to event e; returns the number of events."""
+    H, share = len(prior), X[0]
+    for e in range(H):
+        mass, count = 0.0, 0
+        for l in range(L):
+            heavy = B[WEIGHT, l] * prior[e, l]
+            if heavy > 0.0:
+                order[count], share[count] = l, heavy
+                mass += heavy
+                count += 1
+        possible = mass
+        if count == 0:  # no way leads here
+            order[0], share[0], mass, count = 0, 1.0, 1.0, 1
+        for k in range(count):
+            share[k] /= mass
+        match(B, order[:count], n, na, unknown, share[:count], A, e, X[1:])
+        average(T, order[:count], share[:count], T2, e)
+        A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
+    return H

@@ -1,0 +1,221 @@
+"""Which leaves go on, and which of them become one: a group for every leaf, -1 for those that are dropped.
+
+The plan is made when a sample has been taken in and carried out before the next one that can be used: a sample that is
+not used leaves the mixture as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
+from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
+from driftfit.trackers.bank.machine.lookahead import expected_risk
+
+CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
+"""Kinds of reduction."""
+KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR = range(7)
+"""Entries of the vector of settings of a reduction."""
+
+
+FEW = 64
+"""As many entries are compared each with each; among more, and among ties, the bound is searched."""
+
+
+@kernel
+def reached(V: Array, row: int, count: int, value: float) -> float:
+    """How many entries of a row are at least ``value``."""
+    sums = fill(0.0)
+    for l in range(0, count, WIDTH):
+        sums = plus(sums, reaches(load(V, row, l), fill(value)))
+    return float(sum_of(sums))
+
+
+@core
+def bound(V: Array, row: int, count: int, M: int) -> float:
+    """The M-th largest entry of a row, or any number between it and the next; 0 if no more than M are positive.
+
+    By bisection of the bits, which are in the order of the numbers: a dozen counts, each without branches,
+    are faster than a selection that jumps about.
+    """
+    low, high = np.int64(1), np.int64(0x7FF0000000000000)
+    if reached(V, row, count, np.int64(low).view(np.float64)) <= M:
+        return 0.0
+    while high - low > 1:
+        middle = low + (high - low) // 2  # of numbers above 2 the sum of the bits would overflow
+        many = reached(V, row, count, np.int64(middle).view(np.float64))
+        low = middle if many >= M else low
+        high = high if many >= M else middle
+        if many == M:
+            break
+    return float(np.int64(low).view(np.float64))
+
+
+@part
+def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
+    """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
+    many. What follows in the row, up to the next eight, must be zero; ``ranks`` (1, count) is overwritten.
+    """
+    value, over, G = V[row], 0, 0
+    if count <= FEW:
+        for l in range(0, count, WIDTH):
+            here, rank = load(V, row, l), fill(0.0)
+            for k in range(count):
+                rank = plus(rank, reaches(fill(value[k]), here))
+            store(ranks, 0, l, rank)
+        for l in range(count):
+            keep = 1 if value[l] > 0.0 and ranks[0, l] <= M else 0
+            group[l], order[G] = G if keep > 0 else -1, l
+            G += keep
+        if G == M:
+            return G
+        G = 0
+    least = bound(V, row, count, M)
+    for l in range(count):
+        over += 1 if value[l] > least else 0
+    ties = M - over if least > 0.0 else 0
+    for l in range(count):
+        tie = 1 if value[l] == least and ties > 0 else 0
+        keep = tie + (1 if value[l] > least else 0)
+        ties -= tie
+        group[l], order[G] = G if keep > 0 else -1, l
+        G += keep
+    return G
+
+
+@kernel
+def clear(V: Array, row: int, count: int) -> None:
+    """Zeros after the first entries, up to the next eight."""
+    for l in range(count, min(count + WIDTH, V.shape[1])):
+        V[row, l] = 0.0
+
+
+@part
+def beam(B: Array, L: int, knobs: Array, group: Array, order: Array, X: Array) -> int:
+    """The heaviest leaves."""
+    return int(heaviest(B, WEIGHT, L, int(knobs[LEAVES]), group, order, X[2:3]))
+
+
+@core
+def merge(B: Array, L: int, group: Array, slots: Array) -> int:
+    """Leaves of one code become one; codes are numbered as they come."""
+    G = 0
+    for l in range(L):
+        slots[int(B[CODE, l])] = -1
+    for l in range(L):
+        group[l] = -1
+        if B[WEIGHT, l] > 0.0:
+            code = int(B[CODE, l])
+            if slots[code] < 0:
+                slots[code] = G
+                G += 1
+            group[l] = slots[code]
+    return G
+
+
+@core
+def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array) -> int:
+    """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
+    cap, size = knobs[CAP], len(slots)
+    mass, key, renumber = X[0], X[1], X[3]
+    for k in range(size):
+        slots[k] = -1
+    G = 0
+    for l in range(L):
+        group[l] = -1
+        if B[WEIGHT, l] <= 0.0:
+            continue
+        mine = (B[CHANGES, l] * bases[1] + B[SENSORS, l]) * (cap + 1.0) + min(B[AGE, l], cap)
+        place = int(mine) * 2654435761 % size
+        while slots[place] >= 0 and key[slots[place]] != mine:
+            place = (place + 1) % size
+        if slots[place] < 0:
+            slots[place], key[G], mass[G] = G, mine, 0.0
+            G += 1
+        group[l] = slots[place]
+        mass[slots[place]] += B[WEIGHT, l]
+    M = int(knobs[LEAVES])
+    if G > M:
+        for k in range(G):
+            slots[k] = 0
+        clear(X, 0, G)
+        G2 = heaviest(X, 0, G, M, slots, order, X[2:3])
+        for k in range(G):
+            renumber[k] = slots[k]
+        for l in range(L):
+            group[l] = int(renumber[group[l]]) if group[l] >= 0 else -1
+        return int(G2)
+    return G
+
+
+@core
+def decide(
+    B: Array, L: int, held: int, knobs: Array, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array,
+    theta0: Array, sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array,
+    stamps: Array, now: float, decided: Array, parts: Array, group: Array, X: Array,
+) -> int:  # fmt: skip
+    """Resolve the oldest events while the rule says so; returns how many floors are still held.
+
+    A leaf that loses a decision has its weight set to 0. ``decided[k]`` is the event, how many samples ago it was first
+    visible, and its probability.
+    """
+    H = len(loss)
+    p, risk = X[0], X[1]
+    count = 0
+    for l in range(L):
+        group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
+    while held > 0:
+        top = float(H) ** (held - 1)
+        mass = 0.0
+        for e in range(H):
+            p[e] = 0.0
+        for l in range(L):
+            if group[l] >= 0:
+                p[int(B[CODE, l] // top)] += B[WEIGHT, l]
+                mass += B[WEIGHT, l]
+        best = -1
+        for k in range(H):
+            p[k] /= mass
+        for k in range(H):
+            risk[k] = 0.0
+            for e in range(H):
+                risk[k] += loss[e, k] * p[e]
+            if p[k] > 0.0 and (best < 0 or risk[k] < risk[best]):
+                best = k
+        stop = held >= knobs[DEPTH]
+        if not stop and knobs[TAU] >= 0.0:
+            stop = risk[best] <= knobs[TAU]
+            if not stop and knobs[WAIT] > 0.0:
+                stop = risk[best] <= knobs[WAIT]
+                if not stop:
+                    later = expected_risk(
+                        B, L, top, loss, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event,
+                        group, mass, parts, X[2:],
+                    )  # fmt: skip
+                    stop = risk[best] <= knobs[WAIT] + later
+        if not stop:
+            break
+        decided[count, 0], decided[count, 1], decided[count, 2] = best, now - stamps[0], p[best]
+        count += 1
+        for k in range(held - 1):
+            stamps[k] = stamps[k + 1]
+        for l in range(L):
+            if group[l] >= 0:
+                if int(B[CODE, l] // top) == best:
+                    B[CODE, l] -= best * top
+                else:
+                    group[l] = -1
+        held -= 1
+    return held
+
+
+@core
+def number(group: Array, L: int, order: Array) -> int:
+    """Groups of single leaves in their order."""
+    G = 0
+    for l in range(L):
+        keep = group[l] >= 0
+        group[l], order[G] = G if keep else -1, l
+        G += 1 if keep else 0
+    return G

@@ -1,0 +1,224 @@
+"""The steps of a bank in the lane form: one filter until it can begin, then the machine of `advance`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
+from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.bank.machine.advance import bank
+from driftfit.trackers.bank.machine.grow import FLOOR
+from driftfit.trackers.bank.machine.layout import (
+    ADDRESSES,
+    BASE,
+    COUNT,
+    COV,
+    FACTORS,
+    GIVEN,
+    IN_DT,
+    IN_NOISE,
+    IN_OK,
+    IN_SEEN,
+    IN_TIME,
+    IN_Y,
+    LEAST,
+    MANY,
+    NOW,
+    PHI,
+    PLACES,
+    POWERS,
+    READY,
+    REPORT,
+    ROWS,
+    S2,
+    SETTLED,
+    SIZE,
+    SQUARES,
+    THETA,
+    TIMES,
+    WAITING,
+    Y_HAT,
+    R,
+)  # fmt: skip
+from driftfit.trackers.parts.diffuse import MACHINES, enter, measurement, spanned_variance, wander
+from driftfit.trackers.parts.excitation import learn_scales
+from driftfit.trackers.parts.resolution import resolve
+
+
+@kernel
+def only_drift(s: State, l: int) -> None:
+    """The first change, for the one filter before the bank starts."""
+    time = s.dt[l] * s.drift[l]
+    keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
+    at = 0
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] = s.P[i, j, l] * keep + s.q0[at, l] * time
+            at += 1
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        s.P[i, i, l] += s.size0[i, l] * unit * time
+
+
+@kernel
+def only_drifted(s: State, l: int) -> None:
+    """The same in square-root form."""
+    n = s.theta.shape[0]
+    time = s.dt[l] * s.drift[l]
+    root = exp(-0.5 * s.dt[l] * log(s.keep0[l]))
+    for i in range(n):
+        s.d[i, l] *= root
+        for j in range(i, n):
+            s.S[i, j, l] *= root
+            s.H[i, j, l] = s.G[i, j, l]
+    wander(s, np.sqrt(time), l)
+    for i in range(n):
+        unit = s.r[l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
+        for j in range(i, n):
+            s.H[i, j, l] = np.sqrt(s.size0[i, l] * unit) if i == j else 0.0
+    wander(s, np.sqrt(time), l)
+
+
+@kernel
+def point(s: State) -> None:
+    """Write where the arrays are into the table."""
+    s.table[BASE, 0, 0] = s.memory.ctypes.data
+    s.table[REPORT, 0, 0] = s.report.ctypes.data
+    s.table[PHI, 0, 0] = s.phi.ctypes.data
+    s.table[POWERS, 0, 0] = s.c.ctypes.data
+    s.table[THETA, 0, 0] = s.theta.ctypes.data
+    s.table[COV, 0, 0] = s.P.ctypes.data
+    s.table[MANY, 0, 0] = s.many.ctypes.data
+    s.table[NOW, 0, 0] = s.now.ctypes.data
+
+
+@kernel
+def run(s: State, l: int) -> None:
+    """The machine; addresses are no part of the state."""
+    if s.theta.shape[1] > 1:
+        among(s, l)
+    else:
+        point(s)
+        bank(s.table.ctypes.data)
+        for k in range(ADDRESSES):
+            s.table[PLACES + k, 0, 0] = 0
+
+
+@kernel
+def among(s: State, l: int) -> None:
+    """The machine for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
+    n, N, R = s.theta.shape[0], s.memory.shape[0], s.report.shape[0]
+    memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
+    vectors = report + 8 * R
+    P = vectors + 24 * n
+    now = P + 8 * n * n
+    many = now + 8 * SIZE
+    at = many + 8 * COUNT
+    table = wholes(at, ROWS, 3)
+    for k in range(ROWS):
+        for i in range(3):
+            table[k, i] = s.table[k, i, l]
+    table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[POWERS, 0] = memory, report, vectors, vectors + 8 * n
+    table[THETA, 0], table[COV, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
+    for k in range(N):
+        floats(memory, 1, N)[0, k] = s.memory[k, l]
+    for i in range(n):
+        floats(vectors, 3, n)[0, i] = s.phi[i, l]
+        floats(vectors, 3, n)[1, i] = s.c[i, l]
+        floats(vectors, 3, n)[2, i] = s.theta[i, l]
+        for j in range(n):
+            floats(P, n, n)[i, j] = s.P[i, j, l]
+    for k in range(SIZE):
+        floats(now, 1, SIZE)[0, k] = s.now[k, l]
+    for k in range(COUNT):
+        wholes(many, 1, COUNT)[0, k] = s.many[k, l]
+    bank(at)
+    for k in range(N):
+        s.memory[k, l] = floats(memory, 1, N)[0, k]
+    for k in range(R):
+        s.report[k, l] = floats(report, 1, R)[0, k]
+    for i in range(n):
+        s.theta[i, l] = floats(vectors, 3, n)[2, i]
+        for j in range(n):
+            s.P[i, j, l] = floats(P, n, n)[i, j]
+    for k in range(SIZE):
+        s.now[k, l] = floats(now, 1, SIZE)[0, k]
+    for k in range(COUNT):
+        s.many[k, l] = wholes(many, 1, COUNT)[0, k]
+
+
+@kernel
+def tell(s: State, l: int) -> None:
+    """What the machine is told of this sample."""
+    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
+    s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
+    s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
+    s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.many[SETTLED, l] > 0:
+        tell(s, l)
+        run(s, l)
+        s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
+        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]  # a fault code counts as missing, in lags too
+        learn_scales(s, l)
+    else:
+        only_drift(s, l)
+        measurement(s, l)
+        alone(s, l, s.unknown[l] > 0)
+
+
+@kernel
+def begin(s: State, l: int) -> None:
+    resolve(s, l)
+    only_drifted(s, l)
+    enter(s, l)
+    alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
+    spanned_variance(s, l)
+
+
+@kernel
+def alone(s: State, l: int, counts: bool) -> None:
+    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    learn_scales(s, l)
+    if counts:
+        learn_start(s, l)
+    tell(s, l)
+    s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
+    s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
+    ready = s.root[l] == 0 and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
+    s.many[SETTLED, l] = READY if ready else WAITING
+    run(s, l)
+    if ready:
+        s.scale[l] = 1.0
+
+
+@kernel
+def report(s: State, l: int) -> None:
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
+
+
+@kernel
+def keep(o: State, s: State, l: int) -> None:
+    """Store what tells of events."""
+    for k in range(s.report.shape[0]):
+        o.report[k, l] = s.report[k, l]
+
+
+@kernel
+def told(s: State, known: Array, t: int, l: int) -> None:
+    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
+    row = t if known.shape[0] > 1 else 0
+    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
+    count, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
+    for k in range(count):
+        s.memory[given + k, l] = known[row, 3 + k, l]
+    for i in range(Hd):
+        s.memory[factors + i, l] = known[row, 3 + count + i, l]
+
+
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=MACHINES)

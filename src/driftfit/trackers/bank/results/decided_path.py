@@ -1,0 +1,211 @@
+"""The path of a complete record given the events that were found: Rauch, Tung and Striebel with Q of the decided event.
+
+    G = C(t|t) C(t+1|t)^-1,   m_s = m + G (m_s(t+1) - m(t+1|t)),   C_s = C + G (C_s(t+1) - C(t+1|t)) G'
+    theta(t+1) - theta(t):  mean m_s(t+1) - m_s(t),  covariance C_s(t+1) + C_s(t) - G C_s(t+1) - C_s(t+1) G'
+
+Samples at which the sensor was at fault count with the noise of their fault, or not at all (additive outliers, a frozen
+sensor; in ARX then also the samples whose regressors hold them). Bands are conditional on the events. A diffuse start
+is a prior of 1e6 times what a sample tells. Cost: O(T n^3).
+
+Source: Rauch, Tung and Striebel (1965); the covariance of an increment from the lag-one covariance G C_s(t+1).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, shared
+from driftfit.smooth.parts.walk import replay
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+    from driftfit.trackers.bank.bank import Bank
+    from driftfit.trackers.bank.results.events import Event
+
+WIDE = 1e6
+"""Variance of the start of a diffuse run, in units of what one sample tells."""
+
+
+class Problem(NamedTuple):
+    """A regression whose coefficients walk with a covariance of its own before every sample."""
+
+    phi: Array
+    y: Array
+    r: Array
+    """(T,): noise variance; inf for samples that are not used."""
+    Q: Array
+    """(T, n, n): covariance of the step before each sample."""
+    m0: Array
+    C0: Array
+
+
+class EventSmoothed:
+    """Parameters of a record, each from all of it, given the events.
+
+    ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on.
+    """
+
+    def __init__(self, run: Track, events: list[Event]) -> None:
+        self.run, self.events, self.names, self.time = run, events, run.names, run.time
+        self.problem = problem_of(run, events)
+        self.theta, self.covs, self.gains = solve(self.problem)
+
+    @property
+    def std(self) -> Array:
+        return np.asarray(np.sqrt(np.einsum("tii->ti", self.covs)))
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high), each (T, n)."""
+        from statistics import NormalDist
+
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        return self.theta - half, self.theta + half
+
+    def increment(self, t: int) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) of theta_t - theta_{t-1}."""
+        lag = self.gains[t - 1] @ self.covs[t]
+        return self.theta[t] - self.theta[t - 1], self.covs[t] + self.covs[t - 1] - lag - lag.T
+
+
+def problem_of(run: Track, events: list[Event]) -> Problem:
+    """The walk behind a run of a bank, with the covariances of the events."""
+    bank: Any = run.tracker
+    if any(change.forgets for change in bank.all_changes):
+        raise ValueError(
+            "smooth: a Change that forgets or resets is no random walk, which is what can be smoothed; give its q "
+            "instead, or cut the record at the changes with driftfit.smooth.piecewise.piecewise(run)."
+        )
+    measured = measurements(run, events)
+    n = measured.phi.shape[1]
+    which = np.zeros(len(run), int)
+    for event in events:
+        if event.kind == "change":
+            which[event.span.date] = bank.change_names.index(event.name)
+    drift = measured.drift * np.where(which > 0, 1.0, measured.dt)  # what happens once does not last
+    steps = np.array(steps_of(run, measured))[which] * drift[:, None, None]
+    C0 = np.diag(WIDE * measured.unit) if bank.p0 is None else np.asarray(_full(bank, n)) * measured.relative
+    m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
+    return Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
+
+
+class Measured(NamedTuple):
+    """What a run was told by its samples, and the units of what its bank was told."""
+
+    phi: Array
+    y: Array
+    r: Array
+    """(T,): noise variance; inf for samples that are not used."""
+    dt: Array
+    drift: Array
+    unit: Array
+    """(n,): what one sample tells of each parameter."""
+    relative: float
+    """What q and p0 are in units of."""
+
+
+def measurements(run: Track, events: list[Event]) -> Measured:
+    """The samples of a run; those of sensor faults count little or not."""
+    bank: Any = run.tracker
+    seen = replay(run)
+    ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
+    known = np.broadcast_to(run._known[:, :3], (len(phi), 3))
+    noise = noise_variance(bank, run)
+    squares = np.mean(phi[ok] ** 2, axis=0) if ok.any() else np.ones(phi.shape[1])
+    unit = np.where(squares > 0.0, noise / np.where(squares > 0.0, squares, 1.0), noise)
+    relative = noise if bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None else 1.0
+    r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
+    return Measured(phi, seen["y"][:, 0].copy(), r, seen["dt"][:, 0].copy(), known[:, 2].copy(), unit, relative)
+
+
+def steps_of(run: Track, measured: Measured) -> list[Array]:
+    """The covariance (n, n) of every change."""
+    bank: Any = run.tracker
+    moves = [change.increments(measured.phi.shape[1]) for change in bank.all_changes]
+    return [Q * measured.relative + np.diag(sizes * measured.unit) for Q, sizes in moves]
+
+
+def noise_variance(bank: Bank, run: Track) -> float:
+    """The known one, or what the bank thinks of it at the end."""
+    from driftfit.trackers.bank.leaves.leaves import NU, WEIGHT, S
+
+    r = bank.all_sensors[0].r
+    if r is not None:
+        return float(r)
+    lane = run.lane(-1)
+    B = bank.array(run.model, lane, "B")
+    mass = B[WEIGHT] > 0.0
+    if not mass.any():
+        return float(lane["scale"])
+    return float(np.sum(B[WEIGHT, mass] * B[S, mass] / (B[NU, mass] - 2.0)))
+
+
+def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
+    """Factors of the noise variance, inf where the sensor said nothing."""
+    factor = np.ones(len(run))
+    sensors = {sensor.name: sensor for sensor in bank.all_sensors}
+    reach = getattr(run.model, "output_lags", 0)
+    for event in events:
+        if event.kind == "sensor":
+            sensor = sensors[event.name]
+            away = sensor.kind in ("additive", "frozen")
+            last = event.span.last + 1 + (reach if away else 0)
+            first = event.span.first
+            factor[first:last] = np.inf if away else np.maximum(factor[first:last], sensor.factor)
+    return factor
+
+
+def _full(bank: Bank, n: int) -> Array:
+    from driftfit.engine.settings import matrix
+
+    return matrix("Bank", "p0", bank.p0, n)
+
+
+def solve(problem: Problem) -> tuple[Array, Array, Array]:
+    """(theta (T, n), covariances (T, n, n), gains (T, n, n))."""
+    T, n = problem.phi.shape
+    m, C = np.empty((T, n)), np.empty((T, n, n))
+    forward(problem.phi, problem.y, problem.r, problem.Q, problem.m0, problem.C0.copy(), m, C)
+    gains = np.zeros((T, n, n))
+    for t in range(T - 2, -1, -1):
+        ahead = C[t] + problem.Q[t + 1]
+        try:
+            G = np.linalg.solve(ahead, C[t]).T
+        except np.linalg.LinAlgError:
+            G = C[t] @ np.linalg.pinv(ahead, hermitian=True)
+        gains[t] = G
+        m[t] += G @ (m[t + 1] - m[t])
+        smoothed = C[t] + G @ (C[t + 1] - ahead) @ G.T
+        C[t] = 0.5 * (smoothed + smoothed.T)
+    return m, C, gains
+
+
+@shared
+def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> None:
+    """The filter; m (T, n) and C (T, n, n) after each sample."""
+    T, n = phi.shape
+    theta = m0.copy()
+    g = np.empty(n)
+    for t in range(T):
+        for i in range(n):
+            for j in range(n):
+                P[i, j] += Q[t, i, j]
+        if r[t] < np.inf:
+            s, e = r[t], y[t]
+            for i in range(n):
+                g[i] = 0.0
+                for j in range(n):
+                    g[i] += P[i, j] * phi[t, j]
+                s += phi[t, i] * g[i]
+                e -= phi[t, i] * theta[i]
+            for i in range(n):
+                theta[i] += g[i] / s * e
+            for i in range(n):
+                for j in range(i + 1):
+                    P[i, j] -= g[i] * g[j] / s
+                    P[j, i] = P[i, j]
+        for i in range(n):
+            m[t, i] = theta[i]
+            for j in range(n):
+                C[t, i, j] = P[i, j]

@@ -1,0 +1,205 @@
+"""Events: what the probabilities of a run add up to, dated and with what is plausible beside the date.
+
+The mass of one jump splits between neighbouring samples, so an event is a cluster of them: while the probability of a
+change in the window is above the threshold, samples with a share in it belong together. Its date is the likeliest of
+them, its interval the fewest neighbours that hold `LEVEL` of the mass of the leaves. Samples that were not used belong
+to the next one that was: a jump in an outage may have been at any of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+
+if TYPE_CHECKING:
+    from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+FAINT = 0.02
+"""Probability below which a sample does not count to a cluster."""
+LEVEL = 0.95
+"""Share of the mass that the interval of a date holds, and its level where the whole record tells of it."""
+
+
+class Span(NamedTuple):
+    """Date, first, last and known of an event as sample numbers."""
+
+    date: int
+    first: int
+    last: int
+    known: int
+
+    def moved(self, by: int) -> Span:
+        """The same, counted from another sample."""
+        return Span(*(sample + by for sample in self))
+
+
+@dataclass(frozen=True)
+class Event:
+    """One change or sensor fault.
+
+    Attributes
+    ----------
+    date, first, last
+        When it is first visible, and the ends of the interval that holds the date with probability ``level`` (of a
+        fault: the ends of its duration): times where there are some, else sample numbers.
+    known
+        When it was known at this threshold, likewise.
+    span : Span
+        The four as sample numbers.
+    level : float
+        Level of the interval: 0.95 for changes in a record, whose dates are those of
+        `driftfit.trackers.bank.results.dates`, simulated in `benchmarks/event_dates.py`. NaN for faults, and in a
+        stream, where the interval is only what the leaves that were kept leave open.
+    prob : float
+        Probability that it happened.
+    name : str
+        The likeliest change, or the sensor fault.
+    names : mapping from names of changes to their share
+    shift, std, z : mappings from parameters to how far they moved, its standard error, and their ratio (changes only)
+        From the smoothed path given the events: conditional on them.
+    """
+
+    kind: str
+    span: Span
+    prob: float
+    name: str
+    names: dict[str, float] = field(default_factory=dict)
+    shift: dict[str, float] = field(default_factory=dict)
+    std: dict[str, float] = field(default_factory=dict)
+    times: tuple[Any, ...] = ()
+    level: float = float("nan")
+
+    @property
+    def date(self) -> Any:
+        return self._at(0)
+
+    @property
+    def first(self) -> Any:
+        return self._at(1)
+
+    @property
+    def last(self) -> Any:
+        return self._at(2)
+
+    @property
+    def known(self) -> Any:
+        return self._at(3)
+
+    def _at(self, k: int) -> Any:
+        return self.times[k] if self.times else self.span[k]
+
+    def timed(self, time: Callable[[int], Any]) -> Event:
+        """The same with times, from sample numbers to which."""
+        return replace(self, times=tuple(time(sample) for sample in self.span))
+
+    def measured(self, smoothed: EventSmoothed) -> Event:
+        """The same, with how far each parameter moved."""
+        mean, cov = smoothed.increment(self.span.date)
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        names = smoothed.names
+        return replace(
+            self, shift=dict(zip(names, mean.tolist(), strict=True)), std=dict(zip(names, std.tolist(), strict=True))
+        )
+
+    @property
+    def z(self) -> dict[str, float]:
+        """How far each parameter moved in standard errors."""
+        return {name: shift / self.std[name] if self.std[name] > 0.0 else 0.0 for name, shift in self.shift.items()}
+
+    def row(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """For a table, with shift and standard error of every parameter, None where there is none."""
+        told = {
+            "kind": self.kind, "date": self.date, "first": self.first, "last": self.last, "known": self.known,
+            "prob": self.prob, "name": self.name,
+            "moved": ", ".join(name for name, z in self.z.items() if abs(z) > 2.0),
+        }  # fmt: skip
+        for name in names:
+            told |= {name: self.shift.get(name), f"std_{name}": self.std.get(name)}
+        return told
+
+
+class Told(NamedTuple):
+    """What events are made of."""
+
+    latest: Array
+    """(T, H): probabilities of the joint events of each sample, from as late as the bank remembers."""
+    window: Array
+    """(T,): probability, at each sample, of a change in the newest W floors."""
+    used: Array
+    """(T,) bool"""
+    W: int
+    change_names: tuple[str, ...]
+    sensor_names: tuple[str, ...]
+
+
+def changes_of(told: Told, threshold: float) -> list[Event]:
+    """Clusters of samples at which theta may have jumped."""
+    Hm, latest = len(told.sensor_names), np.nan_to_num(told.latest)
+    by_change = latest.reshape(len(latest), -1, Hm).sum(axis=2)
+    p, names = by_change[:, 1:].sum(axis=1), told.change_names[1:]
+    events: list[Event] = []
+    for a, b in runs(told.window > threshold):
+        reach = slice(max(0, a - told.W + 1, events[-1].span.last + 1 if events else 0), b)
+        for first, end in clusters(p, reach, threshold):
+            mass, share = p[first:end], by_change[first:end, 1:].sum(axis=0)
+            low, high = densest(mass)
+            low = back_to(first + low, reach.start, told.used)
+            shares = dict(zip(names, (share / share.sum()).tolist(), strict=True))
+            likely, date = names[int(share.argmax())], first + int(mass.argmax())
+            prob = float(min(mass.sum(), 1.0))
+            span = Span(date, low, first + high, max(a, date))
+            events.append(Event("change", span, prob, likely, shares))
+    return events
+
+
+def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
+    """Groups of neighbouring samples with a share each; the whole where no group alone passes the threshold."""
+    part = p[reach]
+    found = [(reach.start + a, reach.start + b) for a, b in runs(part > FAINT) if part[a:b].sum() > threshold]
+    if found or not len(part) or part.sum() <= threshold:
+        return found
+    seen = np.flatnonzero(part > FAINT)
+    return [(reach.start + int(seen[0]), reach.start + int(seen[-1]) + 1)] if len(seen) else []
+
+
+def back_to(first: int, start: int, used: Array) -> int:
+    """The first of the samples that were not used before this one: what happened then shows here."""
+    while first > start and not used[first - 1]:
+        first -= 1
+    return first
+
+
+def densest(mass: Array) -> tuple[int, int]:
+    """First and last of the fewest neighbours that hold `LEVEL` of all."""
+    total = np.r_[0.0, np.cumsum(mass)]
+    wanted = LEVEL * total[-1] * (1.0 - 1e-12)
+    ends = np.searchsorted(total, total[:-1] + wanted)  # of the interval that begins at each
+    first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
+    return first, int(ends[first]) - 1
+
+
+def faults_of(told: Told, threshold: float) -> list[Event]:
+    """Stretches at which the sensor was likely not nominal."""
+    Hm, T, events = len(told.sensor_names), len(told.latest), []
+    by_sensor = np.nan_to_num(told.latest).reshape(T, -1, Hm).sum(axis=1)
+    for j in range(1, Hm):
+        for a, b in runs(by_sensor[:, j] > threshold):
+            p, known = float(by_sensor[a:b, j].max()), min(a + told.W - 1, T - 1)
+            events.append(Event("sensor", Span(a, a, b - 1, known), p, told.sensor_names[j]))
+    return events
+
+
+def all_of(told: Told, threshold: float) -> list[Event]:
+    """Changes and faults in order of time."""
+    return sorted(changes_of(told, threshold) + faults_of(told, threshold), key=lambda event: event.span.date)
+
+
+def runs(on: Array) -> list[tuple[int, int]]:
+    """Stretches [a, b) over which a condition holds."""
+    edges = np.flatnonzero(np.diff(np.r_[False, on, False].astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

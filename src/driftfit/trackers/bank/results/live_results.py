@@ -1,0 +1,70 @@
+"""What a bank of hypotheses tells in a stream: probabilities now, events as they are decided, the mixture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
+from driftfit.trackers.bank.machine.memory import SINGLE
+from driftfit.trackers.bank.results.events import Event, Told, all_of
+from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
+
+if TYPE_CHECKING:
+    from driftfit.run.live.live import Live
+    from driftfit.trackers.bank.bank import Bank
+
+
+class LiveHypotheses:
+    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
+
+    ``lag_prob`` (len(lags), H), ``window``, ``evidence``, ``leaves``, ``kept`` and ``impossible`` are those of
+    `Hypotheses` after the last sample.
+    """
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self.tracker: Bank = live.tracker  # type: ignore[assignment]
+        self._lane = live.lane()
+        self.names = self.tracker.event_names
+        told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
+        self.lag_prob: Array = told["lag_prob"].copy()
+        self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
+        self.impossible = int(self._lane["many"][IMPOSSIBLE])
+
+    def mixture(self) -> Mixture:
+        """The leaves now: what control works with."""
+        return mixture_of(self.tracker, self._live, self._lane)
+
+    def events(self, threshold: float = 0.5) -> list[Event]:
+        """Events that were decided since this was asked last: all that can be known of them is known.
+
+        A stream remembers the last 256 samples, so ask more often than that.
+        """
+        many, bank = self._lane["many"], self.tracker
+        ring = bank.array(self._live.model, self._lane, "ring")
+        now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
+        at = np.arange(max(0, now - len(ring)), now)
+        rows = ring[at % len(ring)]
+        first = int(at[0]) - W + 1 if len(at) else 0
+        window, used = np.r_[np.zeros(W - 1), rows[:, 0]], np.r_[np.ones(W - 1, bool), rows[:, 1] > 0.0]
+        latest = np.vstack([rows[:, BESIDE:], np.zeros((W - 1, len(self.names)))])
+        told = Told(latest, window, used, W, bank.change_names, bank.sensor_names)
+        found = [replace(event, span=event.span.moved(first)) for event in all_of(told, threshold)]
+        busy, reported = window[-1] > threshold, int(many[REPORTED_TO])
+        done = [event for event in found if reported <= event.span.date and event.span.last < now - W + 1 and not busy]
+        if not busy:
+            many[REPORTED_TO] = max(now - W + 1, reported)
+        return [event.timed(lambda sample: self._time(ring, sample)) for event in done]
+
+    def _time(self, ring: Array, sample: int) -> Any:
+        """When a sample of the ring was; its number where the stream is given no times."""
+        last, lane = self._live._last, self._lane
+        if last is None:
+            return sample
+        back = float(lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        time = self._live._clock.moved(last, np.array([-back]))
+        return sample if time is None else time[0]

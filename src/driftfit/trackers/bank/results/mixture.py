@@ -1,0 +1,87 @@
+"""The leaves of a bank as they stand: the mixture that control works with, and what is still undecided."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.leaves.factored import product
+from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.machine.gap import SINCE
+from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, SETTLED
+
+if TYPE_CHECKING:
+    from driftfit.trackers.bank.bank import Bank
+
+
+class Mixture(NamedTuple):
+    """The leaves after a sample: what control works with."""
+
+    weights: Array
+    """(L,), summing to 1."""
+    means: Array
+    """(L, n)"""
+    covs: Array
+    """(L, n, n)"""
+    ages: Array
+    """(L,): samples since the last change of each leaf; inf where there was none (of merged leaves, the heaviest's)."""
+
+    @property
+    def mean(self) -> Array:
+        """sum w m, (n,)."""
+        return np.asarray(self.weights @ self.means)
+
+    @property
+    def cov(self) -> Array:
+        """sum w (C + d d'), (n, n)."""
+        away = self.means - self.mean
+        return np.asarray(np.einsum("l,lij->ij", self.weights, self.covs + away[:, :, None] * away[:, None, :]))
+
+
+def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
+    """The leaves in the fields of one lane; before the bank has begun, its one filter."""
+    n = len(lane["theta"])
+    if lane["many"][SETTLED] != 1:
+        return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
+    B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
+    i, j = np.tril_indices(n)
+    C = B[FIRST + n : FIRST + n + len(i)]
+    if tracker.form == "sqrt":
+        covs = product(C, n)
+    else:
+        covs = np.zeros((B.shape[1], n, n))
+        covs[:, i, j] = covs[:, j, i] = C.T
+    gap = tracker.array(place.model, lane, "gap")
+    since = gap[1:, gap.shape[1] - WIDTH + SINCE]
+    if since.any():  # what else may have happened since the last used sample
+        more = np.zeros((n, n))
+        more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
+        covs = covs + more
+    if lane["unknown"]:
+        covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
+    ages = np.where(B[AGE] < NEVER, B[AGE], np.inf)
+    return Mixture(B[WEIGHT].copy(), B[FIRST : FIRST + n].T.copy(), covs, ages)
+
+
+def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:
+    """(sample, event, probability) of the events held, decided one after the other from the leaves at the end."""
+    held, H = int(lane["many"][HELD]), len(loss)
+    if lane["many"][SETTLED] != 1 or held == 0:
+        return []
+    L = int(lane["many"][LEAVES])
+    B, group, stamps = (tracker.array(place.model, lane, name) for name in ("B", "group", "stamps"))
+    here = group[0, :L] >= 0
+    codes, w = B[CODE, :L][here].astype(int), B[WEIGHT, :L][here]
+    found = []
+    for k in range(held):
+        top = H ** (held - 1 - k)
+        p = np.bincount(codes // top, w / w.sum(), H)
+        risk = np.where(p > 0.0, p @ loss, np.inf)
+        event = int(risk.argmin())
+        found.append((int(stamps[0, k]), event, float(p[event])))
+        keep = codes // top == event
+        codes, w = codes[keep] - event * top, w[keep]
+    return found

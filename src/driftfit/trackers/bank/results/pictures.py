@@ -1,0 +1,101 @@
+"""Pictures of hypotheses: probabilities stacked under the parameters, events marked; the tree as it stands."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.show.plots import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
+from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, WEIGHT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.run.live.live import Live
+    from driftfit.trackers.bank.results.results import Hypotheses
+
+COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8c6d46", "#5fb5c4")
+"""Of events, the ordinary course first."""
+
+
+def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
+    """Parameters with bands; under them the probabilities of events; changes as lines, faults as shades."""
+    run, n = told.run, told.run.model.n
+    figure = new_figure(9.0, 1.4 * n + 2.6)
+    axes = figure.subplots(n + 1, 1, sharex=True, height_ratios=[*[1.4] * n, 1.6])
+    for i in range(n):
+        draw_parameter(axes[i], run, i, level)
+    stack(axes[n], run.time, np.nan_to_num(told.latest), told.names)
+    for event in told.found(threshold):
+        if event.kind == "change":
+            for axis in axes[:n]:
+                axis.axvline(event.date, color=RED, linewidth=1.0, linestyle=":")
+        else:
+            for axis in axes[:n]:
+                last = min(event.span.last + 1, len(run) - 1)
+                axis.axvspan(event.first, run.time[last], color=GREY, alpha=0.25, linewidth=0)
+    axes[n].set_xlabel(time_label(run))
+    date_axis(axes[n], run)
+    figure.align_ylabels()
+    return figure
+
+
+def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
+    """Probabilities of events, one upon the other; the ordinary course below."""
+    colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
+    axis.stackplot(time, p.T, labels=names, colors=colours, step="mid", linewidth=0)
+    axis.set_ylim(0.0, 1.0)
+    axis.set_ylabel("events")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=min(len(names), 4), fontsize=8, frameon=False)
+
+
+def plot_tree(live: Live, floors: int = 3) -> Figure:
+    """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
+
+    The newest floors are drawn, oldest to the left; each leaf is labelled with its weight and its mean.
+    """
+    bank: Any = live.tracker
+    lane = live.lane()
+    from driftfit.trackers.bank.machine.layout import LEAVES
+    from driftfit.trackers.bank.reduction import GPB, Decide
+
+    if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
+        raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
+    H = len(bank.event_names)
+    B = bank.array(live.model, lane, "B")[:, : lane["many"][LEAVES]]
+    depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
+    figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))
+    axis = figure.subplots()
+    axis.set_axis_off()
+    codes, weights = B[CODE].astype(int) % H**depth, B[WEIGHT]
+    height: dict[tuple[int, ...], float] = {(): (H**depth - 1) / 2.0}
+    for d in range(depth):
+        width = H ** (depth - 1 - d)
+        for code in range(H ** (d + 1)):
+            path = digits(code, H, d + 1)
+            height[path] = code * width + (width - 1) / 2.0
+            mass = float(weights[codes // width == code].sum())
+            axis.plot(
+                [d, d + 1], [-height[path[:-1]], -height[path]], color=BLUE if path[-1] == 0 else RED,
+                linewidth=0.4 + 5.0 * mass, alpha=0.25 + 0.75 * mass, solid_capstyle="round",
+            )  # fmt: skip
+            if d == 0:
+                axis.annotate(
+                    bank.event_names[code], (0.5, -(height[()] + height[path]) / 2.0), fontsize=7, ha="center"
+                )
+    for code in range(H**depth):
+        of = codes == code
+        mass = float(weights[of].sum())
+        if mass > 1e-4:
+            mean = (B[FIRST : FIRST + live.model.n, of] * weights[of]).sum(axis=1) / mass
+            text = f"{mass:.3f}  " + ", ".join(f"{value:.2f}" for value in mean)
+            axis.annotate(text, (depth + 0.08, -code), fontsize=7, va="center", color=GREY)
+    axis.set_xlim(-0.1, depth + 1.6)
+    return figure
+
+
+def digits(code: int, base: int, count: int) -> tuple[int, ...]:
+    """Digits of a number, the most significant first."""
+    return tuple(code // base**k % base for k in range(count - 1, -1, -1))

@@ -1,0 +1,283 @@
+"""What a bank of hypotheses tells beside parameters: probabilities, evidence, alarms, events, the mixture.
+
+Everything is causal unless it says otherwise: what stands in row t is what was known after sample t. Where events were
+decided, probabilities are conditional on the decisions.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.trackers.bank.results.events import Event, Told, all_of
+from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+    from driftfit.trackers.bank.bank import Bank
+    from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+
+class Alarm(NamedTuple):
+    """A window alarm: the threshold of the probability, and the samples at which it went on."""
+
+    threshold: float
+    at: Array
+    on: Array
+    """(T,) bool: whether the alarm is on."""
+
+
+class Decision(NamedTuple):
+    """An event that was decided."""
+
+    sample: int
+    """The first sample that it affects."""
+    decided: int
+    """The sample after which it was decided."""
+    event: int
+    """Joint event."""
+    prob: float
+    """Its probability then."""
+
+
+class Hypotheses:
+    """What a run of a `Bank` says of events; `Track.hypotheses` makes it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Names of the joint events (change, sensor), H of them.
+    lags : tuple of int
+        Floors back that are told of: all W that the reduction remembers, or where these are more than eight the
+        newest seven and the oldest.
+    lag_prob : (T, len(lags), H)
+        lag_prob[t, k] are the probabilities of the events lags[k] floors before t, given the data up to t; NaN before
+        the first event.
+    window : (T,)
+        Probability of at least one change in the newest W floors.
+    evidence : (T,)
+        Log density of each sample given those before it.
+    leaves : (T,)
+        Leaves after growth.
+    kept : (T,)
+        Weight of the leaves that went on from the sample before; what is missing to 1 was dropped.
+    """
+
+    def __init__(self, run: Track) -> None:
+        self.run = run
+        self.tracker: Bank = run.tracker  # type: ignore[assignment]
+        self._report = run._written("report")
+        self.names = self.tracker.event_names
+        self.lags = self.tracker.floors_told
+        self.sensors = len(self.tracker.all_sensors)
+        if self.impossible:
+            warnings.warn(
+                f"{self.impossible} samples were impossible under every hypothesis of the bank and were not used. Give "
+                "each event that may happen a probability above 0 in transition= and prob=.",
+                stacklevel=3,
+            )
+
+    def _told(self, name: str) -> Array:
+        return self.tracker.told(self._report, name)
+
+    @cached_property
+    def lag_prob(self) -> Array:
+        p = self._told("lag_prob").copy()
+        p[p.sum(axis=2) < 0.5] = np.nan
+        return np.asarray(p)
+
+    def prob(self, lag: int = 0) -> Array:
+        """(T, H): probabilities of the events at the samples themselves, seen from ``lag`` floors later.
+
+        Row t is of the event first visible in sample t; NaN at the end, where the later samples are not there yet.
+        """
+        if lag not in self.lags:
+            said = ", ".join(str(k) for k in self.lags)
+            raise ValueError(f"prob: lag must be one of {said} for this reduction; got {lag}.")
+        p = np.full((len(self.run), len(self.names)), np.nan)
+        p[: max(len(p) - lag, 0)] = self.lag_prob[lag:, self.lags.index(lag)]
+        return p
+
+    @property
+    def mode_prob(self) -> Array:
+        """(T, H): probabilities of the present event, `prob` at lag 0."""
+        return self.prob(0)
+
+    @property
+    def change_prob(self) -> Array:
+        """(T,): probability of a change at each sample, from as many later samples as the bank remembers."""
+        return np.asarray(1.0 - self.latest[:, : self.sensors].sum(axis=1))
+
+    @cached_property
+    def latest(self) -> Array:
+        """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
+        p, oldest = self.prob(self.lags[-1]), self.lags[-1]
+        tile, run = self.run._tile, self.run
+        lane = {name: tile[name][0, ..., run._lane] for name in ("memory", "table")}
+        now = self.tracker.array(run.model, lane, "lag_prob")
+        for k in range(min(oldest, len(p))):
+            p[len(p) - 1 - k] = now[k] if now[k].sum() > 0.5 else np.nan
+        return p
+
+    @property
+    def window(self) -> Array:
+        return self._told("window")
+
+    @property
+    def evidence(self) -> Array:
+        return self._told("evidence")
+
+    @property
+    def log_evidence(self) -> float:
+        """Their sum: the log density of the record, under the approximations made."""
+        return float(self.evidence.sum())
+
+    @property
+    def leaves(self) -> Array:
+        return self._told("leaves")
+
+    @property
+    def kept(self) -> Array:
+        return self._told("kept")
+
+    @property
+    def impossible(self) -> int:
+        """Samples that no leaf allowed; they were not used."""
+        from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
+
+        return int(self.run._tile["many"][0, IMPOSSIBLE, self.run._lane])
+
+    @cached_property
+    def decisions(self) -> list[Decision]:
+        """Decided events, in order; empty for reductions that decide nothing."""
+        found = self._told("decided")
+        return [
+            Decision(int(t - found[t, k, 1]), int(t), int(found[t, k, 0]), float(found[t, k, 2]))
+            for t, k in zip(*np.nonzero(found[:, :, 0] >= 0.0), strict=True)
+        ]
+
+    def finish(self) -> list[Decision]:
+        """What `Decide` would decide of the events still held, the oldest first, each given those before it.
+
+        Also where the record is shorter than the depth; empty for reductions that decide nothing.
+        """
+        from driftfit.trackers.bank.reduction import Decide
+
+        reduce = self.tracker.reduction
+        if not isinstance(reduce, Decide) or not len(self.run):
+            return []
+        lane, last = self.run.lane(-1), len(self.run) - 1
+        loss = reduce.losses(len(self.names))
+        found = undecided(self.tracker, self.run, lane, loss)
+        return [Decision(sample, last, event, prob) for sample, event, prob in found]
+
+    def smooth(self, threshold: float = 0.5) -> EventSmoothed:
+        """The path of the whole record given the events."""
+        from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+        return EventSmoothed(self.run, self.dated(threshold))
+
+    def events(self, threshold: float = 0.5) -> list[Event]:
+        """Changes and sensor faults whose probability exceeds the threshold, in order of time.
+
+        How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
+        change forgets or resets there is nothing to smooth, and it is not said.
+        """
+        found = self.dated(threshold)
+        if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
+            return found
+        from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+        smoothed = EventSmoothed(self.run, found)
+        return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
+
+    def dated(self, threshold: float = 0.5) -> list[Event]:
+        """`found`, with the dates of changes from all samples around them (`driftfit.trackers.bank.results.dates`)."""
+        found = self.found(threshold)
+        if not any(event.kind == "change" for event in found):
+            return found
+        from driftfit.trackers.bank.results.dates import dated
+        from driftfit.trackers.bank.results.decided_path import measurements, steps_of
+
+        measured = measurements(self.run, found)
+        jumps = dict(zip(self.tracker.change_names, steps_of(self.run, measured), strict=True))
+        return self._timed(dated(found, measured, jumps))
+
+    def found(self, threshold: float = 0.5) -> list[Event]:
+        """`events` as they were known when they were found: with the dates that the leaves say, and no shifts."""
+        bank = self.tracker
+        told = Told(
+            self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
+        )  # fmt: skip
+        found = [self._early(event, threshold) for event in all_of(told, threshold)]
+        return self._timed(found)
+
+    def _early(self, event: Event, threshold: float) -> Event:
+        """A fault may have been known sooner than when it was remembered for the last time."""
+        if event.kind == "change":
+            return event
+        j, date = self.tracker.sensor_names.index(event.name), event.span.date
+        for k, lag in enumerate(self.lags):
+            if date + lag < len(self.run) and self.lag_prob[date + lag, k, j :: self.sensors].sum() > threshold:
+                return replace(event, span=event.span._replace(known=date + lag))
+        return event
+
+    def _timed(self, events: list[Event]) -> list[Event]:
+        """With times, where the record has some."""
+        time = self.run.time
+        return [event.timed(lambda sample: time[sample]) for event in events]
+
+    def table(self, threshold: float = 0.5) -> Any:
+        """`events` as a polars table: for every parameter how far it moved, with its standard error."""
+        import polars as pl
+
+        names = self.run.names
+        rows = [{**event.row(names), "sample": event.span.date} for event in self.events(threshold)]
+        return pl.DataFrame(rows, infer_schema_length=None)
+
+    def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:
+        """Alarm while the window probability exceeds a threshold.
+
+        Give the threshold, or the rate of false alarms per sample that is allowed. With ``reference``, a run of the
+        same bank over a record without changes, the threshold is the least that alarms there no more often; without
+        one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
+        """
+        if (threshold is None) == (rate is None):
+            raise ValueError("alarm: give threshold= or rate= (false alarms per sample), one of them.")
+        if threshold is None:
+            assert rate is not None
+            threshold = self._threshold(rate, reference)
+        on = self.window > threshold
+        return Alarm(float(threshold), onsets(on), on)
+
+    def _threshold(self, rate: float, reference: Track | None) -> float:
+        window = self.window if reference is None else reference.hypotheses.window
+        for level in np.unique(np.r_[0.0, np.round(window, 4), 1.0]):
+            at = onsets(window > level)
+            false = len(at) if reference is not None else float(np.sum(1.0 - window[at]))
+            if false <= rate * len(window) and (reference is not None or level >= rate):
+                return float(level)
+        return 1.0
+
+    def mixture(self, t: int = -1) -> Mixture:
+        """The leaves after sample t; replays the record up to t."""
+        lane = self.run.lane(t)
+        return mixture_of(self.tracker, self.run, lane)
+
+    def plot(self, threshold: float = 0.5, level: float = 0.95) -> Figure:
+        """Parameters with bands, probabilities of events stacked under them, events marked."""
+        from driftfit.trackers.bank.results.pictures import plot_hypotheses
+
+        return plot_hypotheses(self, threshold, level)
+
+
+def onsets(on: Array) -> Array:
+    """Where a condition begins to hold."""
+    return np.flatnonzero(on & ~np.r_[False, on[:-1]])

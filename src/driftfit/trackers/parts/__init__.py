@@ -1,0 +1,1 @@
+"""What several trackers share: the start, square roots, noise levels, readings that mislead."""

@@ -1,0 +1,413 @@
+"""The diffuse start: no knowledge at all before the first sample, no large number in its place, and no unit preferred.
+
+Until the samples determine all of theta, and after that for as long as they determine it badly, what is known stands as
+a square root of information (`driftfit.trackers.parts.information`): S theta = d, S an upper triangle. A zero row is a
+direction of which nothing is known yet; its column is free, and with R = S^-1 on the others the vector
+
+    R_.j = (-S_pp^-1 S_pj, 1)                     of each free column j
+
+is one that no sample has seen. A regressor phi lies in the span of those before it where u_j = phi' R_.j = 0 for all
+free j. Then it is a correction as any other, s = |S^-T phi|^2 + r. Otherwise s is infinite, the first j with u_j != 0
+is free no more, and the share in the diffuse log-likelihood is -1/2 log F, F = u_j^2 det(N_after' N_after) /
+det(N' N), N the matrix of these vectors: the limit of s / kappa for P0 = kappa I.
+
+Rotations treat each column in its own unit: multiplying one by a power of 2 changes nothing but the exponents. So does
+the rank, as u_j counts as 0 only where rounding explains it. Of what is not spanned, theta keeps what it was: with
+isotropic q it is the answer nearest to theta0. With other q the exact limit may move theta in directions that nothing
+was seen of; here it stays.
+
+The filter goes on with theta and P where variance inflation P_ii |S column i|^2 <= `WORST` for all parameters: the
+covariance form loses as many digits. Otherwise it stays with S, also at full rank.
+
+Source: Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapter 5, for the start from zero
+information; Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 5.2, for the likelihood.
+Departures: the decision on rank; the change of form. Cost per sample: O(n^3) until the change, O(n^2) after it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, core, cubes, exp, floats, kernel, log
+from driftfit.engine.kernel import outside as machine
+from driftfit.trackers.parts.information import spread
+
+ROUNDING = 1e-13
+"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, and to spare."""
+
+WORST = 1e6
+"""Largest variance inflation that is left to a covariance: of sixteen digits ten remain."""
+
+LEFT = 1e-14
+"""Least share of a variance that one sample leaves: below it what is left is rounding, which may be negative. It takes
+a regressor ten million times as large as those before it."""
+
+ALMOST_ANY = 1e13
+"""The same for trackers whose work cannot wait: they are least squares without drift before the change of form."""
+
+SIZE, STD, LOOSE, ROW, WORK = range(5)
+"""Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
+
+Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, NOW = range(9)
+"""Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
+variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation."""
+
+
+def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
+    """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
+    square = np.zeros((n, n))
+    return {
+        "S": square, "d": np.zeros(n), "R": np.eye(n), "H": square, "pivot": np.zeros(n), "work": np.zeros((WORK, n)),
+        "at_start": np.zeros(NOW), "F": np.ones(n), "volume": 0.0, "rank": 0, "root": 1, "worst": worst,
+    }  # fmt: skip
+
+
+def knowing(n: int) -> dict[str, Any]:
+    """The same fields for a proper prior."""
+    return knowing_nothing(n) | {"rank": n, "root": 0}
+
+
+def product_with(entry: Any) -> Any:
+    """A kernel that fills s.g = P x from the lower triangle of P and returns x' P x, for x_i = entry(s, i, l)."""
+
+    @kernel
+    def product(s: State, l: int) -> float:
+        n = s.theta.shape[0]
+        for i in range(n):
+            g = 0.0
+            for j in range(i + 1):
+                g += s.P[i, j, l] * entry(s, j, l)
+            for j in range(i + 1, n):
+                g += s.P[j, i, l] * entry(s, j, l)
+            s.g[i, l] = g
+        total = 0.0
+        for i in range(n):
+            total += entry(s, i, l) * s.g[i, l]
+        return total
+
+    return product
+
+
+@kernel
+def regressor(s: State, i: int, l: int) -> float:
+    """phi_i."""
+    return s.phi[i, l]  # type: ignore[no-any-return]
+
+
+symmetric_product = product_with(regressor)
+"""s.g = P phi; returns phi' P phi."""
+
+
+@kernel
+def prediction(s: State, l: int) -> float:
+    """phi' theta."""
+    total = 0.0
+    for i in range(s.theta.shape[0]):
+        total += s.phi[i, l] * s.theta[i, l]
+    return total
+
+
+@kernel
+def measurement(s: State, l: int) -> None:
+    """One correction with noise variance s.r: theta, the lower triangle of P, and s.y_hat, s.e, s.s.
+
+    Only one triangle is updated: P - outer(k, P phi) rounds asymmetrically, and forgetting lets the antisymmetric part
+    grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
+    """
+    n = s.theta.shape[0]
+    y_hat = prediction(s, l)
+    v = symmetric_product(s, l) + s.r[l] * s.noise[l]
+    e = s.y[l] - y_hat
+    gain = s.ok[l] / v
+    for i in range(n):
+        k = gain * s.g[i, l]
+        s.theta[i, l] += k * e
+        for j in range(i):
+            s.P[i, j, l] -= k * s.g[j, l]
+        s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
+    s.y_hat[l] = y_hat
+    s.e[l] = e
+    s.s[l] = v
+
+
+@core
+def refresh(S: Array, R: Array, work: Array) -> None:
+    """R = S^-1 where S has rows, its free columns the vectors that no sample has seen; and the norms of both."""
+    n = len(S)
+    for j in range(n):
+        R[j, j] = 1.0 / S[j, j] if S[j, j] > 0.0 else 1.0
+        squares = 0.0
+        for i in range(j, -1, -1):
+            squares += S[i, j] * S[i, j]
+            if i < j:
+                t = 0.0
+                for k in range(i + 1, j + 1):
+                    t -= S[i, k] * R[k, j]
+                R[i, j] = t / S[i, i] if S[i, i] > 0.0 else 0.0
+        work[SIZE, j] = np.sqrt(squares)
+    for i in range(n):
+        squares = 0.0
+        for k in range(i, n):
+            squares += R[i, k] * R[i, k] if S[k, k] > 0.0 else 0.0
+        work[STD, i] = np.sqrt(squares)
+    for j in range(n):
+        loose = work[SIZE, j]
+        for i in range(j):
+            loose += work[SIZE, i] * abs(R[i, j])
+        work[LOOSE, j] = loose
+        for i in range(j):
+            if S[j, j] == 0.0 and abs(R[i, j]) <= ROUNDING * work[STD, i] * loose:
+                R[i, j] = 0.0
+
+
+@core
+def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
+    """The first free column j along which phi leaves the span, and u_j; or -1, 0 and |S^-T phi|^2 for a phi within it.
+
+    u_j is summed as phi_j - x' S_.j with S' x = phi: its rounding grows with |x|, and not with each entry of R.
+    """
+    n = len(S)
+    squares = 0.0
+    for j in range(n):
+        u = phi[j]
+        for i in range(j):
+            u -= S[i, j] * work[ROW, i]
+        x = u / S[j, j] if S[j, j] > 0.0 else 0.0
+        work[ROW, j] = x
+        if S[j, j] == 0.0 and abs(u) > ROUNDING * (abs(phi[j]) + np.sqrt(squares) * work[LOOSE, j]):
+            return j, u, np.inf
+        squares += x * x
+    return -1, 0.0, squares
+
+
+@core
+def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
+    """Rotate ``row' theta = y`` into (S, d), past free columns, where it holds rounding, up to the one it enters by."""
+    n = len(S)
+    for i in range(n):
+        a, b = S[i, i], row[i]
+        if a > 0.0 or i == entering:
+            top = max(a, abs(b))
+            r = top * np.sqrt((a / top) ** 2 + (b / top) ** 2)  # squares of 1e-200 would be 0
+            c, s = a / r, b / r
+            S[i, i] = r
+            for j in range(i + 1, n):
+                t = S[i, j]
+                S[i, j] = c * t + s * row[j]
+                row[j] = c * row[j] - s * t
+            t = d[i]
+            d[i] = c * t + s * y
+            y = c * y - s * t
+        if i == entering:
+            break
+
+
+@core
+def sheared(x: Array, time: float) -> None:
+    """x = (level, slope) as it is ``time`` later."""
+    half = len(x) // 2
+    for i in range(half if time != 0.0 else 0):
+        x[i] += time * x[half + i]
+
+
+@core
+def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
+    """Q = an orthonormal basis, one column for each free column, of what no sample has seen; returns log det N' N.
+
+    Both are of the first sample, ``age`` ago, where theta is made of levels and slopes; otherwise the age is 0.
+    """
+    n = len(S)
+    volume = 0.0
+    for j in range(n):
+        if S[j, j] == 0.0:
+            for i in range(n):
+                Q[i, j] = R[i, j] if i <= j else 0.0
+            sheared(Q[:, j], -age)
+            for _ in range(4):  # in units far apart these are nearly parallel, and what one pass leaves is rounding
+                for k in range(j):
+                    if S[k, k] == 0.0:
+                        dot = 0.0
+                        for i in range(n):
+                            dot += Q[i, k] * Q[i, j]
+                        for i in range(n):
+                            Q[i, j] -= dot * Q[i, k]
+                top, squares = 1e-300, 0.0
+                for i in range(n):
+                    top = max(top, abs(Q[i, j]))
+                for i in range(n):
+                    squares += (Q[i, j] / top) ** 2
+                for i in range(n):
+                    Q[i, j] /= top * np.sqrt(squares)
+                volume += log(squares) + 2.0 * log(top)
+    return volume
+
+
+@core
+def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -> None:
+    """theta that solves S theta = d and keeps what it was in the directions of Q, those that no sample has seen."""
+    n = len(S)
+    for i in range(n - 1, -1, -1):
+        x[i] = theta[i]
+        if S[i, i] > 0.0:
+            t = d[i]
+            for j in range(i + 1, n):
+                t -= S[i, j] * x[j]
+            x[i] = t / S[i, i]
+    for i in range(n):
+        theta[i] -= x[i]
+    sheared(theta, -age)
+    sheared(x, -age)
+    for j in range(n):
+        if S[j, j] == 0.0:
+            dot = 0.0
+            for i in range(n):
+                dot += Q[i, j] * theta[i]
+            for i in range(n):
+                x[i] += dot * Q[i, j]
+    sheared(x, age)
+    for i in range(n):
+        theta[i] = x[i]
+
+
+@core
+def covariance(S: Array, R: Array, P: Array) -> None:
+    """The lower triangle of P = R R', given the parameters of free columns."""
+    n = len(S)
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += R[i, k] * R[j, k] if S[k, k] > 0.0 else 0.0
+            P[i, j] = total
+
+
+@core
+def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
+    """Take in a sample, if there is one, after time has passed; ``now`` is ``at_start``."""
+    n = len(S)
+    refresh(S, R, work)
+    entering, u, now[BEFORE] = outside(phi, S, work)
+    now[SQUARE] = 0.0
+    if now[OK] > 0.0:
+        root = np.sqrt(1.0 / now[NOISE])
+        for i in range(n):
+            work[ROW, i] = root * phi[i]
+        turn_in(S, d, work[ROW], root * now[Y], entering)
+        refresh(S, R, work)
+        now[SQUARE], now[VOLUME] = u * u, unseen(S, R, P, now[AGE])
+        estimate(S, d, P, theta, work[ROW], now[AGE])
+    covariance(S, R, P)
+    worst = 0.0
+    for i in range(n):
+        inflation = P[i, i] * work[SIZE, i] * work[SIZE, i]
+        worst = max(worst, inflation if S[i, i] > 0.0 else np.inf)
+    now[INFLATION] = worst
+
+
+@core
+def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
+    """var = diag P, inf where a free column has a share."""
+    for i in range(len(var)):
+        var[i] = P[i, i]
+        for j in range(i, len(S)):
+            if S[j, j] == 0.0 and R[i, j] != 0.0:
+                var[i] = np.inf
+
+
+@machine
+def machine_learn(
+    S: int, d: int, R: int, P: int, theta: int, phi: int, work: int, now: int, var: int, n: int, m: int, L: int, l: int
+) -> None:  # fmt: skip
+    """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
+    S_l, R_l, P_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], cubes(P, n, n, L)[:, :, l]
+    learn(
+        S_l, floats(d, n, L)[:, l], R_l, P_l, floats(theta, n, L)[:, l], floats(phi, n, L)[:, l],
+        cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l],
+    )  # fmt: skip
+    spanned(S_l, R_l, P_l, floats(var, m, L)[:, l])
+
+
+@machine
+def machine_wander(S: int, d: int, H: int, pivot: int, n: int, L: int, l: int, size: float) -> None:
+    """`spread` for lane l of L, from the addresses of fields."""
+    spread(cubes(S, n, n, L), floats(d, n, L), cubes(H, n, n, L), size, floats(pivot, n, L), l)
+
+
+MACHINES = (machine_learn, machine_wander)
+"""What the steps of a tracker that starts here call; see `TrackerSteps`."""
+
+
+@kernel
+def wander(s: State, size: float, l: int) -> None:
+    """Let theta move by ``size`` s.H w with w ~ N(0, I), in square-root form."""
+    n, L = s.d.shape
+    machine_wander(s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.pivot.ctypes.data, n, L, l, size)
+
+
+@kernel
+def drifted(s: State, time: float, l: int) -> None:
+    """What a random walk of covariance ``time`` E G G' E does to the square root, E the roots of each one's factor."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            s.H[i, j, l] = s.each[i, l] * s.G[i, j, l]
+    wander(s, np.sqrt(time), l)
+
+
+@kernel
+def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
+    """`learn` from parameters and regressors at these addresses, with the sample if ok is 1."""
+    n, L = s.d.shape
+    s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[AGE, l] = s.y[l], s.r[l] * s.noise[l], ok, age
+    machine_learn(
+        s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
+        s.at_start.ctypes.data, s.var.ctypes.data, n, s.var.shape[0], L, l,
+    )  # fmt: skip
+
+
+@kernel
+def take_in_row(s: State, theta: int, phi: int, age: float, l: int) -> None:
+    """A sample in square-root form, with parameters and regressors at these addresses: P, s.s, a new direction."""
+    call(s, theta, phi, s.ok[l], age, l)
+    s.s[l] = s.at_start[BEFORE, l] + s.r[l] * s.noise[l]
+    if s.at_start[SQUARE, l] > 0.0:
+        s.F[s.rank[l], l] = s.at_start[SQUARE, l] * exp(s.at_start[VOLUME, l] - s.volume[l])
+        s.rank[l] += 1
+        s.volume[l] = s.at_start[VOLUME, l]
+
+
+@kernel
+def take_in(s: State, l: int) -> None:
+    """A sample in square-root form: theta, P, and s.y_hat, s.e, s.s."""
+    y_hat = prediction(s, l)
+    take_in_row(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, l)
+    s.y_hat[l], s.e[l] = y_hat, s.y[l] - y_hat
+
+
+@kernel
+def reform(s: State, l: int) -> None:
+    """P as the square root has it, after something else than a sample."""
+    call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
+
+
+@kernel
+def hand_over(s: State, l: int) -> None:
+    """Let the covariance be the state from now on, where it will do."""
+    s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
+
+
+@kernel
+def enter(s: State, l: int) -> None:
+    """The correction while the state is in square-root form, and the change to a covariance where that will do."""
+    take_in(s, l)
+    hand_over(s, l)
+
+
+@kernel
+def spanned_variance(s: State, l: int) -> None:
+    """Report the variance: infinite for every parameter that the regressors do not span yet."""
+    for i in range(s.theta.shape[0]):
+        var = s.var[i, l]
+        s.var[i, l] = var * s.scale[l] if var < np.inf else np.inf

@@ -1,0 +1,96 @@
+"""Readings and regressors out of all proportion to what has been seen: fault codes, spikes, wrong units.
+
+A reading of 9999 where the output is near 10 says nothing of the system, and it does harm three times: as an output, as
+a lag in the regressors of later samples, and in every scale that is measured from the data. With m and v the mean and
+variance of the readings so far and e the innovation, it is left out (not used, and its lag is that of an output that is
+missing) if
+
+    (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v
+
+so never where the model expects it. p, the patience, is 1, and doubles with every sample in a row that is so far off
+or an outlier: what keeps coming is a change of level, and is taken in. A change of level by a factor of 1000 costs
+seven samples.
+
+A regressor out of proportion to its mean square c is not left out, for it may be a test or a flood, and so what was
+waited for. It counts as no more than LEVERAGE ordinary samples: the noise variance of its sample is multiplied by
+
+    max(1, max_i phi_i^2 / (LEVERAGE c_i))
+
+Source: bounded leverage is Mallows's, see Hampel, Ronchetti, Rousseeuw and Stahel, Robust Statistics (1986), section
+6.3; patience is ours. Cost per sample: O(n).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from driftfit.engine.kernel import Array, State, kernel
+
+REACH = 10.0
+"""Standard deviations of the readings beyond which one is out of proportion."""
+LEVERAGE = 100.0
+"""Ordinary samples that one regressor may be worth."""
+FIRST = 10.0
+"""Readings that are taken as they come, to have something to compare with."""
+MEMORY = 1000.0
+"""Readings over which their mean and variance are remembered."""
+LONGEST = 1e12
+"""Patience is never above this."""
+
+
+def no_proportion() -> dict[str, Any]:
+    """Fields before the first reading."""
+    return {
+        "middle": 0.0, "spread": 0.0, "readings": 0.0, "patience": 1.0, "strange": 0.0, "left_out": 0.0,
+        "leverage": 1.0,
+    }  # fmt: skip
+
+
+@kernel
+def leave_out(s: State, l: int) -> None:
+    """Leave a reading out that is out of all proportion; s.y_hat must be known."""
+    away, e = (s.y[l] - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
+    e = e if s.valid[l] > 0.0 else away
+    reach = REACH * REACH * s.spread[l]
+    limit = reach * s.patience[l] * s.patience[l]
+    judged = (s.seen[l] > 0.0) & (s.readings[l] >= FIRST)
+    strange = judged & (away > reach) & (e > reach)
+    out = judged & (away > limit) & (e > limit)
+    s.strange[l] = 1.0 if strange else 0.0
+    s.left_out[l] += 1.0 if out else 0.0
+    s.ok[l] = 0.0 if out else s.ok[l]
+    s.seen[l] = 0.0 if out else s.seen[l]
+
+
+@kernel
+def learn_proportion(s: State, l: int, outlier: float) -> None:
+    """Mean and variance of the readings that were let in, and patience, given the probability of an outlier.
+
+    A reading that repeats the last one has nothing new: a plant that stands still keeps its scale.
+    """
+    odd = max(s.strange[l], outlier)
+    if s.seen[l] > 0.0 or odd > 0.0:
+        s.patience[l] = min(1.0 + odd * (2.0 * s.patience[l] - 1.0), LONGEST)
+    if s.seen[l] > 0.0 and (s.fresh[l] > 0.0 or s.readings[l] < 1.0):
+        s.readings[l] += 1.0
+        share = 1.0 / min(s.readings[l], MEMORY)
+        away = s.y[l] - s.middle[l]
+        s.middle[l] += share * away
+        s.spread[l] += share * ((1.0 - share) * away * away - s.spread[l])
+
+
+@kernel
+def bound_leverage(s: State, l: int) -> None:
+    """The factor of the noise variance."""
+    most = 1.0
+    for i in range(s.theta.shape[0]):
+        square = s.phi[i, l] * s.phi[i, l]
+        most = max(most, square / (LEVERAGE * s.c[i, l])) if s.c[i, l] > 0.0 else most
+    s.leverage[l] = most
+
+
+def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """What a summary says of it: nothing where all readings were let in."""
+    count = int(lane["left_out"])
+    return (("Left out", f"{count} readings out of all proportion to those before"),) if count else ()

@@ -1,0 +1,86 @@
+"""How strongly the regressors excite: their scales, and a windowed Gram matrix that tells which parameters are learned.
+
+    c_i <- mean of phi_i^2 over the last samples on which regressor i did anything
+    G   <- fade G + D phi phi' D,   D = diag(c)^(-1/2)
+
+A dull regressor keeps its scale, since a mean square that fades to 0 would blow up any drift measured by it. So does y,
+whose scale keeps the noise variance of a sensor that went dead from falling to 0. Parameter
+i is being learned while 1 / (G^-1)_ii, the information that no other parameter could explain, is above one sample's
+worth.
+Cost per sample: O(n^2); the flag inverts G when asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.disproportion import FIRST
+
+MEMORY = 200.0
+"""Samples over which the mean square of a regressor is remembered."""
+DULL = 1e-4
+"""A square below this share of the mean square counts as nothing happening."""
+
+LARGE = 25.0
+"""A square above this multiple of the mean square counts as this multiple."""
+
+
+def window(n: int) -> int:
+    """Samples over which G looks."""
+    return max(50, 10 * n)
+
+
+def no_excitation(n: int) -> dict[str, Any]:
+    """Fields before the first sample."""
+    return {
+        "seen_samples": 0.0,
+        "power": 0.0,
+        "c": np.zeros(n),
+        "active": np.zeros(n),
+        "information": np.zeros((n, n)),
+        "fade": 1.0 - 1.0 / window(n),
+    }
+
+
+@kernel
+def bounded(square: float, mean: float, count: float) -> float:
+    """A square as it counts in a mean square of ``count`` others: a fault code may not make a scale of its own."""
+    return min(square, LARGE * mean) if count >= FIRST else square
+
+
+@kernel
+def learn_scales(s: State, l: int) -> None:
+    """Mean squares of the regressors over the samples on which they did anything, and of y."""
+    s.seen_samples[l] += s.ok[l]
+    square = bounded(s.y[l] * s.y[l], s.power[l], s.seen_samples[l])
+    active = s.ok[l] if square > DULL * s.power[l] else 0.0
+    s.power[l] += active * (square - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
+    for i in range(s.theta.shape[0]):
+        square = bounded(s.phi[i, l] * s.phi[i, l], s.c[i, l], s.active[i, l])
+        active = s.ok[l] if square > DULL * s.c[i, l] else 0.0
+        s.active[i, l] += active
+        s.c[i, l] += active * (square - s.c[i, l]) / min(max(s.active[i, l], 1.0), MEMORY)
+
+
+@kernel
+def learn_information(s: State, l: int) -> None:
+    """Windowed Gram matrix of the regressors in units of their scale: what the guard against dull inputs looks at."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            unit = s.c[i, l] * s.c[j, l]
+            fresh = s.phi[i, l] * s.phi[j, l] / np.sqrt(unit) if unit > 0.0 else 0.0
+            fresh *= s.ok[l] / s.leverage[l]
+            s.information[i, j, l] = s.fade[l] * s.information[i, j, l] + fresh
+
+
+def learned(lane: Mapping[str, Array]) -> Array:
+    """Which parameters the regressors of the window tell apart from all others, (n,) bool."""
+    lower = np.tril(lane["information"])
+    G = lower + np.tril(lower, -1).T
+    own: Array = 1.0 / np.diag(np.linalg.inv(G + 1e-9 * np.eye(len(G))))
+    return own > 1.0

@@ -1,0 +1,71 @@
+"""The random walk that the adaptive filters come to believe in, once the whole record is known.
+
+    w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
+    q_t    = sum_k w_t(k) q_tk,    1 / r_t = (1 - o_t) / sum_j w_t(j) v_tj + o_t / max(f_J r, e_t^2)
+
+with f_t the probabilities after sample t and T their transitions, of drift modes and, likewise, of noise levels v_tj,
+and o_t the probability that sample t was an outlier. A smoother of that walk (`driftfit.smooth.exact`) gives theta
+from all samples, with drift and noise as they turned out to be. Before the filters start nothing drifts.
+
+Source: the backward pass is Kim's (1994), eq. 2.20; to smooth one walk given its result, in the place of one for each
+mode, is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.drift_ladder import TOP
+from driftfit.trackers.parts.noise_levels import level_chain
+
+NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled")
+"""Fields that a run notes at every sample."""
+
+
+@kernel
+def note(o: State, s: State, l: int) -> None:
+    """Store them."""
+    for k in range(s.prior.shape[0]):
+        o.prior[k, l] = s.prior[k, l]
+        for j in range(s.joint.shape[0]):
+            o.joint[j, k, l] = s.joint[j, k, l]
+    for j in range(s.nu.shape[0]):
+        o.nu[j, l] = s.nu[j, l]
+    for i in range(s.c.shape[0]):
+        o.c[i, l] = s.c[i, l]
+    o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
+    o.leapt[l], o.weighed[l], o.settled[l] = s.leapt[l], s.weighed[l], s.settled[l]
+
+
+def given_all(after: Array, transition: Array, moves: Array) -> Array:
+    """Probabilities (T, K) of the states of a chain given all samples, from those after each; it moves where told."""
+    found, ahead = after.copy(), after @ transition
+    for t in range(len(found) - 2, -1, -1):
+        if moves[t]:
+            found[t] = after[t] * (transition @ (found[t + 1] / np.maximum(ahead[t], 1e-300)))
+            found[t] /= found[t].sum()
+        else:
+            found[t] = found[t + 1]
+    return found
+
+
+def varying(noted: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]) -> tuple[Array, Array]:
+    """q (T, n) and r (T,) of every sample, from what a run noted (T, ..), its innovations and intervals of drift."""
+    running, weighed = noted["settled"] > 0, noted["weighed"] > 0
+    r = np.where(running, noted["r"], noted["r"][np.argmax(running)])
+    after = np.where(weighed[:, None], noted["joint"].sum(axis=1), noted["prior"])
+    w, span, ratio = given_all(after, state["transition"], weighed), r * time, state["ratio"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        leapt = np.where(weighed, noted["leapt"] / span, 0.0)
+        q = (w @ ratio.T + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / noted["c"]
+    q = np.where(running[:, None] & (span[:, None] > 0.0) & (noted["c"] > 0.0), q, 0.0)
+    levels = given_all(noted["nu"][:, :-1], level_chain(), weighed)
+    v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], noted["coarse"][:, None]), axis=1)
+    v = np.where(running, v + noted["coarse"] * noted["alike"] * (noted["alike"] + 2.0), r) * noted["leverage"]
+    outlier = np.where(weighed, noted["joint"][:, -1].sum(axis=1), 0.0)
+    far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
+    return q, 1.0 / ((1.0 - outlier) / v + outlier / far)

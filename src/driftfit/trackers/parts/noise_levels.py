@@ -1,0 +1,91 @@
+"""Noise that changes, and outliers: levels f_j r of the noise variance as modes of a chain.
+
+The last level is an outlier's: it comes with probability 0.02 at every sample and says nothing about the others, which
+form a sticky chain (stay, or one rung up or down). r itself follows what the levels leave unexplained,
+
+    log r <- log r + (sum_j p_j (e^2 / s_j - 1) + sum_j nu_j log f_j) / memory
+
+so the level in use moves towards 1.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, exp, kernel
+from driftfit.trackers.parts.resolution import lasting
+
+LEVELS = (1.0 / 16.0, 0.25, 1.0, 4.0, 16.0, 100.0)
+"""Noise levels in units of r; the last is the outlier's."""
+STAY = 0.99
+"""Probability that the level stays where it is from one sample to the next."""
+OUTLIER = 0.02
+"""Probability of an outlier."""
+MEMORY = 100.0
+"""Samples over which r is remembered."""
+IN_A_ROW, RISE = 4.0, 0.3
+"""From the third outlier in a row on (`driftfit.trackers.parts.disproportion`), log r rises by this with each."""
+FINEST = 1e-12
+"""r is never below this share of the mean square of y: the data's own rounding."""
+
+
+def any_level() -> dict[str, Any]:
+    """Fields before the first sample."""
+    J = len(LEVELS)
+    return {
+        "level": np.array(LEVELS),
+        "log_level": np.log(LEVELS),
+        "nu": np.array([*np.full(J - 1, 1.0 / (J - 1)), 0.0]),
+        "nu_prior": np.zeros(J),
+        "odd": 0.0,
+    }
+
+
+def level_chain() -> Array:
+    """Transitions of the ordinary levels: stay, or one rung up or down."""
+    K = len(LEVELS) - 1
+    T = STAY * np.eye(K)
+    for j in range(K):
+        for to in (max(j - 1, 0), min(j + 1, K - 1)):
+            T[j, to] += 0.5 * (1.0 - STAY)
+    return T
+
+
+@kernel
+def finest(s: State, l: int) -> float:
+    """What r is never below."""
+    return max(FINEST * s.power[l], s.coarse[l])  # type: ignore[no-any-return]
+
+
+@kernel
+def noise_prior(s: State, l: int) -> None:
+    """The chain of noise levels: stay, or one rung up or down; the outlier level has its own fixed probability."""
+    J = s.nu.shape[0]
+    for j in range(J):
+        s.nu_prior[j, l] = 0.0
+    for j in range(J - 1):
+        here = (1.0 - OUTLIER) * s.nu[j, l]
+        s.nu_prior[j, l] += STAY * here
+        s.nu_prior[max(j - 1, 0), l] += 0.5 * (1.0 - STAY) * here
+        s.nu_prior[min(j + 1, J - 2), l] += 0.5 * (1.0 - STAY) * here
+    s.nu_prior[J - 1, l] = OUTLIER
+
+
+@kernel
+def learn_noise(s: State, l: int) -> None:
+    """r follows what the ordinary levels leave unexplained, and moves towards the level in use."""
+    K, J = s.mu.shape[0], s.nu.shape[0]
+    surprise, level = 0.0, 0.0
+    more = lasting(s, l)
+    for j in range(J - 1):
+        for k in range(K):
+            surprise += s.joint[j, k, l] * (s.e_k[k, l] * s.e_k[k, l] / (1.0 / s.inverse[j, k, l] - more) - 1.0)
+        level += s.nu[j, l] * s.log_level[j, l]
+    s.count[l] += 1.0
+    step = 1.0 / min(s.count[l] + 1.0, MEMORY)
+    move = step * surprise + max(step, 2.0 / MEMORY) * level
+    if s.patience[l] > IN_A_ROW:
+        move += RISE * s.odd[l]
+    s.r[l] = max(s.r[l] * exp(min(1.0, max(-1.0, move))), finest(s, l))

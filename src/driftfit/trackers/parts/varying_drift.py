@@ -1,0 +1,36 @@
+"""A drift of its own for every parameter at every sample: ``drift=`` of shape (T, n).
+
+    q_t = diag(d_t)^(1/2) q diag(d_t)^(1/2),   d_t >= 0 known before sample t
+
+For flexible least squares it is a weight of its own for every step and parameter, mu_i / d_ti; d = 0 keeps a parameter
+where it is. Trackers that support it have a field ``each`` (n,), the roots of d, 1 where the user gives nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.kernel import Array, State, kernel
+
+
+@kernel
+def told(s: State, known: Array, t: int, l: int) -> None:
+    """Take the roots from the columns of ``known`` after the third."""
+    for i in range(s.theta.shape[0]):
+        s.each[i, l] = known[t, 3 + i, l]
+
+
+def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:
+    """The columns (T, n); ValueError where ``drift`` has another shape or cannot be a factor."""
+    factors, n = as_numbers("drift", drift), len(names)
+    if factors.shape != (T, n):
+        raise ValueError(
+            f"{owner}: drift with a column for each parameter must be ({T}, {n}), for {', '.join(names)}; got shape "
+            f"{factors.shape}."
+        )
+    roots: Array = np.sqrt(factor("drift", factors.ravel(), factors.size)).reshape(T, n)
+    return roots

@@ -1,0 +1,1 @@
+"""Tuning: settings of a tracker from a record."""

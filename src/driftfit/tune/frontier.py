@@ -1,0 +1,83 @@
+"""The frontier of flexible least squares: what fit costs in movement, over all mu.
+
+    r_M^2(mu) = sum w_k (y_k - phi_k' theta_k)^2          r_D^2(mu) = sum |theta_{k+1} - theta_k|^2 / (dt d)
+
+of the smoothed path (with ``differences=2`` its slope is in the place of theta in r_D^2). It is convex; r_M^2 does not
+fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu exactly. There is no corner to choose mu by: in
+logarithms the curve has none, because r_M^2 goes to 0 with mu, and on linear axes the knee depends on the scaling;
+`tune` finds mu.
+
+Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing a point.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.data.arguments import check_role
+from driftfit.engine.kernel import Array
+from driftfit.models.base import Model
+from driftfit.run.track import track
+from driftfit.smooth.shared_theta import SmoothedShared
+from driftfit.trackers.fls import FLS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from driftfit.smooth.smoothed import Smoothed
+
+
+class Frontier(NamedTuple):
+    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, in the order of mu."""
+
+    mu: Array
+    measurement: Array
+    dynamic: Array
+
+    def plot(self) -> Figure:
+        """r_M^2 against r_D^2, and both against mu; a matplotlib figure."""
+        from driftfit.tune.plots import plot_frontier
+
+        return plot_frontier(self)
+
+
+def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, **known: Any) -> Frontier:
+    """The two costs of the smoothed path for every mu.
+
+    Parameters
+    ----------
+    model, y, u, and time, dt, weights, drift
+        As for `track`.
+    mu : (S,) or None
+        Weights, positive. None: four per decade, from 1e-4 to 1e5 (1e10 for second differences) times the mean of
+        phi' phi.
+    differences : 1 or 2
+        As for `FLS`.
+
+    Raises
+    ------
+    ValueError
+        If a mu is not positive, or what `track` refuses.
+    """
+    check_role("frontier", "model", model, Model)
+    if len(model.outputs) > 1 and not model.shared:
+        raise ValueError("frontier: of one output at a time: take run[name], and frontier(run[name].model, .y, .u).")
+    if mu is None:
+        steady = track(model, FLS(1.0), y, u, **known).smooth()
+        used = steady.walk.weight > 0.0
+        power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
+        mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
+    weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
+    paths = [track(model, FLS(float(m), differences=differences), y, u, **known).smooth() for m in weights]
+    return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
+
+
+def _movement(path: Smoothed) -> float:
+    """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
+    path = path.rows if isinstance(path, SmoothedShared) else path
+    walk = path.walk
+    steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
+    factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
+    return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))

@@ -1,0 +1,264 @@
+"""Settings as knobs: which numbers of a tracker are to be found, in which range, and what a value of them means.
+
+A knob x is the log10 of a positive number, or -inf for zero where zero makes sense. Which knobs a tracker has follows
+from the settings that it was left without:
+
+    mu           FLS, AugmentedFLS   mu = 10^x s, or by group mu_i = 10^x p_i;    x from -4 to max(5, 2 log10 T)
+    q and r      Kalman              q_i = r 10^x / p_i;                          -x in the same range, or zero
+    q alone      Kalman(r=...)       the same with the given r
+    r alone      Kalman(q=...)       r = 10^x v;                                  x from -9 to 3
+    forgetting   RLS                 forgetting = 1 - 10^-x, 10^x samples of memory; x from log10 2n to log10 100 T
+    changes      Bank                q or size^2 of every change times 100^x; x from -3 to 3, of the first also zero;
+                                     prior probabilities of the others, where they are given, times 10^x, x from -2
+
+p_i is the mean square of regressor i, s their sum, v the variance that a constant theta leaves. A group shares one
+drift *as it is seen in the output*, so no unit of the data matters. T samples cannot tell a drift below 1 / T^2 from
+none (of slopes: 1 / T^4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import missing_settings
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.kalman import Kalman
+from driftfit.tune.lanes import Record, score
+
+Bounds = tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """The numbers to be found, p knobs that stand for k values of settings.
+
+    ``low``, ``high``, ``zero`` (p,): the range of x, and whether -inf is possible. ``run(x)`` is the tracker that
+    scores x in lanes; ``profiled`` says that it works relative to the noise variance, which then is known in closed
+    form. ``build(x, sigma2)`` is the tracker that is returned. ``names`` (k,), ``owner`` (k,), ``values(x)`` (k,): what
+    the knobs mean, and which knob a value belongs to.
+    """
+
+    low: Array
+    high: Array
+    zero: Array
+    profiled: bool
+    run: Callable[[Array], Tracker]
+    build: Callable[[Array, float], Tracker]
+    names: tuple[str, ...]
+    owner: Array
+    values: Callable[[Array], Array]
+    origin: tuple[Any, ...] = ()
+
+    def __reduce__(self) -> Any:
+        """Functions cannot be sent to another process; what they were made of can."""
+        return find_knobs, self.origin
+
+
+def find_knobs(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
+    """The knobs of a tracker for a record; ValueError where it has none."""
+    return replace(_find(record, tracker, groups, bounds), origin=(record, tracker, groups, bounds))
+
+
+def _find(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
+    missing = missing_settings(tracker)
+    if isinstance(tracker, Bank) and groups is None:
+        return _changes(tracker, bounds)
+    if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
+        raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
+    if missing == ["mu"]:
+        return _weight(record, tracker, groups, bounds)
+    if missing in (["q"], ["q", "r"]):
+        return _drift(record, tracker, groups, bounds)
+    if missing == ["r"]:
+        return _noise(record, tracker, bounds)
+    if missing == ["forgetting"]:
+        return _memory(record, tracker, bounds)
+    raise ValueError(
+        f"tune: {tracker!r} leaves {', '.join(missing) or 'nothing'} open; what can be found is mu, q and r, or "
+        "forgetting. Leave out what is to be found, as in FLS(), Kalman(r=0.1) or RLS()."
+    )
+
+
+def members(names: Sequence[str], groups: Any) -> Array:
+    """For every parameter the number of its group, (n,)."""
+    if groups is None:
+        return np.zeros(len(names), int)
+    if isinstance(groups, str) and groups == "each":
+        return np.arange(len(names))
+    labels = [] if isinstance(groups, str) else [str(label) for label in groups]
+    if len(labels) != len(names):
+        raise ValueError(
+            f"tune: groups must be None, 'each', or one label for each of the {len(names)} parameters "
+            f"({', '.join(names)}); got {groups!r}."
+        )
+    unique = list(dict.fromkeys(labels))
+    return np.array([unique.index(label) for label in labels])
+
+
+def still(record: Record, scored_by: Tracker) -> tuple[Array, float]:
+    """Mean squares of the regressors (n,), and the variance that a constant theta leaves."""
+    scores = score(record, [scored_by])
+    power, variance = scores.power[:, 0], float(scores.sigma2()[0])
+    if not np.any(power > 0.0):
+        raise ValueError("tune: the record has no usable sample with a regressor other than zero: nothing to tune on.")
+    return power, variance if 0.0 < variance < np.inf else 1.0
+
+
+def constant(record: Record, tracker: Any) -> Tracker:
+    """The tracker with its drift taken away, or as near to that as it can be."""
+    n = record.model.n
+    if not tracker.covariance:
+        return replace(tracker, mu=1e300)  # type: ignore[no-any-return]
+    if "mu" in tracker.required:
+        return replace(tracker, mu=(np.inf,) * n, p0=None)  # type: ignore[no-any-return]
+    if len(tracker.names_for(record.model)) == n:
+        return replace(tracker, q=(0.0,) * n, r=1.0, p0=None)  # type: ignore[no-any-return]
+    return Kalman(q=(0.0,) * n, r=1.0)
+
+
+def _range(record: Record, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
+    """Ends of log10 mu, (p,) each; a drift of slopes adds up twice over the record."""
+    times = getattr(tracker, "differences", 1)
+    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(record.y))))
+    return np.full(p, low), np.full(p, high)
+
+
+def _ends(bounds: Bounds, low: float, high: float) -> tuple[float, float]:
+    if bounds is None:
+        return low, high
+    if len(bounds) != 2 or not 0.0 < bounds[0] < bounds[1] < np.inf:
+        raise ValueError(f"tune: bounds must be (low, high), both positive, low below high; got {bounds!r}.")
+    return float(np.log10(bounds[0])), float(np.log10(bounds[1]))
+
+
+def _weight(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
+    """mu of FLS or AugmentedFLS."""
+    names = record.model.names
+    if groups is not None and not tracker.covariance:
+        raise ValueError(f"tune: {type(tracker).__name__} has one mu for all parameters; leave groups=None.")
+    power, _ = still(record, constant(record, tracker))
+    group = members(names, groups)
+    share = np.full(len(names), power.sum()) if groups is None else np.where(power > 0.0, power, power.max())
+    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
+
+    def each(x: Array) -> Array:
+        return np.asarray(10.0 ** x[group] * share)
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        mu = each(x)
+        return replace(tracker, mu=float(mu[0]) if groups is None else tuple(mu))  # type: ignore[no-any-return]
+
+    no = np.zeros(len(low), bool)
+    if groups is None:
+        return Knobs(low, high, no, True, build, build, ("mu",), np.zeros(1, int), lambda x: each(x)[:1])
+    return Knobs(low, high, no, True, build, build, tuple(f"mu[{name}]" for name in names), group, each)
+
+
+def _drift(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
+    """q of Kalman; an open r in closed form after a diffuse start, as a knob of its own after a given prior."""
+    names = tracker.names_for(record.model)
+    power, variance = still(record, constant(record, tracker))
+    if len(names) != len(power):  # the tracker's parameters are not the regression's
+        power = np.full(len(names), power.sum())
+    group = members(names, groups)
+    share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
+    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
+    low, high = -high, -low
+    own_r = tracker.r is None and tracker.p0 is not None
+    profiled = tracker.r is None and not own_r
+    if own_r:
+        low, high = np.append(low, -9.0), np.append(high, 3.0)
+    zero = np.arange(len(low)) <= group.max()
+
+    def ratios(x: Array) -> Array:
+        return np.asarray(10.0 ** x[group] * share)
+
+    def noise(x: Array) -> float:
+        return variance * 10.0 ** float(x[-1]) if own_r else 1.0 if profiled else float(tracker.r)
+
+    def with_noise(x: Array, r: float) -> Tracker:
+        return replace(tracker, q=tuple(r * ratios(x)), r=r)  # type: ignore[no-any-return]
+
+    def values(x: Array) -> Array:
+        return np.append(ratios(x), noise(x)) if own_r else ratios(x)
+
+    labels, owner = tuple(f"q[{name}]/r" for name in names), group
+    if own_r:
+        labels, owner = (*labels, "r"), np.append(group, len(low) - 1)
+    return Knobs(
+        low, high, zero, profiled,
+        run=lambda x: with_noise(x, noise(x)),
+        build=lambda x, sigma2: with_noise(x, sigma2 if profiled else noise(x)),
+        names=labels, owner=owner, values=values,
+    )  # fmt: skip
+
+
+def _noise(record: Record, tracker: Any, bounds: Bounds) -> Knobs:
+    """r of Kalman under a given q."""
+    _, variance = still(record, constant(record, tracker))
+    low, high = _ends(bounds, -9.0, 3.0)
+
+    def values(x: Array) -> Array:
+        return np.asarray(variance * 10.0**x)
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        return replace(tracker, r=float(values(x)[0]))  # type: ignore[no-any-return]
+
+    one, no = np.zeros(1, int), np.zeros(1, bool)
+    return Knobs(np.array([low]), np.array([high]), no, False, build, build, ("r",), one, values)
+
+
+MOST_PROBABLE = 0.5
+"""What the prior probabilities of all changes but the first may add up to."""
+
+
+def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
+    """Scales and prior probabilities of the changes of a bank; bounds are of the factors of the scales."""
+    changes = tracker.all_changes
+    if all(one.prob is not None for one in changes):  # the first has what the others leave
+        changes = (replace(changes[0], prob=None), *changes[1:])
+    moving = [i for i, one in enumerate(changes) if any(part.any() for part in one.scales())]
+    given = [] if tracker.transition is not None else [i for i, one in enumerate(changes) if i and one.prob]
+    if not moving and not given:
+        raise ValueError("tune: no change of this Bank moves anything, and none has a probability to be found.")
+    low, high = _ends(bounds, -3.0, 3.0)
+    priors = np.array([changes[i].prob or 0.0 for i in given])
+    most = np.log10(MOST_PROBABLE / max(len(given), 1) / priors)
+    lows = np.r_[np.full(len(moving), low), np.minimum(-2.0, most - 2.0)]
+    highs = np.r_[np.full(len(moving), high), most]
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        made = list(changes)
+        for i, factor in zip(moving, 10.0 ** x[: len(moving)], strict=True):
+            made[i] = made[i].scaled(float(factor))
+        for i, prob in zip(given, priors * 10.0 ** x[len(moving) :], strict=True):
+            made[i] = replace(made[i], prob=float(prob))
+        return replace(tracker, changes=tuple(made))
+
+    def values(x: Array) -> Array:
+        return np.asarray(10.0**x * np.r_[np.ones(len(moving)), priors])
+
+    names = tuple(f"scale[{tracker.change_names[i]}]" for i in moving)
+    names += tuple(f"prob[{tracker.change_names[i]}]" for i in given)
+    zero = np.array([i == 0 for i in moving] + [False] * len(given))
+    return Knobs(lows, highs, zero, False, build, build, names, np.arange(len(names)), values)
+
+
+def _memory(record: Record, tracker: Any, bounds: Bounds) -> Knobs:
+    """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds are of the memory."""
+    low, high = _ends(bounds, float(np.log10(2.0 * record.model.n)), float(np.log10(100.0 * len(record.y))))
+
+    def values(x: Array) -> Array:
+        return np.asarray(np.maximum(1.0 - 10.0**-x, 0.0))
+
+    def build(x: Array, sigma2: float = 1.0) -> Tracker:
+        return replace(tracker, forgetting=float(values(x)[0]))  # type: ignore[no-any-return]
+
+    one, no = np.zeros(1, int), np.zeros(1, bool)
+    return Knobs(np.array([low]), np.array([high]), no, True, build, build, ("forgetting",), one, values)

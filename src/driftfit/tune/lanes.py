@@ -1,0 +1,176 @@
+"""One record under many settings at once: every lane of a tile sees the same series, each with its own tracker.
+
+For each setting a run is condensed to what the criteria need, so memory does not grow with the record:
+
+    log-likelihood   -1/2 (N log 2 pi + sum log s + sum log F + sum e^2 / s) + sum of the model's log Jacobian
+    profiled         s = sigma^2 s0:  sigma^2 = mean(e^2 / s0),
+                     -1/2 (N (log 2 pi sigma^2 + 1) + sum log s0 + sum log F) + sum of the model's log Jacobian
+    h-step error     mean of w_t (y_t - phi_t' theta_{t-h})^2 after the start
+
+N (`used`) counts the usable samples that did not determine a new direction, F are the diffuse terms of those that did.
+Trackers that estimate their own scale report s = scale s0 with the scale known before the sample; it is divided out.
+Of a tracker that weighs hypotheses the log-likelihood is the sum of the log densities of the mixture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
+
+BLOCK = 1024
+"""Samples between two condensations: a tile's output of that length stays in the cache."""
+
+
+class Record(NamedTuple):
+    """A checked record: bound model, y (T,), u (T, m), known factors (T, 3) or (1, 3)."""
+
+    model: Model
+    y: Array
+    u: Array
+    known: Array
+
+
+class Scores(NamedTuple):
+    """What runs under S settings condense to, each (S,), but power (n, S)."""
+
+    used: Array
+    log_s: Array
+    squares: Array
+    more: Array
+    """What adds to the log-likelihood beside the Gaussian terms: log Jacobians, or densities of a tracker's own."""
+    h_step: Array
+    power: Array
+
+    def sigma2(self) -> Array:
+        """The noise variance where P is relative to it: mean(e^2 / s0)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.squares / self.used)
+
+    def loglik(self, profiled: bool) -> Array:
+        """The log-likelihood, with the noise variance at its maximum when ``profiled``; -inf where there is none."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if profiled:
+                body = self.used * (np.log(2.0 * np.pi * self.sigma2()) + 1.0)
+            else:
+                body = self.used * np.log(2.0 * np.pi) + self.squares
+            value = -0.5 * (body + self.log_s) + self.more
+        return np.where(np.isfinite(value), value, -np.inf)
+
+
+@kernel
+def store_inside(o: State, s: State, l: int) -> None:
+    """Store the regressor that the tracker saw, and the scale after the sample."""
+    o.scale[l] = s.scale[l]
+    for i in range(s.phi.shape[0]):
+        o.phi[i, l] = s.phi[i, l]
+
+
+@cache
+def storing(store: Any) -> Any:
+    """That, and what a tracker stores by itself."""
+
+    @kernel
+    def store_both(o: State, s: State, l: int) -> None:
+        store_inside(o, s, l)
+        store(o, s, l)
+
+    return store_both
+
+
+def score(record: Record, trackers: Sequence[Tracker], h: int = 1) -> Scores:
+    """Run the record under each tracker (all of one class and one form of settings)."""
+    width = trackers[0].width
+    parts = []
+    for a in range(0, len(trackers), width):
+        some = list(trackers[a : a + width])
+        full = some + [some[-1]] * (width - len(some))
+        parts.append([value[..., : len(some)] for value in _score_tile(record, full, h)])
+    return Scores(*(np.concatenate(values, axis=-1) for values in zip(*parts, strict=True)))
+
+
+def _score_tile(record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
+    model, y, u, known = record
+    T, L = len(y), len(trackers)
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model) for tracker in trackers])
+    steps, own = trackers[0].steps_for(model), trackers[0].outputs if trackers[0].density else ()
+    out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))
+    run = drivers(model.steps, steps._replace(store=storing(steps.store) if own else store_inside)).run
+    sums = _Sums(record, trackers[0], tile, h)
+    for a in range(0, T, BLOCK):
+        b = min(a + BLOCK, T)
+        factors = known if len(known) == 1 else known[a:b]
+        spread = [np.repeat(part[..., None], L, axis=-1) for part in (y[a:b], u[a:b], factors)]
+        run(tile, *spread, out[: b - a])
+        sums.add(a, out[: b - a])
+    return sums.scores(tile)
+
+
+class _Sums:
+    """Sums over the blocks of a run, each with the lanes on the last axis."""
+
+    def __init__(self, record: Record, tracker: Tracker, tile: Array, h: int) -> None:
+        n, L = tile["theta"].shape[1:]
+        self.record, self.tracker, self.h = record, tracker, h
+        self.burn = min(max(50, 5 * n), len(record.y) // 3)
+        self.count, self.log_s, self.squares, self.more = np.zeros((4, L))
+        self.errors, self.scored, self.used = np.zeros((3, L))
+        self.power = np.zeros((record.model.n, L))
+        self.scale = np.ones(L) * tile["scale"][0]
+        self.past = np.full((h, n, L), np.nan)
+
+    def add(self, a: int, out: Array) -> None:
+        ok = out["ok"] > 0.0
+        y = self.record.y[a : a + len(out), None]
+        counted = self._likelihood(out, ok)
+        self._forecast(a, out, ok, y)
+        if hasattr(self.record.model, "log_jacobian"):
+            terms = self.record.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
+            self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
+        self.power += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
+        self.used += ok.sum(axis=0)
+
+    def _likelihood(self, out: Array, ok: Array) -> Array:
+        """Add the terms of the samples that have one; returns which, (T, L)."""
+        before = np.concatenate([self.scale[None], out["scale"][:-1]])
+        self.scale = out["scale"][-1].copy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = out["s"] / before
+            first = ok & np.isnan(before)  # no scale was known before the sample that gave the first one
+            s = np.where(first, out["e"] ** 2 / out["scale"], s)
+            counted = ok & np.isfinite(s) & (s > 0.0)
+            own = self.tracker.log_density(out)
+            if own is not None:
+                self.more += np.sum(np.where(counted, own, 0.0), axis=0)
+                return np.asarray(counted)
+            self.log_s += np.sum(np.where(counted, np.log(s), 0.0), axis=0)
+            self.squares += np.sum(np.where(counted, out["e"] ** 2 / s, 0.0), axis=0)
+        self.count += counted.sum(axis=0)
+        return np.asarray(counted)
+
+    def _forecast(self, a: int, out: Array, ok: Array, y: Array) -> None:
+        error = out["e"]
+        if self.h > 1:
+            theta = np.concatenate([self.past, out["theta"]])
+            self.past = theta[-self.h :].copy()
+            error = y - np.sum(out["phi"] * theta[: len(out)], axis=1)
+        known = self.record.known
+        weight = 1.0 / (known if len(known) == 1 else known[a : a + len(out)])[:, 1, None]
+        scored = ok & (np.arange(a, a + len(out)) >= self.burn)[:, None]
+        with np.errstate(invalid="ignore"):
+            self.errors += np.sum(np.where(scored, weight * error**2, 0.0), axis=0)
+        self.scored += scored.sum(axis=0)
+
+    def scores(self, tile: Array) -> Scores:
+        if "F" in (tile.dtype.names or ()):
+            self.log_s += np.sum(np.log(tile["F"][0]), axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            h_step, power = self.errors / self.scored, self.power / self.used
+        return Scores(self.count, self.log_s, self.squares, self.more, h_step, power)

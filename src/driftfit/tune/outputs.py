@@ -1,0 +1,69 @@
+"""Tuning for several outputs: each output by itself, or all rows of a shared theta together.
+
+Outputs with a theta each have a noise each, so each gets settings of its own: `TunedOutputs.tracker` maps the name of
+an output to its tracker, as `track` and `Live` take it. Regressors are those of constant parameters, whose predictions
+also fill missing lags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from driftfit.models.base import Model
+from driftfit.run.track import track
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.kalman import Kalman
+from driftfit.tune.lanes import Record
+
+if TYPE_CHECKING:
+    from driftfit.tune.tune import Tuned
+
+
+STILL = Kalman(q=0.0, r=1.0)
+"""Constant parameters, of which nothing is known before."""
+
+
+class TunedOutputs(Mapping[str, "Tuned"]):
+    """What `tune` returns for a model with several outputs: a `driftfit.tune.Tuned` for each."""
+
+    def __init__(self, each: Mapping[str, Tuned]) -> None:
+        self._each = dict(each)
+
+    def __getitem__(self, output: str) -> Tuned:
+        return self._each[output]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._each)
+
+    def __len__(self) -> int:
+        return len(self._each)
+
+    def __repr__(self) -> str:
+        return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
+
+    @property
+    def tracker(self) -> dict[str, Tracker]:
+        """The tracker of each output, by name: ready for `track` and `Live`."""
+        return {name: one.tracker for name, one in self.items()}
+
+    @property
+    def loglik(self) -> float:
+        """Sum over the outputs."""
+        return sum(one.loglik for one in self.values())
+
+    @property
+    def at_bound(self) -> dict[str, tuple[str, ...]]:
+        """Settings that ended at a bound of the search, by output."""
+        return {name: one.at_bound for name, one in self.items() if one.at_bound}
+
+
+def tune_outputs(model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], one: Callable[..., Any]) -> Any:
+    """Tune every output with ``one(record)``, or the rows of a shared theta at once."""
+    if not isinstance(tracker, Tracker):
+        raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
+    run: Any = track(model, STILL, y, u, **known)
+    if model.shared:
+        return one(Record(run.rows.model, run.rows.y, run.rows.u, run.rows._known))
+    records = {name: run[name] for name in run.outputs}
+    return TunedOutputs({name: one(Record(r.model, r.y, r.u, r._known)) for name, r in records.items()})

@@ -1,0 +1,229 @@
+"""The search: a grid over every knob, then a quasi-Newton method whose gradients are lanes; profiles for intervals.
+
+    start      all knobs together on a grid of at least 4 points a decade, then each by itself (also at zero)
+    refine     L-BFGS-B on the finite knobs, central differences of 1e-3 decades
+    zero       a knob whose zero is at least as good is zero
+    profile    along the ridge x_hat + delta C e_i / C_ii, C the inverse of the Hessian: where the objective has risen
+               by chi2 / 2, on either side; with one knob this is the profile itself
+
+The objective is to be minimised; it takes points (S, p) and gives values (S,), +inf where a point is impossible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from statistics import NormalDist
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.tune.knobs import Knobs
+
+Objective = Callable[[Array], Array]
+DECADE = 4
+"""Points of a grid per decade."""
+STEP = 1e-3
+"""Decades between the points of a central difference."""
+CURVE = 0.03
+"""The same for second differences, which lose twice as many digits."""
+CYCLES = 4
+"""Rounds over the knobs, at most."""
+EDGE = 0.01
+"""Decades from an end of the range that count as being there."""
+
+
+class Counted:
+    """An objective that remembers every point that was asked for."""
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        self.points: list[Array] = []
+        self.values: list[Array] = []
+
+    def __call__(self, points: Array) -> Array:
+        values = self._objective(points)
+        self.points.append(points)
+        self.values.append(values)
+        return values
+
+
+def minimise(f: Objective, knobs: Knobs) -> Array:
+    """The best point (p,)."""
+    return _zeros(f, knobs, _refine(f, knobs, _grid(f, knobs)))
+
+
+def _axis(knobs: Knobs, i: int) -> Array:
+    count = int(np.ceil(DECADE * (knobs.high[i] - knobs.low[i]))) + 1
+    points = np.linspace(knobs.low[i], knobs.high[i], max(count, 2))
+    return np.asarray(np.append(points, -np.inf) if knobs.zero[i] else points)
+
+
+def _grid(f: Objective, knobs: Knobs) -> Array:
+    """All knobs that have the same range together, the others at their middle; then knob by knob."""
+    p = len(knobs.low)
+    together = (knobs.low == knobs.low[0]) & (knobs.high == knobs.high[0]) & (knobs.zero == knobs.zero[0])
+    points = np.where(together, _axis(knobs, 0)[:, None], _middle(knobs))
+    values = f(points)
+    x: Array = points[np.argmin(values)].copy()
+    best = values.min()
+    for _ in range(CYCLES if p > 1 else 0):
+        before = best
+        for i in range(p):
+            points = np.repeat(x[None], len(_axis(knobs, i)), axis=0)
+            points[:, i] = _axis(knobs, i)
+            values = f(points)
+            if values.min() < best:
+                x, best = points[np.argmin(values)].copy(), values.min()
+        if not best < before:
+            break
+    return x
+
+
+def _middle(knobs: Knobs) -> Array:
+    """Where a knob that is not varied stands: at 0, which is the scale of the data, or at the nearest end."""
+    return np.asarray(np.clip(np.zeros(len(knobs.low)), knobs.low, knobs.high))
+
+
+def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
+    free = np.flatnonzero(np.isfinite(x))
+    if not free.size:
+        return x
+    # one grid cell around the best grid point, so that a second valley cannot catch the search
+    reach = 1.0 / DECADE if len(x) == 1 else np.inf
+    low, high = np.maximum(knobs.low[free], x[free] - reach), np.minimum(knobs.high[free], x[free] + reach)
+
+    def value_and_slope(part: Array) -> tuple[float, Array]:
+        points = np.repeat(x[None], 2 * free.size + 1, axis=0)
+        points[:, free] = part
+        for j, i in enumerate(free):
+            points[2 * j + 1, i] += STEP
+            points[2 * j + 2, i] -= STEP
+        values = f(points)
+        slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
+        return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
+
+    from scipy import optimize  # half a second to import
+
+    options = {"ftol": 1e-14, "gtol": 1e-9, "maxiter": 100}  # the logarithm of a mean square is flat: 0.01 a decade^2
+    found = optimize.minimize(
+        value_and_slope, x[free], jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)), options=options
+    )
+    refined: Array = x.copy()
+    refined[free] = found.x
+    return refined
+
+
+def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
+    """Set to zero what is not worse there, and refine the rest again."""
+    candidates = np.flatnonzero(knobs.zero & np.isfinite(x))
+    changed = False
+    for i in candidates:
+        points = np.repeat(x[None], 2, axis=0)
+        points[1, i] = -np.inf
+        values = f(points)
+        if values[1] <= values[0]:
+            x, changed = points[1], True
+    return _refine(f, knobs, x) if changed else x
+
+
+def curvature(f: Objective, x: Array, free: Array) -> Array:
+    """The Hessian of the free knobs by second differences, NaN where the objective has none."""
+    k = free.size
+    points = [x]
+    pairs = [(i, j) for i in range(k) for j in range(i + 1)]
+    for i, j in pairs:
+        for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            point = x.copy()
+            point[free[i]] += a * CURVE
+            point[free[j]] += b * CURVE
+            points.append(point)
+    values = f(np.array(points))
+    H = np.empty((k, k))
+    for at, (i, j) in enumerate(pairs):
+        pp, pm, mp, mm = values[1 + 4 * at : 5 + 4 * at]
+        # on the diagonal the two steps add up to one of twice the length, or to none
+        H[i, j] = H[j, i] = (pp - pm - mp + mm) / (4.0 * CURVE**2)
+    return H
+
+
+class Search:
+    """The best point, and what the objective does around it."""
+
+    def __init__(self, f: Counted, knobs: Knobs, x: Array) -> None:
+        self.f, self.knobs, self.x = f, knobs, x
+        self._tried = np.concatenate(f.points), np.concatenate(f.values)
+        self.best = float(f(x[None])[0])
+        inside = np.isfinite(x) & (x > knobs.low + EDGE) & (x < knobs.high - EDGE)
+        self.free = np.flatnonzero(inside)
+
+    def tried(self) -> tuple[Array, Array]:
+        """Points and values of the search, best first."""
+        points, values = self._tried
+        order = np.argsort(values, kind="stable")
+        return points[order], values[order]
+
+    def at_bound(self, i: int) -> bool:
+        """Whether a knob is at an end of its range, or zero."""
+        return i not in self.free
+
+    @cached_property
+    def inverse(self) -> Array:
+        """C, the inverse of the Hessian of the free knobs; diagonal where the objective is not convex."""
+        H = curvature(self.f, self.x, self.free)
+        convex = np.isfinite(H).all() and np.linalg.eigvalsh(H).min(initial=np.inf) > 0.0
+        C: Array = np.linalg.inv(H) if convex else np.full(H.shape, np.nan)
+        return C
+
+    def ridge(self, i: int) -> Array:
+        """How the other knobs move with knob i so that the objective rises least, to second order; 1 for i itself."""
+        direction = np.zeros(len(self.x))
+        direction[i] = 1.0
+        at = np.flatnonzero(self.free == i)
+        if at.size and self.free.size > 1 and np.isfinite(self.inverse).all():
+            direction[self.free] = self.inverse[at[0]] / self.inverse[at[0], at[0]]
+        return direction
+
+    def sweep(self, i: int) -> tuple[Array, Array]:
+        """Points along the ridge of knob i over its range, denser within a decade of the best, with their values."""
+        low, high = self.knobs.low[i], self.knobs.high[i]
+        axis = np.linspace(low, high, 32)
+        if np.isfinite(self.x[i]):
+            axis = np.union1d(axis, np.clip(self.x[i] + np.linspace(-1.0, 1.0, 32), low, high))
+        points = self._along(i, axis)
+        return points, self.f(points)
+
+    def _along(self, i: int, axis: Array) -> Array:
+        points = np.repeat(self.x[None], len(axis), axis=0)
+        if np.isfinite(self.x[i]):
+            points += (axis - self.x[i])[:, None] * self.ridge(i)
+        points[:, i] = axis
+        return points
+
+    def profile(self, i: int, level: float) -> tuple[float, float]:
+        """Ends of the interval of knob i: where the objective has risen by half the chi-square quantile.
+
+        -inf or inf where it has not before the end of the range.
+        """
+        rise = 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
+        start = self.x[i] if np.isfinite(self.x[i]) else self.knobs.low[i]
+        ends = [self._crossing(i, start, end, rise) for end in (self.knobs.low[i], self.knobs.high[i])]
+        return (-np.inf if not np.isfinite(self.x[i]) else ends[0]), ends[1]
+
+    def _crossing(self, i: int, start: float, end: float, rise: float) -> float:
+        """Where the root of the rise, which is nearly linear, passes 1 between start and end."""
+        nowhere = (
+            np.copysign(np.inf, end - start) if end != start else (-np.inf if end == self.knobs.low[i] else np.inf)
+        )
+        axis = start + np.linspace(0.0, 1.0, 32) ** 2 * (end - start)
+        crossing = nowhere
+        for _ in range(2):
+            root = np.sqrt(np.maximum(self.f(self._along(i, axis)) - self.best, 0.0) / rise)
+            above = np.flatnonzero(root > 1.0)
+            if not above.size:
+                return float(nowhere)
+            at = max(int(above[0]), 1)
+            share = (1.0 - root[at - 1]) / (root[at] - root[at - 1]) if np.isfinite(root[at]) else 0.5
+            crossing = axis[at - 1] + share * (axis[at] - axis[at - 1])
+            axis = np.linspace(axis[at - 1], axis[at], 32)
+        return float(crossing)

@@ -1,0 +1,292 @@
+"""First passage: when will a parameter, or the output, cross a limit?
+
+A parameter that walks at random is at T known as N(m, P), and its variance grows by q a sample. With c the distance of
+m from the limit and V = h q, reflection gives the probability that it has crossed by sample T + h,
+
+    F(h) = Phi(-B) + 2 T(B, sqrt(V / P)),   B = c / sqrt(P + V),   T: Owen's function
+
+which is Phi(-c / sqrt(P)), that it is beyond already, at h = 0, and 2 Phi(-c / sqrt(V)) where P = 0. It is exact for a
+path that moves between samples too (a path that is looked at once a sample crosses a little later: as if the limit were
+0.58 sqrt(q) farther away). q is what the tracker itself adds in one nominal sample after the end, so a drift that is
+estimated (`AdaptiveKalman`) is taken as it stands then, and a tracker without drift can only be beyond already.
+
+Where it is the slope that walks, ``FLS(differences=2)``, and for the output, paths are drawn from the covariance of the
+state at T and run on: theta walks, noise is drawn, and each output is fed back among the lags. F then is the share of
+paths that have crossed, with a standard error of at most 0.5 / sqrt(DRAWS). The output is as it would be measured, with
+its noise; for the level behind it give the parameter.
+
+F grows for ever more slowly, so a limit may well not be crossed within the horizon: ``probability`` is F there, and
+quantiles beyond it are infinite. Parameters of a `Bank` jump, which is no random walk: refused.
+
+Source: Karatzas and Shreve, Brownian Motion and Stochastic Calculus (1991), section 2.8 (reflection); Owen (1956).
+Cost: O(horizon), times DRAWS where paths are drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import types
+from scipy import special
+
+from driftfit.data import storage
+from driftfit.data.clock import Clock
+from driftfit.data.labels import inputs_for
+from driftfit.data.record import time_text
+from driftfit.engine.drivers import INPUTS, drivers, tile_type
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import near, whole
+from driftfit.use.forecast import final_state
+from driftfit.use.simulate import noise_at
+
+if TYPE_CHECKING:
+    import polars
+
+    from driftfit.run.result import Track
+
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """When something crosses a limit, counted in nominal samples after the end of the record.
+
+    Attributes
+    ----------
+    name, limit, side
+        What crosses which limit; it is "below" or "above" then.
+    probability : float
+        That it crosses within ``horizon`` samples.
+    median, low, high : float
+        Median of the time of the crossing, and the interval that holds it with probability ``level``: the first sample
+        by which its distribution reaches 1/2, (1 - level) / 2, (1 + level) / 2. 0 is at the end of the record
+        already, inf beyond the horizon.
+    by : (horizon + 1,)
+        Probability that it has crossed by the end of the record, by the sample after it, and so on.
+    times : (horizon,) or None
+        When those samples are, where the record has times that are more than labels.
+    """
+
+    name: str
+    limit: float
+    side: str
+    level: float
+    horizon: int
+    by: Array
+    times: Array | None
+    zone: str | None = None
+
+    @property
+    def probability(self) -> float:
+        return float(self.by[-1])
+
+    @property
+    def median(self) -> float:
+        return self.quantile(0.5)
+
+    @property
+    def low(self) -> float:
+        return self.quantile(0.5 - self.level / 2.0)
+
+    @property
+    def high(self) -> float:
+        return self.quantile(0.5 + self.level / 2.0)
+
+    def quantile(self, p: float) -> float:
+        """The first sample by which the probability of having crossed reaches p; inf beyond the horizon."""
+        reached = np.flatnonzero(self.by >= p)
+        return float(reached[0]) if len(reached) else float("inf")
+
+    def time(self, samples: float) -> Any:
+        """The time that many samples after the end; None at the end, beyond the horizon, and without times."""
+        within = self.times is not None and 1.0 <= samples <= self.horizon
+        return self.times[int(samples) - 1] if within and self.times is not None else None
+
+    def __str__(self) -> str:
+        def shown(samples: float) -> str:
+            time = self.time(samples)
+            text = f"{samples:g}" if np.isfinite(samples) else "later"
+            return text if time is None else f"{text} ({time_text(time, self.zone)})"
+
+        when = f"median {shown(self.median)}, {100 * self.level:g} % from {shown(self.low)} to {shown(self.high)}"
+        what = f"{self.name} {self.side} {self.limit:g} within {self.horizon} samples"
+        return f"{what}: probability {self.probability:.2f}; {when}"
+
+
+def crossing(
+    run: Track, what: str, *, below: float | None = None, above: float | None = None, horizon: int | None = None,
+    u: Any = None, level: float = 0.9,
+) -> Crossing:  # fmt: skip
+    """When a parameter, or the output, crosses a limit after the end of a record.
+
+    Parameters
+    ----------
+    run : Track
+        The record; of a tracker with a covariance.
+    what : str
+        Name of a parameter, or of the output ("y", or its column) for models that can be run forward.
+    below, above : number
+        The limit; one of the two.
+    horizon : int or None
+        How many nominal samples to look ahead. None: as many as the record has, or as ``u`` has.
+    u : (horizon,), (horizon, m) or None
+        Future inputs, for the output.
+    level : number in (0, 1)
+        Of the interval.
+
+    Raises
+    ------
+    ValueError
+        An unknown name, not exactly one limit, a tracker without a covariance, a `Bank`, a parameter of which nothing
+        is known yet, missing inputs.
+    """
+    limit, side = _limit(below, above)
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"crossing: level must be between 0 and 1, such as 0.9; got {level!r}.")
+    if not run.tracker.covariance or run.tracker.weighs:
+        why = "jumps between hypotheses, which is no random walk" if run.tracker.weighs else "carries no covariance"
+        raise ValueError(f"crossing: {type(run.tracker).__name__} {why}; track with Kalman, AdaptiveKalman or FLS.")
+    sign = -1.0 if side == "below" else 1.0
+    if what in run.names:
+        h = len(run) if horizon is None else whole("crossing", "horizon", horizon, 1)
+        place = run.names.index(what)
+        lane = {name: values[0, ..., 0] for name, values in _fields(final_state(run)).items()}
+        drawn = "slope" in lane
+        by = (_along_slopes if drawn else _reflected)(run, lane, place, sign, limit, h)
+    elif what in ("y", run.labels.y):
+        h = len(u) if horizon is None and u is not None else len(run) if horizon is None else horizon
+        by = _of_output(run, sign, limit, whole("crossing", "horizon", h, 1), u)
+    else:
+        raise ValueError(f"crossing: there is no {what!r}; {near(str(what), (*run.names, run.labels.y))}")
+    times = None if run._time is None else Clock.of(run.labels.dt, run.labels.zone).ahead(run._time[-1], h)
+    return Crossing(what, limit, side, level, h, by, times, run.labels.zone)
+
+
+def _limit(below: float | None, above: float | None) -> tuple[float, str]:
+    if (below is None) == (above is None):
+        raise ValueError("crossing: give one limit, below= or above=.")
+    limit, side = (below, "below") if below is not None else (above, "above")
+    if limit is None or not np.isfinite(limit):
+        raise ValueError(f"crossing: {side}={limit!r} is no finite number.")
+    return float(limit), side
+
+
+def _fields(tile: Array) -> dict[str, Array]:
+    return {name: tile[name] for name in storage.fields(tile)}
+
+
+def _known(run: Track, cov: Array, place: int | None = None) -> Array:
+    """A covariance; ValueError where nothing is known yet of what it is about."""
+    if not np.isfinite(cov if place is None else cov[place, place]).all():
+        raise ValueError("crossing: nothing is known yet of a parameter that it needs: its std is infinite.")
+    return cov
+
+
+def _covariances(run: Track) -> tuple[Array, Array]:
+    """(covariance of theta at the end, what a nominal sample without an observation adds to it), (n, n) each."""
+    tile = final_state(run)
+    lane = {name: values[0, ..., 0] for name, values in _fields(tile).items()}
+    steps = drivers(run.model.steps, run.tracker.steps_for(run.model))
+    update = steps.update.entry(tile_type(tile), types.float64, INPUTS)
+    now = run.tracker.cov(lane).copy()
+    update(tile, np.nan, np.full(run.model.m, np.nan))
+    with np.errstate(invalid="ignore"):
+        return now, run.tracker.cov(lane) - now
+
+
+def _reflected(run: Track, lane: Mapping[str, Array], place: int, sign: float, limit: float, h: int) -> Array:
+    """F by reflection, (h + 1,)."""
+    P, q = (float(part[place, place]) for part in _covariances(run))
+    _known(run, np.array([[P]]))
+    V = max(q, 0.0) * np.arange(h + 1)
+    c = sign * (limit - float(lane["theta"][place]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        B, ratio = c / np.sqrt(P + V), np.sqrt(V / P)
+    B = np.where(P + V > 0.0, B, np.inf if c > 0.0 else -np.inf)
+    F = special.ndtr(-B) + 2.0 * special.owens_t(B, np.where(np.isnan(ratio), 0.0, ratio))
+    return np.asarray(np.clip(F, 0.0, 1.0))
+
+
+def _along_slopes(run: Track, lane: Mapping[str, Array], place: int, sign: float, limit: float, h: int) -> Array:
+    """F from paths of level and slope: slope += w, level += slope; (h + 1,)."""
+    n, scale = len(run.names), float(lane["scale"])
+    both = np.ix_([place, n + place], [place, n + place])
+    full = np.tril(lane["P"]) + np.tril(lane["P"], -1).T
+    cov = _known(run, full[both] * scale)
+    rng = np.random.default_rng(0)
+    mean = [float(lane["theta"][place]), float(lane["slope"][place])]
+    level, slope = rng.multivariate_normal(mean, cov, DRAWS, method="eigh").T
+    spread = np.sqrt(float(lane["q"][place]) * scale)
+    beyond = sign * (level - limit) >= 0.0
+    by = np.empty(h + 1)
+    by[0] = beyond.mean()
+    for k in range(1, h + 1):
+        slope = slope + spread * rng.normal(size=DRAWS)
+        level = level + slope
+        beyond |= sign * (level - limit) >= 0.0
+        by[k] = beyond.mean()
+    return by
+
+
+def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
+    """F from paths of the output, (h + 1,); at the end itself nothing has been measured beyond it."""
+    model = run.model
+    if u is None and model.m:
+        raise ValueError(f"crossing: the output depends on {model.m} inputs; give those to come, u= ({h}, {model.m}).")
+    if run.tracker.output_error or "slope" in storage.fields(run._tile):
+        raise ValueError("crossing: the output is run on for parameters that walk at random; ask for a parameter.")
+    p, rng = model.reach, np.random.default_rng(0)
+    r = noise_at(run, -1)
+    now, q = _covariances(run)
+    later = np.zeros((h, 0)) if u is None else inputs_for(model, u, h)
+    inputs = np.concatenate([run.u[len(run) - p :], later])
+    past = np.tile(run.y[len(run) - p :], (DRAWS, 1))
+    if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
+        raise ValueError("crossing: the last samples and the inputs to come must be known, where lags hold them.")
+    zero = np.zeros(len(now))
+    theta = run.theta[-1] + rng.multivariate_normal(zero, _known(run, now), DRAWS, method="eigh")
+    values, vectors = np.linalg.eigh(q)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    by, beyond = np.zeros(h + 1), np.zeros(DRAWS, dtype=bool)
+    for k in range(h):
+        theta = theta + rng.normal(size=theta.shape) @ root.T
+        noise = np.sqrt(r) * rng.normal(size=(DRAWS, 1))
+        y = model.play(theta, past, inputs[None, k : k + p + 1], noise, (-np.inf, np.inf))
+        past = np.concatenate([past, y], axis=1)[:, 1:]
+        beyond |= sign * (y[:, 0] - limit) >= 0.0
+        by[k + 1] = beyond.mean()
+    return by
+
+
+def crossings(
+    runs: Mapping[Hashable, Track], by: tuple[str, ...], what: str, below: Any, above: Any, horizon: int | None,
+    u: Any, level: float,
+) -> polars.DataFrame:  # fmt: skip
+    """A table of the crossings of many runs, those that come first on top; limits and u are one for all, or by key."""
+    import polars
+
+    rows: list[dict[str, Any]] = []
+    times: dict[str, list[Any]] = {}
+    for key, run in runs.items():
+        low, high = (one[key] if isinstance(one, Mapping) else one for one in (below, above))
+        future = u.get(key) if isinstance(u, Mapping) else u
+        found = crossing(run, what, below=low, above=high, horizon=horizon, u=future, level=level)
+        row = dict(zip(by, key if isinstance(key, tuple) else (key,), strict=True)) | {"probability": found.probability}
+        row |= {name: getattr(found, name) for name in ("median", "low", "high")}
+        rows.append(row)
+        if found.times is not None:
+            nothing = np.array("NaT", found.times.dtype) if found.times.dtype.kind == "M" else np.nan
+            for name in ("median", "low", "high"):
+                time = found.time(row[name])
+                times.setdefault(f"{name}_time", []).append(nothing if time is None else time)
+    table = polars.DataFrame(rows, infer_schema_length=None)
+    zone = next((run.labels.zone for run in runs.values()), None)
+    for name, values in times.items():
+        column = polars.Series(name, np.array(values))
+        if zone is not None:
+            column = column.dt.replace_time_zone("UTC").dt.convert_time_zone(zone)
+        table = table.insert_column(table.columns.index(name.removesuffix("_time")) + 1, column)
+    return table.sort(["median", "probability"], descending=[False, True])

@@ -1,0 +1,213 @@
+"""Forecasts beyond the end of a record: what theta and y will be when nobody has looked.
+
+    theta_{T+h} = theta_T,   Cov = P_T + h q                               (what `predict` does, h times)
+    y_{T+h}     = phi' theta,  Var = phi' (P_T + h q) phi + r                  without output lags
+
+An output lag that is not known yet is its own forecast, and so has an error of its own, which depends on that of theta.
+With l the lags (L,), a the entries of theta that multiply them, C_ll and C_tl the covariances of their errors,
+
+    y - y_hat   = phi' dtheta + a' dl + da' dl + v
+    Var         = phi' P phi + r + 2 phi' C_tl a + a' C_ll a + tr(P_aa C_ll) + tr(C_al C_al)
+
+for normal errors: the last two terms are the product da' dl, which matters while parameters are uncertain. C_ll and
+C_tl follow from the same line, sample by sample; the drift of theta enters when it happens. Cost O(h (n + L)^2). While
+an unstable system is still likely, the outputs have tails that no variance describes; the bands then are those of the
+middle. With several outputs the noises of the outputs are taken to be independent. A
+Hammerstein-Wiener model is fitted to w = F(y): its errors are those of w; to phi' P phi + r is added r sum_{0<j<h}
+psi_j^2, psi the response of 1 / A(z) to one noise, and everything is divided by the slope F'(y_hat).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from driftfit.data import storage
+from driftfit.data.labels import inputs_for
+from driftfit.data.signals import as_numbers
+from driftfit.engine.drivers import INPUTS, drivers, make_tile, tile_type
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+
+if TYPE_CHECKING:
+    from driftfit.models.base import Model
+    from driftfit.run.live.outputs import LiveOutputs
+    from driftfit.run.outputs import Outputs
+    from driftfit.run.result import Track
+    from driftfit.run.shared_outputs import Shared
+    from driftfit.trackers.base import Tracker
+
+
+STANDING = ("interval", "noise", "drift", "each")
+"""Fields that hold what is known of one sample."""
+
+
+class Forecast(NamedTuple):
+    """The h samples after a record."""
+
+    theta: Array
+    """(h, n)"""
+    std: Array
+    """(h, n): its standard deviation."""
+    y_hat: Array
+    """(h,): NaN where an input is not known."""
+    y_std: Array
+    """(h,): standard deviation of the error of y_hat; NaN for trackers without a covariance."""
+
+
+def forecast(run: Track, h: int, u: Any = None) -> Forecast:
+    """Forecast h nominal samples.
+
+    Parameters
+    ----------
+    run : Track
+        The record.
+    h : int
+        How many samples, at least 1.
+    u : (h,), (h, m) or None
+        Future inputs; None: not known, which leaves the forecast of theta.
+
+    Raises
+    ------
+    ValueError
+        If h is below 1, or u has not h rows and the model's number of inputs.
+    """
+    return forecast_from(run.model, run.tracker, final_state(run), future(run.model, h, u))
+
+
+def future(model: Model, h: int, u: Any) -> Array:
+    """Future inputs (h, m), NaN where they are not known."""
+    whole("forecast", "h", h, 1)
+    inputs = np.full((h, model.m), np.nan) if u is None else inputs_for(model, u, h)
+    if inputs.shape[1] != model.m:
+        raise ValueError(f"forecast: the model has {model.m} inputs, but u has {inputs.shape[1]} columns.")
+    return inputs
+
+
+def forecast_from(model: Model, tracker: Tracker, tile: Array, inputs: Array) -> Forecast:
+    """Forecast from the state in a tile of one lane, which is driven on."""
+    look, h, now = tile.copy(), len(inputs), tile["theta"][0, :, 0].copy()
+    lane = {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
+    lagged = LagErrors.of(model, len(now)) if tracker.covariance else None
+    steps = drivers(model.steps, tracker.steps_for(model))
+    update = steps.update.entry(tile_type(tile), types.float64, INPUTS)
+    noise = tile["r"][0, 0] * tile["scale"][0, 0] if "r" in storage.fields(tile) else np.nan
+    result = Forecast(np.empty((h, len(now))), np.empty((h, len(now))), np.empty(h), np.empty(h))
+    for k in range(h):
+        look[...] = tile
+        y_hat, _, s, _ = update(look, np.nan, inputs[k])
+        # the forecast takes the place of the output among the lags, and is no observation
+        tile["noise"] = np.inf
+        update(tile, y_hat, inputs[k])
+        tile["noise"] = 1.0
+        result.theta[k], result.std[k] = tile["theta"][0, :, 0], np.sqrt(tile["var"][0, :, 0])
+        result.y_hat[k], result.y_std[k] = y_hat, s
+        if lagged is not None:
+            P = tracker.cov(lane)[None]
+            result.y_std[k] = lagged.step(lane["phi"], lane["theta"][None], P, np.array([s]))[0]
+    if lagged is not None or tracker.output_error:  # (an output error is never fed back)
+        return result._replace(y_std=np.sqrt(result.y_std))
+    response = model.noise_response(now, h)
+    later = noise * model.noise_factor(now, result.y_hat[0]) * (np.cumsum(response**2) - response[0] ** 2)
+    return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
+
+
+def forecast_outputs(run: Outputs | Shared, h: int, u: Any = None) -> Forecast:
+    """Forecast h nominal samples of several outputs: theta and std (h, ny, n) or (h, n), y_hat and y_std (h, ny)."""
+    from driftfit.run.live.outputs import LiveOutputs
+
+    end: Any = run.end()
+    model: Any = run.model
+    tracker = end.tracker[0] if model.shared else dict(zip(run.outputs, end.tracker, strict=True))
+    if model.shared:
+        model = replace(model, regressors=run.rows.model.m)
+    return drive_on(LiveOutputs(model, tracker, warm_start=run), h, u)
+
+
+def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
+    """Forecast from where a stream of several outputs stands, which is driven on."""
+    whole("forecast", "h", h, 1)
+    inputs = [None] * h if u is None else list(as_numbers("u", u))
+    if len(inputs) != h:
+        raise ValueError(f"forecast: u must have a row for each of the {h} samples; got shape {np.shape(u)}.")
+    model: Any = live.model
+    if live.awaits:
+        live.apply(inputs[0])
+        inputs = [*inputs[1:], None]
+    parts: list[tuple[Array, ...]] = []
+    lagged = None if model.shared or not live.trackers[0].covariance else LagErrors.of(model, model.n)
+    for row in inputs:
+        y_hat, s = live.predict(row)
+        live.pass_by(y_hat, row)  # the forecast takes the place of the outputs among the lags
+        s = s if lagged is None else lagged.step(live.regressors, live.theta, live.cov, s)
+        parts.append((live.theta, live.std, y_hat, s))
+    theta, std, means, variances = (np.array(part) for part in zip(*parts, strict=True))
+    return Forecast(theta, std, means, np.sqrt(variances))
+
+
+class LagErrors:
+    """Covariances of the errors of ny outputs that are forecast, where they are lags of each other; see the module."""
+
+    def __init__(self, ny: int, na: int, n: int) -> None:
+        self._shape = ny, na
+        self._ll = np.zeros((ny * na, ny * na))
+        self._tl = np.zeros((ny, n, ny * na))
+
+    @classmethod
+    def of(cls, model: Model, n: int) -> LagErrors | None:
+        """For a model whose regressors begin with past outputs; None for others."""
+        na = getattr(model, "output_lags", None)
+        return None if na is None else cls(len(model.outputs), na, n)
+
+    def step(self, phi: Array, theta: Array, P: Array, s: Array) -> Array:
+        """Variances (ny,) of the outputs of the next sample, for phi (n,), theta (ny, n), P (ny, n, n).
+
+        ``s`` (ny,) is the variance for lags that are known.
+        """
+        L = len(self._ll)
+        if not np.isfinite(P).all():
+            begun = np.isinf(self._ll).any()
+            self._ll[:] = np.inf
+            return np.full(len(s), np.inf) if begun else s
+        a, tl, al = theta[:, :L], self._tl, self._tl[:, :L]
+        first = np.einsum("i,oij,pj->op", phi, tl, a)
+        both = first + first.T + a @ self._ll @ a.T + np.einsum("oij,pji->op", al, al)
+        both[np.diag_indices(len(s))] += s + np.einsum("oij,ji->o", P[:, :L, :L], self._ll)
+        with_theta = np.einsum("pij,oj->opi", tl, a)  # (output, theta of output, n)
+        for o in range(len(s)):
+            with_theta[o, o] += P[o] @ phi
+        with_lags = np.einsum("i,oij->oj", phi, tl) + a @ self._ll
+        self._shift(both, with_theta, with_lags)
+        return np.diag(both).copy()
+
+    def _shift(self, both: Array, with_theta: Array, with_lags: Array) -> None:
+        """The new outputs become the first lags, and the last lags are forgotten."""
+        ny, na = self._shape
+        if not na:
+            return
+        old = np.arange(ny * na).reshape(ny, na)
+        kept, place, new = old[:, :-1].ravel(), old[:, 1:].ravel(), old[:, 0]
+        ll, tl = np.zeros_like(self._ll), np.zeros_like(self._tl)
+        ll[np.ix_(place, place)] = self._ll[np.ix_(kept, kept)]
+        ll[np.ix_(new, new)], ll[np.ix_(new, place)] = both, with_lags[:, kept]
+        ll[np.ix_(place, new)] = with_lags[:, kept].T
+        tl[:, :, place] = self._tl[:, :, kept]
+        tl[:, :, new] = np.moveaxis(with_theta, 0, 2)
+        self._ll, self._tl = ll, tl
+
+
+def final_state(run: Track) -> Array:
+    """The state after the last sample, as a tile of one lane."""
+    return resting(run.model, run.tracker, run._tile, run._lane)
+
+
+def resting(model: Model, tracker: Tracker, from_tile: Array, lane: int = 0) -> Array:
+    """The state of a lane as a tile of one lane; what was known of its last sample alone is left behind."""
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
+    for name in storage.fields(tile):
+        if name not in STANDING:
+            tile[name][0, ..., 0] = from_tile[name][0, ..., lane]
+    return tile

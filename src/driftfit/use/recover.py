@@ -1,0 +1,244 @@
+"""Recover: what a path of coefficients says about the system behind it.
+
+    static_curve        y = sum a_i y_{k-i} + sum b_j f(u_{k-j})     g_j(k) = theta_j(k) u_{k-j} = b_j f(u_{k-j})
+    rational_constants  y = phi' a / g                               a from theta(k) = a / g_k, g given
+    switching_times     constants between switches                   the largest |theta(k) - theta(k-1)|
+    exp_autoregression  y = sum (a_i + b_i e^{-r y_{k-d}^2}) y_{k-i}  a, b by least squares for every r, then r
+
+Use the first three on a smoothed path (`run.smooth()`). Where the coefficients depend on a variable, smooth along it:
+``run.smooth(order_by=u)`` follows a static curve several times more closely than smoothing in time. The product b_j f
+is all that can be known of a curve, and where f(0) is not 0 not even that: then beta = f / u is unbounded at u = 0.
+
+The constants of an exponential autoregression are fitted to y, never to the path, which is too far from it: smoothing
+bias and noise end in r. Cost: one or a few least-squares fits.
+
+Source: the model classes of Chen et al., "augmented flexible least squares for time-varying parameter systems", section
+2; variable projection of Golub and Pereyra (1973). Departures: the lag of the exponent is explicit; what cannot be
+identified is not returned.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from itertools import pairwise
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from driftfit.data.signals import as_output
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.smooth.smoothed import Smoothed
+
+COLLINEAR = 0.8
+"""Correlation of two regressors above which a path splits their effect badly."""
+RATES = (1e-3, 1e3)
+"""Range of r in units of 1 / mean(y^2): below, the exponential is a constant and a parabola; above, it is a spike."""
+OFFSET = 5.0
+"""Standard errors from 0 at which a curve is said not to pass through the origin."""
+
+
+class StaticCurve(NamedTuple):
+    """A recovered curve: inputs (N,) in ascending order, b f(input) (N,) and its standard deviation (N,)."""
+
+    input: Array
+    value: Array
+    std: Array
+
+
+def static_curve(path: Smoothed, regressor: int | str) -> StaticCurve:
+    """b f(u) from the coefficient of one regressor that is a lag of an input, by its number or name.
+
+    Warns where the path cannot follow the curve: neighbouring samples with very different inputs, or residuals that are
+    not centred near u = 0, as when f(0) is not 0.
+    """
+    i = _column(path, regressor)
+    used = np.flatnonzero(path.walk.weight > 0.0)
+    u, value = path.walk.phi[used, i], path.theta[used, i] * path.walk.phi[used, i]
+    if path.order_by is None and _roughness(u) > 0.5:
+        warnings.warn(
+            f"static_curve: {path.names[i]!r} jumps from sample to sample, and its coefficient with it; smooth along "
+            "the input: run.smooth(order_by=u).",
+            stacklevel=2,
+        )
+    _warn_if_offset(u, value + path.loo[used])
+    order = np.argsort(u, kind="stable")
+    return StaticCurve(u[order], value[order], (path.std[used, i] * np.abs(u))[order])
+
+
+def _column(path: Smoothed, regressor: int | str) -> int:
+    if isinstance(regressor, str) and regressor not in path.names:
+        raise ValueError(f"there is no regressor {regressor!r}; the model has {', '.join(path.names)}.")
+    return path.names.index(regressor) if isinstance(regressor, str) else int(regressor)
+
+
+def _roughness(u: Array) -> float:
+    """Mean square step between neighbours over that between strangers: 1 for white noise, near 0 for a slow signal."""
+    spread = 2.0 * np.var(u)
+    return float(np.mean(np.diff(u) ** 2) / spread) if spread > 0.0 and len(u) > 1 else 0.0
+
+
+def _warn_if_offset(u: Array, partial: Array) -> None:
+    """Fit c0 + c1 u + c2 u^2 to what is left for the curve at the third of the samples nearest to u = 0; c0 is f(0)."""
+    near = np.argsort(np.abs(u))[: len(u) // 3]
+    near = near[np.isfinite(partial[near])]
+    X = u[near, None] ** np.arange(3)
+    if len(near) < 10 or np.linalg.matrix_rank(X) < 3:
+        return
+    c = np.linalg.lstsq(X, partial[near], rcond=None)[0]
+    variance = np.sum((partial[near] - X @ c) ** 2) / (len(near) - 3) * np.linalg.inv(X.T @ X)[0, 0]
+    if c[0] ** 2 > OFFSET**2 * variance:
+        warnings.warn(
+            f"static_curve: near u = 0 the curve seems to pass {c[0]:.2g} instead of 0, and f / u is unbounded there; "
+            "add an intercept to the model.",
+            stacklevel=3,
+        )
+
+
+class RationalConstants(NamedTuple):
+    """Constants of a rational model, (n,) each: from the path, and by least squares of y on phi / g.
+
+    ``correlation`` is the largest between two regressors (about zero): near 1 the split between their coefficients in
+    the path is weakly determined, and the second estimate is the one to use.
+    """
+
+    from_path: Array
+    least_squares: Array
+    correlation: float
+
+
+def rational_constants(path: Smoothed, g: Callable[[Array], Any]) -> RationalConstants:
+    """a in y = phi' a / g + v, with g a known function of the regressors phi (T, n), giving (T,).
+
+    g is asked as a function of phi, which holds the past only: a denominator that contains y_k itself is correlated
+    with the noise, and no least squares of this kind is consistent then. ValueError if phi or g holds y_k.
+    """
+    if not callable(g):
+        raise ValueError(
+            "rational_constants: g must be a function of the regressors phi (T, n), such as lambda phi: 1 + "
+            "phi[:, 1]**2; an array could hold the present output, for which the estimate is inconsistent."
+        )
+    used = (path.walk.weight > 0.0) & np.any(path.walk.phi != 0.0, axis=1)
+    phi, y, theta = path.walk.phi[used], path.walk.y[used], path.theta[used]
+    if any(np.array_equal(column, y) for column in phi.T):
+        raise ValueError("rational_constants: a regressor is the present output; the estimate would be inconsistent.")
+    shape = 1.0 / np.broadcast_to(np.asarray(g(phi), float), y.shape)
+    fitted = np.linalg.lstsq(phi * shape[:, None], y, rcond=None)[0]
+    unit = phi / np.sqrt(np.sum(phi**2, axis=0))
+    correlation = np.abs(unit.T @ unit - np.eye(phi.shape[1])).max()
+    if correlation > COLLINEAR:
+        warnings.warn(
+            f"rational_constants: two regressors have a correlation of {correlation:.3f}; the path determines "
+            "the split between their coefficients weakly. Use least_squares.",
+            stacklevel=2,
+        )
+    return RationalConstants(shape @ theta / (shape @ shape), fitted, float(correlation))
+
+
+def switching_times(path: Smoothed, count: int = 1, apart: int = 10) -> Array:
+    """First samples of new modes, (count,) ascending: where theta steps furthest, at least ``apart`` samples apart.
+
+    Steps of a parameter count by what they do to the output, |step| times the rms of its regressor. Fewer come back
+    where the record is too short. Smooth with a tuned tracker: a mu that is too small hides switches in noise.
+    """
+    whole("switching_times", "count", count, 1)
+    whole("switching_times", "apart", apart, 1)
+    used = path.walk.weight > 0.0
+    power = np.sqrt(np.mean(path.walk.phi[used] ** 2, axis=0))
+    steps = np.sqrt(np.sum((np.diff(path.theta, axis=0) * power) ** 2, axis=1))
+    found: list[int] = []
+    for _ in range(count):
+        if not len(steps) or not steps.max() > 0.0:
+            break
+        at = int(np.argmax(steps))
+        found.append(at + 1)
+        steps[max(0, at - apart + 1) : at + apart] = -1.0
+    return np.sort(np.array(found, dtype=int))
+
+
+class ExpAutoregression(NamedTuple):
+    """Constants of an exponential autoregression: a, b (n,), r with its profile interval, noise variance."""
+
+    a: Array
+    b: Array
+    r: float
+    interval: tuple[float, float]
+    noise: float
+
+    def theta(self, y: Any, delay: int = 1) -> Array:
+        """Coefficients a_i + b_i e^{-r y_{k-d}^2} along a record, (T, n)."""
+        past = _lagged(as_output(y), delay)
+        theta: Array = self.a + self.b * np.exp(-self.r * past[:, None] ** 2)
+        return theta
+
+
+def exp_autoregression(y: Any, n: int, delay: int = 1, level: float = 0.95) -> ExpAutoregression:
+    """Fit y_k = sum_{i=1..n} (a_i + b_i e^{-r y_{k-delay}^2}) y_{k-i} + v_k to a record (T,) by variable projection.
+
+    The minimum over r is flat, so the interval of r (at ``level``, from the profile of the likelihood) matters more
+    than r; an open end is 0 or inf, with a warning. Samples whose lags are missing are not used. ValueError where fewer
+    samples than 2 n + 2 are left.
+    """
+    lags, square, output = _exp_regressors(as_output(y), whole("exp_autoregression", "n", n, 1), delay)
+    project = _projection(lags, square, output)
+    low, high = (float(np.log(rate / np.mean(square))) for rate in RATES)
+    grid = np.linspace(low, high, 81)
+    at = int(np.argmin([project(x)[0] for x in grid]))
+    bracket = (grid[max(at - 1, 0)], grid[min(at + 1, 80)])
+    best = float(optimize.minimize_scalar(lambda x: project(x)[0], bounds=bracket, method="bounded").x)
+    cost, constants = project(best)
+    limit = cost * float(np.exp(NormalDist().inv_cdf(0.5 + level / 2.0) ** 2 / len(output)))
+    ends = _profile_end(project, best, low, limit, -np.inf), _profile_end(project, best, high, limit, np.inf)
+    if not np.isfinite(ends).all():
+        warnings.warn(
+            "exp_autoregression: the record does not bound r on both sides; a and b are only known together with it.",
+            stacklevel=2,
+        )
+    interval = (float(np.exp(ends[0])), float(np.exp(ends[1])))
+    noise = cost / (len(output) - 2 * n - 1)
+    return ExpAutoregression(constants[:n], constants[n:], float(np.exp(best)), interval, noise)
+
+
+def _exp_regressors(y: Array, n: int, delay: int) -> tuple[Array, Array, Array]:
+    """Lags (N, n), squares in the exponent (N,) and outputs (N,) of the samples that have them all."""
+    whole("exp_autoregression", "delay", delay, 1)
+    lags = np.stack([_lagged(y, i) for i in range(1, n + 1)], axis=1)
+    square = _lagged(y, delay) ** 2
+    used = np.isfinite(y) & np.isfinite(lags).all(axis=1) & np.isfinite(square)
+    if used.sum() < 2 * n + 2 or not np.any(square[used] > 0.0):
+        raise ValueError(
+            f"exp_autoregression: {2 * n + 1} constants need at least {2 * n + 2} usable samples that are not all "
+            f"zero; there are {used.sum()}."
+        )
+    return lags[used], square[used], y[used]
+
+
+def _lagged(y: Array, lag: int) -> Array:
+    """y moved back by ``lag`` samples; NaN where nothing is known."""
+    moved = np.full(len(y), np.nan)
+    moved[lag:] = y[: len(y) - lag]
+    return moved
+
+
+def _projection(lags: Array, square: Array, y: Array) -> Callable[[float], tuple[float, Array]]:
+    """log r -> (sum of squares, constants): least squares in a and b for that r."""
+
+    def project(x: float) -> tuple[float, Array]:
+        X = np.concatenate([lags, lags * np.exp(-np.exp(x) * square)[:, None]], axis=1)
+        constants = np.linalg.lstsq(X, y, rcond=None)[0]
+        return float(np.sum((y - X @ constants) ** 2)), constants
+
+    return project
+
+
+def _profile_end(
+    project: Callable[[float], tuple[float, Array]], x: float, end: float, limit: float, nowhere: float
+) -> float:
+    """Where the cost first reaches a limit between x and an end of the range; ``nowhere`` if it does not."""
+    for inner, outer in pairwise(np.linspace(x, end, 81)):
+        if project(outer)[0] > limit:
+            return float(optimize.brentq(lambda value: project(value)[0] - limit, inner, outer))
+    return nowhere

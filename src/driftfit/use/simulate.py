@@ -1,0 +1,230 @@
+"""Predictions over a record k samples ahead, and free simulation, with bands, given the inputs.
+
+The output lags that are not known yet are the predictions themselves, so that theta acts through them too:
+
+    y_j  = phi_j' theta                                phi_j holds y_(j-1), .. of this recursion and the inputs
+    S_j  = phi_j + sum_i a_i S_(j-i)                    = d y_j / d theta
+    Var  = S_j' (P + j q) S_j + r sum_(i<j) psi_i^2     psi = response of 1 / A to one noise
+
+`ahead` starts from the outputs up to t at every t, with theta_t and P_t as they were then: nothing looks ahead but the
+inputs. `simulate` sees no output at all. q is the drift that the tracker assumes per sample where it says so, else 0;
+r is what makes the first step the variance that the run reported. First-order in the parameter errors.
+Cost: O(T k n^2) for `ahead`, O(h n^2) for `simulate`.
+
+That is for ARX and Regression. Other models that say how they run forward (`Model.play`), as Hammerstein-Wiener, are
+drawn from (`driftfit.use.draws`).
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from driftfit.data.labels import inputs_for
+from driftfit.engine.drivers import LARGEST
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.models.arx import ARX, GAP
+from driftfit.models.base import Model
+from driftfit.models.regression import Regression
+from driftfit.use.system import covariances, taken
+
+if TYPE_CHECKING:
+    from driftfit.run.result import Track
+
+
+class Prediction(NamedTuple):
+    """Outputs with what is known of their errors; NaN where inputs or lags are missing."""
+
+    y_hat: Array
+    """(T,): at the sample that is predicted."""
+    theta_std: Array
+    """(T,): standard deviation from the parameters alone, the band of the mean."""
+    y_std: Array
+    """(T,): with the noise, the band of the output."""
+    paths: Array | None = None
+    """(D, T): outputs that were drawn, for models whose predictions bend in their parameters."""
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high) of the output, (T,) each: normal, or quantiles of the drawn outputs."""
+        if self.paths is not None:
+            known = np.isfinite(self.paths).all(axis=0)
+            ends = np.quantile(np.where(known, self.paths, 0.0), [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
+            low, high = np.where(known, ends, np.nan)
+            return low, high
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
+        return self.y_hat - half, self.y_hat + half
+
+
+def ahead(run: Track, k: int) -> Prediction:
+    """Predict every sample from k samples before it, the inputs being given; the first k samples are NaN.
+
+    Raises
+    ------
+    ValueError
+        If k is below 1, the model cannot be run forward, or theta moves along a slope.
+    """
+    whole("ahead", "k", k, 1)
+    if getattr(run.tracker, "differences", 1) > 1:
+        raise ValueError(
+            "ahead: predictions over a record hold theta, which moves along its slope here; run.forecast follows it."
+        )
+    if not isinstance(run.model, ARX | Regression):
+        from driftfit.use.draws import ahead_by_draws
+
+        return ahead_by_draws(run, k)
+    na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
+    T, theta, cov = len(run), run.theta, covariances(run)
+    y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
+    a = theta[:, :na]
+    lags = [moved(y, i) for i in range(na)]
+    slopes = [np.zeros_like(theta) for _ in range(na)]
+    psi, energy, r = [np.ones(T)], np.zeros(T), np.full(T, np.nan)
+    for j in range(1, k + 1):
+        phi = np.column_stack([*lags, moved(U, -j)])
+        y_hat = np.einsum("ti,ti->t", phi, theta)
+        S = phi + sum((a[:, i, None] * slopes[i] for i in range(na)), np.zeros_like(theta))
+        q = drift(run, r)
+        of_theta = np.einsum("ti,tij,tj->t", S, cov, S) + j * np.einsum("ti,tij,tj->t", S, q, S)
+        if j == 1:
+            r = _filled(np.maximum(moved(_known(run.innovation_std) ** 2, -1) - of_theta, 0.0))
+        energy = energy + psi[-1] ** 2
+        psi.append(sum((a[:, i] * psi[-1 - i] for i in range(min(na, len(psi)))), np.zeros(T)))
+        lags, slopes = [y_hat, *lags][:na], [S, *slopes][:na]
+    whole_time = unbroken(run, na, k)
+    with np.errstate(invalid="ignore"):
+        found = (y_hat, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
+    return Prediction(*(np.where(whole_time, moved(part, k), np.nan) for part in found))
+
+
+def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
+    """Free simulation of the model of one sample: the outputs that inputs u (h,) or (h, m) would cause.
+
+    Parameters
+    ----------
+    run : Track
+        Of a model that can be run forward: ARX, Regression, HammersteinWiener, or your own with `play`.
+    u : (h,), (h, m), or None without inputs
+        Inputs. Before them the system is at rest: inputs and outputs are zero.
+    at : int
+        The sample whose parameters, covariance and noise are taken.
+    y : (h0,) or None
+        The outputs of the first samples, when the system is not at rest; they are returned as they are.
+
+    Raises
+    ------
+    ValueError
+        If u does not fit the model, or the model cannot be run forward.
+    """
+    h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
+    inputs = inputs_for(run.model, u, h)
+    if inputs.shape[1] != run.model.m:
+        raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
+    given = np.zeros(0) if y is None else np.asarray(y, float)
+    if not isinstance(run.model, ARX | Regression):
+        from driftfit.use.draws import simulate_by_draws
+
+        return simulate_by_draws(run, inputs, at, given)
+    na, U = input_regressors(run.model, inputs, rest=0.0)
+    (theta,), (cov,) = taken(run, at)
+    r = noise_at(run, at)
+    out, S, energy = np.zeros(h), np.zeros((h, run.model.n)), np.zeros(h)
+    psi = run.model.noise_response(theta, h)
+    for k in range(h):
+        lags = [out[k - i] if k >= i else 0.0 for i in range(1, na + 1)]
+        phi = np.concatenate([lags, U[k]])
+        S[k] = phi + sum((theta[i - 1] * S[k - i] for i in range(1, min(na, k) + 1)), np.zeros(len(theta)))
+        out[k] = phi @ theta
+        if k < len(given):
+            out[k], S[k] = given[k], 0.0
+        else:
+            energy[k] = np.sum(psi[: k - len(given) + 1] ** 2)
+    of_theta = np.einsum("ti,ij,tj->t", S, cov, S)
+    return Prediction(out, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
+
+
+def fit(y: Any, y_hat: Any) -> float:
+    """Fit in per cent, 100 (1 - |y - y_hat| / |y - mean y|) over the samples where both are known.
+
+    100 is perfect, 0 no better than the mean, and below that worse; the measure of Ljung (1999) and of MATLAB's
+    ``compare``. NaN where nothing is known or y stands still.
+    """
+    measured, predicted = np.asarray(y, float), np.asarray(y_hat, float)
+    if measured.shape != predicted.shape:
+        raise ValueError(f"fit: y has shape {measured.shape}, but y_hat has {predicted.shape}.")
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    spread = float(np.linalg.norm(measured[known] - measured[known].mean())) if known.any() else 0.0
+    error = float(np.linalg.norm(measured[known] - predicted[known]))
+    return 100.0 * (1.0 - error / spread) if spread > 0.0 else float("nan")
+
+
+def noise_at(run: Track, at: int) -> float:
+    """Noise variance at a sample: the one-step variance less what the parameters add to it; NaN without one."""
+    sample = range(len(run))[at]
+    known = np.flatnonzero(np.isfinite(run.innovation_std[: sample + 1]) & run.ok[: sample + 1])
+    if not len(known):
+        return float("nan")
+    t = int(known[-1])
+    before = run.cov(t - 1) if t > 0 else np.full((len(run.names),) * 2, np.nan)
+    _, U = input_regressors(run.model, run.u[: t + 1])
+    na = run.model.na if isinstance(run.model, ARX) else 0
+    phi = np.concatenate([[run.y[t - i] if t >= i else np.nan for i in range(1, na + 1)], U[t]])
+    q = drift(run, np.full(1, run.innovation_std[t] ** 2))[0]
+    r = run.innovation_std[t] ** 2 - phi @ (before + q) @ phi
+    return float(r) if np.isfinite(r) and r > 0.0 else float(run.innovation_std[t] ** 2)
+
+
+def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
+    """(na, the regressors (T, n - na) that inputs make); what is before the record is ``rest``."""
+    one = [np.ones((len(u), 1))] if getattr(model, "intercept", False) else []
+    if isinstance(model, Regression):
+        return 0, np.hstack([u, *one])
+    if not isinstance(model, ARX) or len(model.outputs) > 1:
+        raise ValueError(f"predictions over a record are for ARX and Regression with one output; got {model!r}.")
+    columns = [moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
+    return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
+
+
+def moved(values: Array, by: int, rest: float = np.nan) -> Array:
+    """Values (T, ..) so many samples later (earlier where negative)."""
+    out = np.full(values.shape, rest)
+    T = len(values)
+    if by >= 0:
+        out[by:] = values[: max(T - by, 0)]
+    else:
+        out[: max(T + by, 0)] = values[-by:]
+    return out
+
+
+def _known(values: Array) -> Array:
+    """Values with NaN for what is not finite."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def drift(run: Track, r: Array) -> Array:
+    """q per sample, (1, n, n) or (T, n, n); zero where theta itself does not walk at random."""
+    n = len(run.names)
+    try:
+        walk = run.tracker.random_walk(run.model)
+    except ValueError:
+        return np.zeros((1, n, n))
+    if walk.slopes:
+        return np.zeros((1, n, n))
+    scale = np.ones(1) if walk.r is not None else np.where(np.isfinite(r), r, 0.0)
+    return np.asarray(walk.q * scale[:, None, None])
+
+
+def _filled(values: Array) -> Array:
+    """NaN replaced by the last number before it."""
+    place = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
+    return np.where(place >= 0, values[place], np.nan)
+
+
+def unbroken(run: Track, na: int, k: int) -> Array:
+    """Samples whose k steps, and the lags before them, have no gap in time."""
+    gaps = np.broadcast_to(run._known[:, 0], len(run)) > GAP
+    total = np.concatenate([[0], np.cumsum(gaps)])
+    first = np.maximum(np.arange(len(run)) - k - max(na, 1) + 2, 0)
+    return np.asarray(total[1:] == total[first])

@@ -1,0 +1,272 @@
+"""The system behind an ARX run, over time: poles, gain, responses with bands, long-run effects, export to scipy.
+
+    y = sum_j B_j(z) / A(z) u_j,     A(z) = 1 - a_1 z^-1 - ..,   B_j(z) = z^-nk (b_1 + b_2 z^-1 + ..)
+
+    poles               roots of z^na A(z)                       gain of input j      B_j(1) / A(1)
+    step response       of B_j / A, h samples                    frequency response   B_j(e^iw) / A(e^iw)
+
+At every sample the parameters of that sample are taken as if they stayed: the frozen system. Standard deviations come
+from the covariance of the run by the delta method (`driftfit.use.delta_method`), those of a frequency response for the
+logarithm of the magnitude and for the phase. Units: w in radians per sample, gains in units of y over units of u.
+
+For economists: in a model of logarithms the gain is the long-run elasticity, b / (1 - a), which `long_run` gives with
+its standard error and with the interval of Fieller (1954). Where A(1) is not clearly different from zero the delta
+method fails, and Fieller's interval is unbounded, which is the truth.
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
+
+import numpy as np
+
+from driftfit.engine.drivers import drivers, output_type
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.models.arx import ARX
+from driftfit.use.delta_method import spread
+
+if TYPE_CHECKING:
+    from driftfit.models.base import Model
+    from driftfit.run.result import Track
+
+
+class Followed(Protocol):
+    """What has parameters over time: a `Track`, or the present of a stream (`driftfit.run.live.system`)."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def theta(self) -> Array: ...
+
+    model: Model
+
+    def __len__(self) -> int: ...
+    def cov(self, t: int) -> Array: ...
+
+
+class Response(NamedTuple):
+    """Something with its standard deviation; NaN where the tracker carries no covariance."""
+
+    value: Array
+    std: Array
+
+    def band(self, level: float = 0.95) -> tuple[Array, Array]:
+        """(low, high) of a normal approximation."""
+        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+        return self.value - half, self.value + half
+
+
+class FrequencyResponse(NamedTuple):
+    """Of one input: w (k,) in radians per sample; log magnitude and phase (radians), (T, k) each, with std."""
+
+    w: Array
+    magnitude: Array
+    log_magnitude_std: Array
+    phase: Array
+    phase_std: Array
+
+
+class LongRun(NamedTuple):
+    """Long-run effect of one input: b / (1 - a)."""
+
+    name: str
+    value: float
+    std: float
+    low: float
+    high: float
+
+
+def arx_of(run: Followed) -> ARX:
+    """The ARX model of a run; ValueError where it has another."""
+    if not isinstance(run.model, ARX) or len(run.model.outputs) > 1 or run.names != run.model.names:
+        raise ValueError(
+            f"poles, gains and responses belong to runs of ARX with one output; this one followed {run.model!r}."
+        )
+    return run.model
+
+
+def covariances(run: Track) -> Array:
+    """Covariance of theta after every sample, (T, n, n); NaN where it is not finite. Replays the record."""
+    n = len(run.names)
+    if not run.tracker.covariance:
+        return np.full((len(run), n, n), np.nan)
+    if "P" in (run._out.dtype.names or ()):
+        return _finite(run._written("P"))
+    tile = run._fresh_tile()
+    out = np.empty(len(run), output_type(tile, run.tracker.outputs, "cov"))
+    known = run._known[:, :, None]
+    steps = drivers(run.model.steps, run.tracker.steps_for(run.model), "cov")
+    steps.run(tile, run.y[:, None], run.u[:, :, None], known, out)
+    return _finite(out["P"][..., 0])
+
+
+def _finite(cov: Array) -> Array:
+    """Covariances (T, n, n) with all of one NaN where a parameter of it is not known yet."""
+    known = np.asarray(np.isfinite(cov).all(axis=(1, 2), keepdims=True))
+    return np.where(known, cov, np.nan)
+
+
+def taken(run: Followed, at: Any) -> tuple[Array, Array]:
+    """(theta, covariance) of samples: all of them, one, or several."""
+    theta = run.theta
+    if at is None:
+        return theta, covariances(cast("Track", run))
+    picked = np.atleast_1d(np.asarray(at))
+    if picked.dtype.kind not in "iu" or (picked < -len(run)).any() or (picked >= len(run)).any():
+        raise IndexError(f"at= must be samples within the record of {len(run)}; got {at!r}.")
+    if len(picked) == 1:
+        return theta[picked], _finite(run.cov(int(picked[0]))[None])
+    return theta[picked], covariances(cast("Track", run))[picked]
+
+
+def poles(run: Followed, at: Any = None) -> Array:
+    """Poles of the frozen systems, (T, na) complex, largest magnitude first; at= picks samples."""
+    model = arx_of(run)
+    theta = run.theta if at is None else run.theta[np.atleast_1d(at)]
+    na = model.na
+    if na == 0:
+        return np.zeros((len(theta), 0), complex)
+    companion = np.zeros((len(theta), na, na))
+    companion[:, 0] = np.where(np.isfinite(theta[:, :na]), theta[:, :na], 0.0)
+    companion[:, np.arange(1, na), np.arange(na - 1)] = 1.0
+    roots = np.linalg.eigvals(companion).astype(complex)
+    order = np.argsort(-np.abs(roots), axis=1, kind="stable")
+    return np.take_along_axis(roots, order, axis=1)
+
+
+def largest_pole(run: Followed, at: Any = None) -> Response:
+    """Magnitude of the largest pole over time, with its standard deviation; below 1 the system is stable."""
+    model = arx_of(run)
+    na = model.na
+
+    def largest(theta: Array) -> Array:
+        companion = np.zeros((len(theta), max(na, 1), max(na, 1)))
+        companion[:, 0, :na] = theta[:, :na]
+        companion[:, np.arange(1, na), np.arange(na - 1)] = 1.0
+        size: Array = np.abs(np.linalg.eigvals(companion)).max(axis=1)
+        return size
+
+    return Response(*spread(largest, *taken(run, at)))
+
+
+def dc_gain(run: Followed, at: Any = None) -> Response:
+    """Gain of every input for a signal that stands, (T, m), with its standard deviation."""
+    model = arx_of(run)
+    return Response(*spread(lambda theta: _gain(model, theta), *taken(run, at)))
+
+
+def _gain(model: ARX, theta: Array) -> Array:
+    A, B = model.polynomials(theta)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gains = np.array([b.sum(axis=-1) / A.sum(axis=-1) for b in B]).reshape(len(B), len(theta))
+    return np.moveaxis(gains, 0, -1)
+
+
+def step_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
+    """Response (T, h) to a unit step of one input at sample 0; ``at`` picks samples, None takes all (T h n numbers)."""
+    model, j = arx_of(run), input_of(run, input)
+    whole("step_response", "h", h, 1)
+    drive = np.ones(h)
+    return Response(*spread(lambda theta: _filtered(model, theta, j, drive), *taken(run, at)))
+
+
+def impulse_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
+    """Response (T, h) to a unit impulse of one input at sample 0."""
+    model, j = arx_of(run), input_of(run, input)
+    whole("impulse_response", "h", h, 1)
+    return Response(*spread(lambda theta: _filtered(model, theta, j, np.eye(1, h)[0]), *taken(run, at)))
+
+
+def _filtered(model: ARX, theta: Array, j: int, drive: Array) -> Array:
+    """B_j / A applied to one signal (h,), for every row of theta."""
+    A, B = model.polynomials(theta)
+    y = np.zeros((len(theta), len(drive)))
+    for k in range(len(drive)):
+        for i in range(min(k + 1, B[j].shape[-1])):
+            y[:, k] += B[j][:, i] * drive[k - i]
+        for i in range(1, min(k + 1, A.shape[-1])):
+            y[:, k] -= A[:, i] * y[:, k - i]
+    return y
+
+
+def frequency_response(run: Followed, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
+    """B_j / A on the unit circle at w (k,) radians per sample, 0.01 to pi by default."""
+    model, j = arx_of(run), input_of(run, input)
+    grid = np.geomspace(0.01, np.pi, 100) if w is None else np.atleast_1d(np.asarray(w, float))
+
+    def on_circle(theta: Array) -> Array:
+        A, B = model.polynomials(theta)
+        return _at(B[j], grid) / _at(A, grid)
+
+    theta, cov = taken(run, at)
+    H = on_circle(theta)
+    magnitude = np.abs(H)
+    _, log_std = spread(lambda theta: np.log(np.abs(on_circle(theta))), theta, cov)
+    _, phase_std = spread(lambda theta: np.angle(on_circle(theta) / H), theta, cov)
+    return FrequencyResponse(grid, magnitude, log_std, np.unwrap(np.angle(H), axis=-1), phase_std)
+
+
+def _at(polynomial: Array, w: Array) -> Array:
+    powers = np.exp(-1j * np.outer(np.arange(polynomial.shape[-1]), w))
+    return polynomial @ powers
+
+
+def input_of(run: Followed, input: int | str) -> int:
+    """The number of an input, by number or name."""
+    m = run.model.m
+    names = run.model.inputs if isinstance(run.model, ARX) and isinstance(run.model.inputs, tuple) else ()
+    if isinstance(input, str):
+        if input not in names:
+            raise ValueError(f"there is no input {input!r}; there is {', '.join(names) or 'none with a name'}.")
+        return names.index(input)
+    if not 0 <= input < m:
+        raise ValueError(f"the model has {m} inputs; input must be 0 .. {m - 1}, got {input!r}.")
+    return input
+
+
+def to_scipy(run: Followed, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
+    """The frozen system of a sample, from one input to y, as `scipy.signal.dlti` (a transfer function in z)."""
+    from scipy import signal
+
+    model, j = arx_of(run), input_of(run, input)
+    A, B = model.polynomials(run.theta[at])
+    length = max(len(A), len(B[j]))  # as many powers of z^-1 in both: then they are powers of z
+    num, den = (np.pad(part, (0, length - len(part))) for part in (B[j], A))
+    lead = int(np.argmax(num != 0.0)) if np.any(num) else 0  # a leading zero coefficient makes scipy warn
+    return signal.dlti(num[lead:], den, dt=dt)
+
+
+def long_run(run: Followed, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
+    """Long-run effect of every input at a sample: b / (1 - a), its standard error, and Fieller's interval at ``level``.
+
+    In a model of logarithms it is the long-run elasticity. ValueError for models other than ARX.
+    """
+    model = arx_of(run)
+    theta, cov = taken(run, at)
+    gain = Response(*spread(lambda theta: _gain(model, theta), theta, cov))
+    found, place = [], model.na
+    over = np.where(np.arange(model.n) < model.na, -1.0, 0.0)
+    for j, (nb, _) in enumerate(model.lags):
+        top = np.zeros(model.n)
+        top[place : place + nb] = 1.0
+        place += nb
+        low, high = fieller(theta[0], cov[0], top, over, 1.0, NormalDist().inv_cdf(0.5 + level / 2.0))
+        name = model.inputs[j] if isinstance(model.inputs, tuple) else f"u{j + 1}"
+        found.append(LongRun(name, float(gain.value[0, j]), float(gain.std[0, j]), low, high))
+    return tuple(found)
+
+
+def fieller(theta: Array, cov: Array, top: Array, over: Array, one: float, z: float) -> tuple[float, float]:
+    """All g for which top' theta - g (one + over' theta) is within z standard deviations of 0.
+
+    (-inf, inf) where they are unbounded, as when the denominator is not clearly different from zero.
+    """
+    a, b = float(top @ theta), one + float(over @ theta)
+    aa, ab, bb = float(top @ cov @ top), float(top @ cov @ over), float(over @ cov @ over)
+    A, B, C = b * b - z * z * bb, a * b - z * z * ab, a * a - z * z * aa
+    root = B * B - A * C
+    if not (A > 0.0 and root >= 0.0):
+        return (float("nan"),) * 2 if np.isnan(A + root) else (-np.inf, np.inf)
+    return (B - np.sqrt(root)) / A, (B + np.sqrt(root)) / A

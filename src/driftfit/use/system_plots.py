@@ -1,0 +1,195 @@
+"""Pictures of the system behind an ARX run: its responses over time, its poles in the plane, its fit on other data."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from driftfit.data.signals import as_output
+from driftfit.engine.kernel import Array
+from driftfit.show.plots import BLUE, GREY, RED, frame, named, new_figure, settled
+from driftfit.use.simulate import fit, simulate
+from driftfit.use.system import arx_of, dc_gain, frequency_response, input_of, largest_pole, poles, step_response
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from driftfit.run.result import Track
+
+TIMES = 5
+"""Samples whose responses are drawn where none are chosen."""
+
+LONGEST = 200
+"""Most samples of a step response."""
+
+
+def plot_system(
+    run: Track, input: int | str = 0, at: Any = None, h: int | None = None, level: float = 0.95, dt: float = 1.0
+) -> Figure:
+    """Step and frequency response at some samples, with bands; poles in the plane; gain over time.
+
+    Parameters
+    ----------
+    run : Track
+        Of an ARX model.
+    input : int or name
+        The input that steps.
+    at : samples
+        Where the responses are taken; five from the start's end to the last by default, dark is late.
+    h : int
+        Samples of the step response; None: until the slowest of these systems has settled, at most 200.
+    level : number
+        Of the bands, pointwise, from the covariance of the run.
+    dt : number
+        Time between samples, for the axes of the responses: frequencies are then in radians per unit of time.
+
+    Raises
+    ------
+    ValueError
+        For another model, or an input that is not there.
+    """
+    arx_of(run)
+    j = input_of(run, input)
+    first = settled(run).start
+    chosen = np.unique(np.linspace(first, len(run) - 1, TIMES).astype(int)) if at is None else np.atleast_1d(at)
+    length = _settling(run, chosen) if h is None else h
+    figure = new_figure(10.0, 7.4)
+    (step, magnitude), (plane, gain) = figure.subplots(2, 2)
+    colours = _shades(len(chosen))
+    _step(step, run, j, chosen, length, level, dt, colours)
+    _frequency(magnitude, run, j, chosen, level, dt, colours)
+    _plane(plane, run, first)
+    _gain(gain, run, j, first, level)
+    return figure
+
+
+def _settling(run: Track, at: Array) -> int:
+    """Samples until the slowest stable pole has faded to 2 per cent."""
+    sizes = np.abs(poles(run, at)[:, 0]) if arx_of(run).na else np.zeros(1)
+    slowest = float(np.max(np.where(sizes < 1.0, sizes, 0.99)))
+    lags = max(nb + nk for nb, nk in arx_of(run).lags)
+    return int(np.clip(lags + (np.log(0.02) / np.log(slowest) if slowest > 0.02 else 1.0), 10, LONGEST))
+
+
+def _shades(count: int) -> list[Any]:
+    """Light to dark blue, early to late."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    ramp = LinearSegmentedColormap.from_list("time", ["#b9d3ef", BLUE, "#0a2747"])
+    return [ramp(x) for x in (np.linspace(0.0, 1.0, count) if count > 1 else [0.6])]
+
+
+def _step(axis: Axes, run: Track, j: int, at: Array, h: int, level: float, dt: float, colours: list[Any]) -> None:
+    response = step_response(run, h, j, at)
+    low, high = response.band(level)
+    time = np.arange(h) * dt
+    for k, t in enumerate(at):
+        if np.isfinite(low[k]).all():
+            axis.fill_between(time, low[k], high[k], color=colours[k], alpha=0.2, lw=0, step="post")
+        axis.step(time, response.value[k], where="post", color=colours[k], lw=1.3, label=run.time_text(int(t)))
+    _titled(axis, f"step response to {_input_name(run, j)}")
+    axis.set_xlabel("samples" if dt == 1.0 else "time", fontsize=9)
+    axis.legend(fontsize=7, frameon=False, loc="best")
+
+
+def _frequency(axis: Axes, run: Track, j: int, at: Array, level: float, dt: float, colours: list[Any]) -> None:
+    from statistics import NormalDist
+
+    response = frequency_response(run, None, j, at)
+    half = np.exp(NormalDist().inv_cdf(0.5 + level / 2.0) * response.log_magnitude_std)
+    w = response.w / dt
+    for k, colour in enumerate(colours):
+        if np.isfinite(half[k]).all():
+            band = response.magnitude[k] / half[k], response.magnitude[k] * half[k]
+            axis.fill_between(w, *band, color=colour, alpha=0.2, lw=0)
+        axis.loglog(w, response.magnitude[k], color=colour, lw=1.3)
+    phase = axis.twinx()
+    for k, colour in enumerate(colours):
+        phase.semilogx(w, np.degrees(response.phase[k]), color=colour, lw=0.8, ls=":")
+    phase.set_ylabel("phase, degrees (dotted)", fontsize=8)
+    phase.tick_params(labelsize=8)
+    _titled(axis, f"frequency response to {_input_name(run, j)}: magnitude")
+    axis.set_xlabel("radians per sample" if dt == 1.0 else "radians per unit of time", fontsize=9)
+
+
+def _plane(axis: Axes, run: Track, first: int) -> None:
+    """Poles of every sample, light to dark, in the unit circle; outside it a system is unstable."""
+    path = poles(run)[first:]
+    axis.plot(*np.array([(np.cos(x), np.sin(x)) for x in np.linspace(0.0, 2.0 * np.pi, 200)]).T, color=GREY, lw=0.8)
+    axis.axhline(0.0, color=GREY, lw=0.4)
+    axis.axvline(0.0, color=GREY, lw=0.4)
+    step = max(1, len(path) // 400)
+    shades = _shades(len(path[::step]))
+    for column in path[::step].T:
+        axis.scatter(column.real, column.imag, c=shades, s=7, lw=0)
+    for last in path[-1] if len(path) else []:
+        axis.plot(last.real, last.imag, marker="x", color=RED, ms=6, mew=1.3, ls="")
+    reach = max(1.1, 1.1 * float(np.max(np.abs(path), initial=0.0)))
+    axis.set_xlim(-reach, reach)
+    axis.set_ylim(-reach, reach)
+    axis.set_aspect("equal")
+    if reach < 1.5:
+        axis.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+        axis.set_yticks([-1.0, -0.5, 0.0, 0.5, 1.0])
+    _titled(axis, "poles: light early, dark late, last red")
+
+
+def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
+    from driftfit.show.plots import date_axis, time_label
+
+    gain, pole = dc_gain(run), largest_pole(run)
+    low, high = (part[:, j] for part in gain.band(level))
+    axis.fill_between(run.time, low, high, color=BLUE, alpha=0.2, lw=0)
+    axis.plot(run.time, gain.value[:, j], color=BLUE, lw=1.3)
+    frame(axis, np.concatenate([gain.value[first:, j], low[first:], high[first:]]))
+    if arx_of(run).na:
+        size = axis.twinx()
+        size.plot(run.time, pole.value, color=RED, lw=0.8)
+        size.set_ylabel("largest pole (red)", fontsize=8)
+        size.set_ylim(0.0, max(1.05, float(np.nanmax(pole.value[first:], initial=0.0)) * 1.05))
+        size.tick_params(labelsize=8)
+    _titled(axis, f"steady-state gain of {_input_name(run, j)}")
+    axis.set_xlabel(time_label(run), fontsize=9)
+    date_axis(axis, run)
+
+
+def _input_name(run: Track, j: int) -> str:
+    names = arx_of(run).inputs
+    return str(names[j]) if isinstance(names, tuple) else f"u{j + 1}"
+
+
+def _titled(axis: Axes, title: str) -> None:
+    axis.set_title(title, fontsize=10, loc="left")
+    axis.grid(alpha=0.25, lw=0.5)
+    axis.tick_params(labelsize=8)
+
+
+def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95) -> Figure:
+    """Free simulation of the model of one sample on data that it has not seen, beside what was measured.
+
+    The first outputs, as many as the model has lags, are given to the simulation. The fit, in per cent,
+    is that of `driftfit.use.simulate.fit`.
+    """
+    output = as_output(y)
+    lags = int(getattr(run.model, "na", 0))
+    said = simulate(run, u, at, np.nan_to_num(output[:lags]))
+    low, high = said.band(level)
+    time = np.arange(len(output))
+    figure = new_figure(9.0, 4.2)
+    signal, error = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1.0])
+    signal.fill_between(time, low, high, color=BLUE, alpha=0.2, lw=0)
+    signal.plot(time, output, color=GREY, lw=1.0, label="measured")
+    signal.plot(time, said.y_hat, color=BLUE, lw=1.1, label=f"simulated, parameters of {run.time_text(at)}")
+    signal.legend(fontsize=8, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    signal.set_ylabel(named(run.labels.y, run.labels.units.get(run.labels.y, "")))
+    frame(signal, np.concatenate([output, said.y_hat]))
+    _titled(signal, f"fit {fit(output[lags:], said.y_hat[lags:]):.1f} %")
+    error.fill_between(time, low - said.y_hat, high - said.y_hat, color=BLUE, alpha=0.15, lw=0)
+    error.plot(time, output - said.y_hat, color=BLUE, lw=0.8)
+    error.axhline(0.0, color=GREY, lw=0.6)
+    error.set_ylabel("error")
+    error.set_xlabel("sample of the validation record")
+    error.grid(alpha=0.25, lw=0.5)
+    return figure
