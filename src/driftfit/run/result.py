@@ -265,7 +265,7 @@ class Track(Plain):
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
         convert = getattr(self.model, "polynomials", None)
         if convert is None:
-            raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
+            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
         A, B = convert(self.theta)
         return A, B
 

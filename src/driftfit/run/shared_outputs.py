@@ -132,7 +132,7 @@ def row_model(model: Model, tracker: Tracker, m: int | None = None) -> Model:
     assert isinstance(model, Regression)
     if not tracker.covariance:
         raise ValueError(
-            f"{type(tracker).__name__} carries no covariance, so one row of an instant would not know of the others; "
+            f"{type(tracker).__name__} carries no covariance, so the rows of an instant could not inform each other; "
             "use FLS, Kalman or RLS with shared=True."
         )
     alone = replace(model, ny=1, shared=False)

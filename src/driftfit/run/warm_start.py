@@ -45,7 +45,7 @@ def carried(run: Run | None, programs: Sequence[Program]) -> tuple[State, ...]:
         return ()
     end = run.end()
     if len(end.programs) != len(programs):
-        raise ValueError(f"warm_start: {run!r} is no run of these outputs.")
+        raise ValueError(f"warm_start: {run!r} is not a run of these outputs.")
     return tuple(_carried(*lane) for lane in zip(end.programs, end.states, programs, strict=True))
 
 

@@ -25,7 +25,7 @@ class SmoothedShared(Smoothed):
     def of_shared(cls, run: Shared, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Self:
         """Smooth a record of outputs that share one theta."""
         if order_by is not None:
-            raise ValueError("smooth: order_by= would tear the rows of an instant apart; it is for single outputs.")
+            raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
         return cls(Smoothed.of(run.rows, keep, undetermined=undetermined), run)
 
     def __init__(self, rows: Smoothed, run: Shared) -> None:

@@ -67,10 +67,10 @@ class Operated(ABC):
         """
         chosen = self._chosen(which)
         if p is None and theta is None:
-            raise ValueError("Live.reset: say p= (how far they may have moved, as a variance), theta=, or both.")
+            raise ValueError("Live.reset: give p= (the variance of their possible change), theta=, or both.")
         if self._window is not None:
             raise ValueError(
-                "Live.reset: smoothing with lag= does not know of resets; keep a second stream without it."
+                "Live.reset: smoothing with lag= does not support resets; keep a second stream without lag=."
             )
         count = len(chosen)
         if p is not None:

@@ -25,7 +25,7 @@ class LiveHypotheses:
 
     def __init__(self, live: Live) -> None:
         if not live.tracker.weighs:
-            raise ValueError(f"hypotheses: {type(live.tracker).__name__} weighs none; track with a Bank.")
+            raise ValueError(f"hypotheses: {type(live.tracker).__name__} has no hypotheses; track with a Bank.")
         self._live = live
         self.tracker: Bank = live.tracker  # type: ignore[assignment]
         self._lane = live.lane()

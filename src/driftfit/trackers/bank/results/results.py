@@ -75,7 +75,7 @@ class Hypotheses:
 
     def __init__(self, run: Track) -> None:
         if not run.tracker.weighs:
-            raise ValueError(f"hypotheses: {type(run.tracker).__name__} weighs none; track with a Bank.")
+            raise ValueError(f"hypotheses: {type(run.tracker).__name__} has no hypotheses; track with a Bank.")
         self.run = run
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
         self._report = run.written("report")
@@ -242,7 +242,7 @@ class Hypotheses:
         one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
         """
         if (threshold is None) == (rate is None):
-            raise ValueError("alarm: give threshold= or rate= (false alarms per sample), one of them.")
+            raise ValueError("alarm: give either threshold= or rate= (false alarms per sample).")
         if threshold is None:
             assert rate is not None
             threshold = self._threshold(rate, reference)
