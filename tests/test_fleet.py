@@ -94,7 +94,7 @@ def test_settings_per_series():
         assert_same(fleet[key], track(MODEL, own[key], y[key], u[key]))
     with pytest.raises(ValueError, match="11 trackers were given for 12 series"):
         track(MODEL, own[:11], y, u, by="row")
-    with pytest.raises(ValueError, match="lack 1 of 12 series, such as 11"):
+    with pytest.raises(ValueError, match="missing for 1 of 12 series, such as 11"):
         track(MODEL, dict(enumerate(own[:11])), y, u, by="row")
 
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from driftfit.engine.version import __version__
 from driftfit.judge.diagnose import Diagnosis, diagnose
-from driftfit.judge.plots import draw_diagnosis
 from driftfit.judge.verdict import Verdict, p_text, verdict
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in
@@ -85,7 +84,7 @@ def page(run: Track, title: str | None = None, alarms: Alarms | None = None, lab
         section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
         section("Parameters", _parameter_table(facts, said) + _system_table(run)),
         section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
-        section("Diagnostics", _checks(health) + picture(draw_diagnosis(health), run, DIAGNOSTICS)),
+        section("Diagnostics", _checks(health) + picture(health.plot(), run, DIAGNOSTICS)),
         section("Settings, and what was left out", _settings(run, facts)),
         section("How to read this", READING),
     ]

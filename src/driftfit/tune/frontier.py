@@ -23,6 +23,7 @@ from driftfit.models.base import Model
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
+from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.trackers.fls import FLS
 
@@ -41,9 +42,7 @@ class Frontier(NamedTuple):
 
     def plot(self) -> Figure:
         """r_M^2 against r_D^2, and both against mu; a matplotlib figure."""
-        from driftfit.tune.plots import plot_frontier
-
-        return plot_frontier(self)
+        return _plot(self)
 
 
 def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, **known: Any) -> Frontier:
@@ -94,3 +93,24 @@ def _movement(path: Smoothed) -> float:
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
     factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
+
+
+def _plot(frontier: Frontier) -> Figure:
+    """Measurement cost against dynamic cost, and both against mu."""
+    figure = new_figure(9.0, 3.6)
+    left, right = figure.subplots(1, 2)
+    left.loglog(frontier.dynamic, frontier.measurement, color=BLUE, lw=1.3, marker="o", ms=2.5)
+    for i in range(0, len(frontier.mu), max(len(frontier.mu) // 6, 1)):
+        point = (frontier.dynamic[i], frontier.measurement[i])
+        left.annotate(
+            f"{frontier.mu[i]:.2g}", point, (-4, -10), textcoords="offset points", ha="right", fontsize=7, color=GREY
+        )
+    left.set_xlabel("dynamic cost r_D^2")
+    left.set_ylabel("measurement cost r_M^2 (numbers: mu)")
+    right.loglog(frontier.mu, frontier.measurement, color=BLUE, lw=1.3, label="measurement cost r_M^2")
+    right.loglog(frontier.mu, frontier.dynamic, color=RED, lw=1.3, label="dynamic cost r_D^2")
+    right.set_xlabel("mu")
+    right.legend(fontsize=8, frameon=False)
+    for axis in (left, right):
+        axis.grid(alpha=0.25, lw=0.5)
+    return figure

@@ -8,7 +8,7 @@ also fill missing lags.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from driftfit.data.record import Reading
 from driftfit.models.base import Model
@@ -18,16 +18,13 @@ from driftfit.run.track import track
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task
-
-if TYPE_CHECKING:
-    from driftfit.tune.tune import Tuned
-
+from driftfit.tune.tuned import Tuned
 
 STILL = Kalman(q=0.0, r=1.0)
 """Constant parameters, of which nothing is known before."""
 
 
-class TunedOutputs(Mapping[str, "Tuned"]):
+class TunedOutputs(Mapping[str, Tuned]):
     """What `tune` returns for a model with several outputs: a `driftfit.tune.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:

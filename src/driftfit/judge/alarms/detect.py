@@ -46,6 +46,7 @@ from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
 from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of
+from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.rule import KINDS, AlarmRule, check_fits, value_text
 from driftfit.run.result import Track
@@ -168,9 +169,7 @@ class Alarms(Printed):
 
     def plot(self, labels: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded."""
-        from driftfit.judge.plots import plot_alarms
-
-        return plot_alarms(self, labels)
+        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, labels)
 
 
 def detect(

@@ -37,6 +37,7 @@ from driftfit.data.record import Reading, one_series
 from driftfit.data.signals import check_ready
 from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
+from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
 from driftfit.judge.structures.subsets import subsets
@@ -158,9 +159,10 @@ class Selection(Printed):
 
     def plot(self, most: int = 20) -> Figure:
         """How far structures are below the best, with standard errors, and where in time they lost it."""
-        from driftfit.judge.plots import plot_selection
-
-        return plot_selection(self, most)
+        rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
+        terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
+        below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
+        return plot_selection([row.name for row in rows], below, std, terms)
 
 
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
