@@ -231,9 +231,11 @@ class AdaptiveKalman(Tracker):
         lately = ~never & ~learned(lane)
         said = []
         if never.any():
-            said.append(("Not learned", f"{', '.join(names[never])}: never moved apart from the others; std is inf"))
+            said.append(
+                ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
+            )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: the last regressors do not tell"))
+            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (*said, *proportion(lane), *resolution(lane))
 
     def inspect(self, run: Any) -> None:
