@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from support import same
 
-from driftfit import ExtendedKalman, Kalman, Live, track
+from driftfit import Kalman, Live, track
 from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
@@ -151,8 +151,6 @@ def test_what_several_inputs_cannot_have_is_said():
         track(VALVES, K, y, u[:, :1])
     with pytest.raises(ValueError, match="one entry for each input"):
         HammersteinWiener(1, [2, 1], input=[None, None, None])
-    with pytest.raises(ValueError, match="needs a model with one input"):
-        track(VALVES, ExtendedKalman(q=0.0, r=1.0), y, u)
     with pytest.raises(ValueError, match="one input"):
         fit_constant(VALVES, y, u)
     for basis in (Saturation(1.0), DeadZone(1.0)):

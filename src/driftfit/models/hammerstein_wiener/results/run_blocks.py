@@ -86,13 +86,15 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
 
 def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
     """The blocks of a tracker that follows the minimal parameters themselves."""
-    a, b, c, d = model.structure.groups(run.theta)
-    at = model.structure.na + sum(model.structure.nb)
-    fixed = [at, at + model.structure.n_in[0] - 1]  # c_1 and d_1, before which free entries of xi they stand
+    structure = model.structure
+    at = structure.na + sum(structure.nb)
+    leads = at + structure.leads - np.arange(model.m)
+    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 stand
     var = np.insert(run._written("var"), fixed, 0.0, axis=1)
     cov = None
     if "P" in (run._out.dtype.names or ()):
         cov = np.insert(np.insert(run._written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    a, b, c, d = structure.groups(run.theta)
     exact, std = np.zeros((len(run), 2)), deviations(model, var)
     return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
 
