@@ -140,7 +140,7 @@ def test_outputs_of_one_record(tmp_path):
     run.report(tmp_path / "outputs.html")
     page = (tmp_path / "outputs.html").read_text()
     assert "<h1>level, flow</h1>" in page
-    assert "Those that move most clearly" in page
+    assert "The series that move most clearly" in page
     rows = np.stack([u, u[:, ::-1]], axis=1)
     theta = np.column_stack([np.ones(T), gain])
     y = np.einsum("toi,ti->to", rows, theta) + 0.1 * rng.normal(size=(T, 2))
