@@ -126,7 +126,7 @@ def test_valid_ranges_and_stretches_left_out(table):
     said = run("track", *SIGNALS, "--limits", "flow=-2:2", "--exclude", "101..121")
     assert "21 excluded" in " ".join(said.split())
     run("tune", *SIGNALS[:-2], "--limits", "flow=-2:2", "--exclude", "101..121")
-    assert "given in rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
+    assert "an interval of rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
     assert "column=low:high" in fails("track", *SIGNALS, "--limits", "flow=2")
     assert "did you mean flow" in fails("track", *SIGNALS, "--limits", "flo=1:2")
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
@@ -142,7 +142,7 @@ def test_a_saved_run_or_stream_goes_on(table):
     rest = ["pump.csv", "--y", "flow", "--u", "valve", "--rows", "201:", "--start"]
     for state in ("first.npz", "live.npz"):
         assert np.array_equal(theta(*rest, state), expected().theta[200:, 1])
-    assert "those of the file" in fails("track", *rest, "first.npz", "--model", "arx:1,1")
+    assert "come from the file" in fails("track", *rest, "first.npz", "--model", "arx:1,1")
     (table.head(3)).write_csv("no.npz")
     assert "no.npz is not a driftfit file" in fails("track", *rest, "no.npz")
 

@@ -291,10 +291,10 @@ def test_probabilities_show_their_limit():
     ("kind", "settings", "match"),
     [
         ("bands", {}, "kind"),
-        ("band", {}, "where the parameters belong"),
+        ("band", {}, "the normal range of the parameters"),
         ("band", {"reference": {"b9": (0, 1)}}, "no parameter"),
         ("band", {"reference": {"b1": (1, 0)}}, "low <= high"),
-        ("band", {"reference": 60}, "too little"),
+        ("band", {"reference": 60}, "too short"),
         ("innovation", {"reference": {"b1": (0, 1)}}, "number of samples"),
         ("innovation", {"window": 2}, "window"),
         ("innovation", {"every": 1.0}, "every"),

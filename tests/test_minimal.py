@@ -187,7 +187,7 @@ def test_minimal_filters_want_their_model():
     for tracker in (ExtendedKalman(q=1e-5, r=1e-4), OutputError(q=1e-5, r=1e-4)):
         with pytest.raises(ValueError, match="HammersteinWiener"):
             track(Regression(1), tracker, [1.0, 2.0], [1.0, 1.0])
-        with pytest.raises(ValueError, match="cannot be told apart"):
+        with pytest.raises(ValueError, match="two cannot be distinguished"):
             track(HammersteinWiener(0, 1, input=Polynomial(2)), tracker, [1.0, 2.0], [1.0, 1.0])
 
 

@@ -14,7 +14,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -31,8 +33,8 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
-BAR = 100
-"""Runs from which on there is a progress bar."""
+PATIENCE = 2.0
+"""Seconds after which there is a progress bar."""
 
 Said = TypeVar("Said")
 
@@ -66,10 +68,12 @@ class Judgement:
 
     @property
     def relative(self) -> float:
-        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named."""
+        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named.
+
+        A value before that is smaller than the standard error of the change counts as that error.
+        """
         moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return float(max((np.abs(np.divide(m.after - m.before, m.before)) for m in moved), default=0.0))
+        return max((abs(m.after - m.before) / max(abs(m.before), m.std) for m in moved), default=0.0)
 
     @property
     def change(self) -> str:
@@ -103,7 +107,7 @@ class ManyVerdicts(Printed):
         for row in self.rows:
             if row.key == key:
                 return row
-        raise KeyError(f"there is no verdict of {key!r}.")
+        raise KeyError(f"there is no verdict for {key!r}.")
 
     def ranked(self, by: str = "clearest") -> ManyVerdicts:
         """The same rows in another order: the "clearest" first, or the largest relative "change" first."""
@@ -256,10 +260,14 @@ def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: 
     from driftfit.run.fleet import cores
 
     keys, tracks = list(runs), list(runs.values())
-    first = [judge(track) for track in tracks[:1]]
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=len(tracks) < BAR) as progress,
-        ThreadPoolExecutor(cores()) as pool,
-    ):
-        rest = progress.track(pool.map(judge, tracks[1:]), total=len(tracks) - 1, description=what)
-        return dict(zip(keys, [*first, *rest], strict=True))
+    said = [judge(track) for track in tracks[:1]]
+    progress = Progress(console=Console(stderr=True), transient=True)
+    task, begun, shown = progress.add_task(what, total=len(tracks), completed=len(said)), monotonic(), False
+    with ThreadPoolExecutor(cores()) as pool, ExitStack() as stack:
+        for one in pool.map(judge, tracks[1:]):
+            said.append(one)
+            progress.advance(task)
+            if not shown and monotonic() - begun > PATIENCE:
+                stack.enter_context(progress)
+                shown = True
+    return dict(zip(keys, said, strict=True))

@@ -120,8 +120,8 @@ class Model(Settings, ABC):
         ValueError for a model that does not say how.
         """
         raise ValueError(
-            f"{type(self).__name__} does not say how it runs forward, so nothing can be simulated; a model of your own "
-            "does with the methods `reach` and `play` (driftfit.models.base)."
+            f"{type(self).__name__} cannot be run forward, so nothing can be simulated; give your own model "
+            "the methods `reach` and `play` (driftfit.models.base)."
         )
 
     def output_slope(self, theta: Array, y: Array) -> Array:

@@ -94,7 +94,7 @@ def taken_over(before: Run | None, model: Model, trackers: Sequence[Tracker]) ->
         return ()
     end: Any = before.end()
     if not isinstance(end.tracker, tuple) or len(end.tracker) != len(trackers):
-        raise ValueError(f"warm_start: {before!r} is no run of these outputs.")
+        raise ValueError(f"warm_start: {before!r} is not a run of these outputs.")
     starts = []
     for lane, tracker in enumerate(trackers):
         state = {name: value[..., lane] for name, value in end.state.items()}

@@ -232,7 +232,9 @@ def _per_series(tracker: Trackers, keys: Sequence[Hashable]) -> list[Tracker]:
     if isinstance(tracker, Mapping):
         absent = [key for key in keys if key not in tracker]
         if absent:
-            raise ValueError(f"track: the settings lack {len(absent)} of {len(keys)} series, such as {absent[0]!r}.")
+            raise ValueError(
+                f"track: settings are missing for {len(absent)} of {len(keys)} series, such as {absent[0]!r}."
+            )
         return [tracker[key] for key in keys]
     if len(tracker) != len(keys):
         raise ValueError(f"track: {len(tracker)} trackers were given for {len(keys)} series.")

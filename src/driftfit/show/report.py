@@ -75,7 +75,7 @@ def report(
 def check_path(path: str | PathLike[str]) -> Path:
     """Where a page goes; ValueError where the name is not that of a page."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"report: the page is HTML, so its name ends in .html; got {str(path)!r}.")
+        raise ValueError(f"report: the page is HTML, so its name must end in .html; got {str(path)!r}.")
     return Path(path)
 
 

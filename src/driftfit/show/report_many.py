@@ -46,7 +46,7 @@ def page_of_many(
 ) -> str:
     """The page as text; ``failed`` says why some have no result; ``labels`` of a key are true where it was wrong."""
     if not runs:
-        raise ValueError("report: there is no run with a result to report on.")
+        raise ValueError("report: no series has a result to report.")
     said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())

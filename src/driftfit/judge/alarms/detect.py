@@ -270,9 +270,9 @@ def _highest(statistic: Array, start: int) -> Array:
 def _warn_of_following(run: Track) -> None:
     """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
     warnings.warn(
-        f"detect: {type(run.tracker).__name__} finds its own drift and noise, so it follows a fault away: its "
-        "innovations are soon normal again, and a slow fault hardly shows in them. Watch where the parameters are, "
-        'detect("band", reference=...), or track with numbers that are fitted to the reference and then stay, '
+        f"detect: {type(run.tracker).__name__} estimates its own drift and noise, so it follows a fault: its "
+        "innovations are soon normal again, and a slow fault is hardly visible in them. Watch the parameters with "
+        'detect("band", reference=...), or track with settings that are fitted to the reference and then kept, '
         "tune(model, Kalman(), ...).tracker.",
         UserWarning,
         stacklevel=4,

@@ -205,7 +205,7 @@ class HammersteinWiener(Model):
     def into(self) -> Basis:
         """Functions of the input block; ValueError where there are several inputs."""
         if self.m > 1:
-            raise ValueError("HammersteinWiener: what was asked for needs a model with one input.")
+            raise ValueError("HammersteinWiener: this method needs a model with one input.")
         return self.bases[0]
 
     @property

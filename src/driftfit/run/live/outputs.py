@@ -55,7 +55,7 @@ class LiveOutputs(storage.Kept):
         self._pace = Pace(self._clock, model.reach)
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
-            raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
+            raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
         before = None if warm_start is None else warm_start.end()
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
@@ -196,7 +196,7 @@ class LiveOutputs(storage.Kept):
         absent = [name for name in rules if name not in self.model.outputs]
         if self.model.shared or absent:
             raise ValueError(
-                f"Live.detect: rules are for outputs with a theta of their own; got {list(rules)}, and the outputs are "
+                f"Live.detect: rules are for outputs with separate theta; got {list(rules)}, and the outputs are "
                 f"{', '.join(self.model.outputs)}."
             )
         for name, rule in rules.items():
@@ -252,7 +252,7 @@ class LiveOutputs(storage.Kept):
         Each is (lag + 1, ny, n), or (lag + 1, n) where the outputs share one theta.
         """
         if not self._windows:
-            raise ValueError("Live.smooth: no samples are kept; say how many, as in Live(model, tracker, lag=20).")
+            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
         found = [window.smooth(self._tile, lane) for lane, window in enumerate(self._windows)]
         if self.model.shared:
             ny = len(self.model.outputs)

@@ -135,9 +135,9 @@ class Bank(Tracker):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
         self._shape, self._events  # noqa: B018  (both refuse what does not fit)
         if self.all_changes[0].reset:
-            raise ValueError("Bank: the first change is the ordinary course of things, and cannot be a reset.")
+            raise ValueError("Bank: the first change is the normal course of events and cannot be a reset.")
         if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
-            raise ValueError("Bank: FirstFloor knows random walks only; changes that forget need another reduction.")
+            raise ValueError("Bank: FirstFloor supports random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
         kinds = {other.kind for other in others}
         reduce = self.reduction
@@ -291,7 +291,7 @@ class Bank(Tracker):
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
-                raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
+                raise ValueError(f"Bank: drift must have {Hd} columns, one per change; got shape {np.shape(drift)}.")
             columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 

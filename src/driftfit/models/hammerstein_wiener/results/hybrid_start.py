@@ -70,7 +70,7 @@ def hand_off(
     output, inputs = as_output(y), as_inputs(u, len(as_output(y)))
     last = _sufficient(model, first, output, inputs, limit) if at is None else whole("hand_off", "at", at, 1)
     if not last < len(output) - 1:
-        raise ValueError(f"hand_off: at={last} leaves nothing of the {len(output)} samples to the second filter.")
+        raise ValueError(f"hand_off: at={last} leaves none of the {len(output)} samples for the second filter.")
     before = track(model, first, output[: last + 1], inputs[: last + 1])
     found = before.blocks("gls")
     assert found.cov is not None
@@ -112,5 +112,6 @@ def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, li
         if found.size:
             return int(at[found[0]])
     raise ValueError(
-        f"hand_off: no window of {3 * n} samples excites all {n} products; see diagnose_blocks(run).dull(), or say at=."
+        f"hand_off: no window of {3 * n} samples excites all {n} products; see diagnose_blocks(run).dull(), or pass "
+        "at=."
     )

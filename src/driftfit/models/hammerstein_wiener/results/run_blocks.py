@@ -30,7 +30,7 @@ def blocks_of(
     """The blocks of a run; see `Track.blocks`."""
     model = run.model
     if not isinstance(model, HammersteinWiener):
-        raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
+        raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
     one_of("blocks", "method", method, METHODS)
     if run.names == model.structure.minimal_names:
         found = _of_minimal(run, model)
@@ -53,7 +53,7 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
         warnings.warn(
-            f"blocks: {used} usable samples cannot tell {n} products apart; what is shown is mostly the start.",
+            f"blocks: {used} usable samples cannot determine {n} products; the blocks are mostly the initial values.",
             UserWarning,
             stacklevel=4,
         )
@@ -77,8 +77,8 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
         small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
         if small.any():
             warnings.warn(
-                f'blocks: a b_j is next to zero in {int(small.any(axis=1).sum())} samples, where "average" has spikes; '
-                'use "svd-joint".',
+                f'blocks: a b_j is close to zero in {int(small.any(axis=1).sum())} samples, where "average" has '
+                'spikes; use "svd-joint".',
                 UserWarning,
                 stacklevel=4,
             )
@@ -102,7 +102,7 @@ def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
 def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
     """Replay the run in pieces, with covariances, and refine the separation of each."""
     if not run.tracker.covariance:
-        raise ValueError(f'blocks: "gls" weighs by the covariance, and {type(run.tracker).__name__} carries none.')
+        raise ValueError(f'blocks: "gls" needs a covariance, but {type(run.tracker).__name__} carries none.')
     a, b, c, d, quality = split(model, run.theta, "svd-joint")
     rest, at = _intercept(run), a.shape[1] + b.shape[1] + c.shape[1]
     zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)

@@ -49,8 +49,8 @@ def structure_of(owner: str, model: Model) -> Structure:
     structure = model.structure
     if structure.n == structure.n_x and structure.names != structure.minimal_names:
         raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb} products and minimal parameters are as many "
-            "and cannot be told apart; follow the products with Kalman and separate them."
+            f"{owner}: with na = {structure.na} and nb = {structure.nb} there are as many products as minimal "
+            "parameters, so the two cannot be distinguished; track the products with Kalman and separate them."
         )
     return structure
 
