@@ -61,7 +61,7 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
 from driftfit.models.hammerstein_wiener.rows import complete, fill, forget, minimal_past, noise_factor, past, shift
-from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values
+from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values, usable
 
 INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
@@ -97,6 +97,8 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
         if moves:
             shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
         input_at(m, p, m[p[US] + i, 0], p[own + OWN_F], p[SPARE])
+        if not usable(m, p[own + OWN_F], p[own + OWN_N_IN]):
+            m[p[own + OWN_F], 0] = np.nan
 
     enter = part(one)
     if i + 1 == len(into):
@@ -143,8 +145,7 @@ def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
                 output_at(m, p, y, g, h)
             else:
                 bare_output_at(m, p, y, g, h)
-            for k in range(n_out):
-                seen = seen and abs(m[g + k, 0]) < LARGEST
+            seen = usable(m, g, n_out)
         m[RAW, 0] = y if seen else np.nan
         if p[IDENTITY] == 0:
             if seen:

@@ -45,6 +45,7 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
 from driftfit.models.hammerstein_wiener.values import Kind, level_of, output_values
+from driftfit.trackers.parts.diffuse import LEFT
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -170,8 +171,9 @@ def absorb(
                 w[x] += k * e
             else:
                 theta[x - n_w] += k * e
-            for z in range(x + 1):
+            for z in range(x):
                 S[x, z] -= k * moved[z]
+            S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
     return s
 
 
