@@ -26,7 +26,6 @@ levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -274,14 +273,6 @@ class AdaptiveKalman(Tracker):
             said.append(("Not learned now", f"{', '.join(names[lately])}: the last regressors do not tell"))
         return (*said, *proportion(lane), *resolution(lane))
 
-    def inspect(self, run: Any) -> None:
-        lane = run.end().state
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
-            warnings.warn(
-                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, since the regressors "
-                "never moved apart from the others: std is inf. The other parameters are followed all the same; leave "
-                "out a column that stands still, or that repeats another, to be rid of this.",
-                UserWarning,
-                stacklevel=4,
-            )
+        return never & bool(lane["settled"] and lane["seen_samples"] >= window(len(never)))
