@@ -27,9 +27,9 @@ def warn_unlearned(run: Track | Fleet) -> None:
     if not isinstance(run, Track):
         named = f"in {found} of {len(series)} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
     warnings.warn(
-        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the others: std is "
-        "inf. The other parameters are followed all the same; leave out a column that stands still, or that repeats "
-        "another, to be rid of this.",
+        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
+        "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
+        "constant or repeat another.",
         UserWarning,
         stacklevel=3,
     )
