@@ -23,9 +23,11 @@ AGAIN says that the present one was just refused.
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, SIZE,
-) = range(20)  # fmt: skip
-"""Numbers of the present sample: what comes in, and what goes out."""
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
+) = range(21)  # fmt: skip
+"""Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
+prediction may have in its output lags (`driftfit.hypotheses.lags`).
+"""
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
 HEAD = 4

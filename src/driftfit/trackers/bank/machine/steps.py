@@ -7,6 +7,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.bank.machine.layout import (
@@ -24,6 +25,7 @@ from driftfit.trackers.bank.machine.layout import (
     IN_Y,
     LEAST,
     MANY,
+    MOST,
     NOW,
     PHI,
     PLACES,
@@ -154,6 +156,7 @@ def tell(s: State, l: int) -> None:
     s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+    s.now[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
 
 
 @kernel
