@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, floats, outside, part
+from driftfit.engine.kernel import Array, floats, machine, part, shared
 from driftfit.models.hammerstein_wiener.memory import (
     CURVE,
     D_NOW,
@@ -55,7 +55,7 @@ TIME, R, Q_W, P_W, V_POWER, BEGUN, VALID, SEEN, OK, E, S2, SIZE = range(12)
 """Numbers of the filter: nominal intervals times the drift, variances, power of v, whether w stands, what comes out."""
 
 
-@core
+@shared
 def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
     """w = F(y) at the last outputs, each of variance p_w."""
     na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_PAST]
@@ -82,7 +82,7 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
     return total
 
 
-@core
+@shared
 def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
     """The time update of w and of S."""
     na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
@@ -121,7 +121,7 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array,
     w[0] = total
 
 
-@core
+@shared
 def absorb(
     e: float, slope: float, m: Array, p: Places, r: float, ok: bool, theta: Array, w: Array, S: Array, row: Array,
     moved: Array,
@@ -147,7 +147,7 @@ def absorb(
     return s
 
 
-@core
+@shared
 def inputs_known(m: Array, p: Places) -> bool:
     """Whether all inputs that the linear block needs are there."""
     nb, nk, n_in = p[NB], p[NK], p[N_IN]
@@ -158,7 +158,7 @@ def inputs_known(m: Array, p: Places) -> bool:
     return missing == 0
 
 
-@core
+@shared
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     """The usual power of v, which stands for inputs that are missing."""
     na, nb, f = p[NA], p[NB], p[F_PAST]
@@ -168,7 +168,7 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     own[V_POWER] += 0.01 * (v * v - own[V_POWER]) if abs(v) < 1e6 else 0.0
 
 
-@core
+@shared
 def hold(m: Array, p: Places, w: Array) -> None:
     """Keep the present w within reach of the outputs seen, whatever the poles do."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
@@ -223,7 +223,7 @@ def _work(out: Kind) -> Any:
             for j in range(i + 1):
                 P[i, j] = S[n_w + i, n_w + j]
 
-    return core(output_error_work)
+    return shared(output_error_work)
 
 
 @lru_cache
@@ -242,4 +242,4 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
             floats(scratch, 2, N)[1],
         )  # fmt: skip
 
-    return outside(machine_output_error)
+    return machine(machine_output_error)

@@ -14,17 +14,17 @@ their lags into V.
 
 from __future__ import annotations
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST
 
 
-@core
+@shared
 def covariance_row(n: int, na: int) -> int:
     """The first row of V, whose lower triangle is the last thing in a leaf."""
     return FIRST + n + n * (n + 1) // 2 + na
 
 
-@core
+@shared
 def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) -> None:
     """Output lags of leaves that took no sample in: y where it was seen, else what each expected."""
     at = FIRST + n + n * (n + 1) // 2
@@ -36,7 +36,7 @@ def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) 
             B[at, l] = y if seen else y_hat[l]
 
 
-@core
+@shared
 def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
     at = covariance_row(n, na)
@@ -51,7 +51,7 @@ def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: 
             at += 1
 
 
-@core
+@shared
 def shift_covariance(
     A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, h: Array, r: float, X: Array
 ) -> None:  # fmt: skip
@@ -85,7 +85,7 @@ def shift_covariance(
         to[l] = h[l] + r if own else 0.0
 
 
-@core
+@shared
 def merge_covariance(B: Array, members: Array, n: int, na: int, share: Array, A: Array, to: int) -> None:
     """Column ``to`` of A: the average of V and the spread of the lags, whose mean stands there already."""
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
