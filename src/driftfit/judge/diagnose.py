@@ -37,7 +37,6 @@ from driftfit.judge.excitation import INDEX, Excitation, excitation
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
-from driftfit.judge.statistics.scale import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.summary import Printed, table_of
