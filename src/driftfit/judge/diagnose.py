@@ -37,6 +37,7 @@ from driftfit.judge.excitation import INDEX, Excitation, excitation
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
+from driftfit.judge.statistics.scale import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
 from driftfit.run.result import Track, root_mean_square
 from driftfit.show.summary import Printed, table_of
