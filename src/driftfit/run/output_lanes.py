@@ -31,7 +31,8 @@ def programs_of(model: Model, tracker: Any) -> tuple[Program, ...]:
         if not isinstance(one, Tracker):
             raise ValueError(f"several outputs take one tracker, or one for each output by its name; got {tracker!r}.")
         check_ready(one)
-    programs = tuple(Program(model, one) for one in trackers)
+    outputs = (None,) if model.shared else model.outputs
+    programs = tuple(Program(model, one, output) for one, output in zip(trackers, outputs, strict=True))
     if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:
         raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
     return programs

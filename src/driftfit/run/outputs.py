@@ -58,7 +58,7 @@ class Outputs(Many):
         self._out, self._tile = out, tile
         self.failed = {}
         self.outputs = self.model.outputs
-        self.names = tuple(self.model.names_of(output) for output in self.outputs)
+        self.names = tuple(one.names for one in self.programs)
 
     @property
     def model(self) -> Model:
@@ -166,10 +166,13 @@ class Outputs(Many):
         return tuple(self._track(lane) for lane in range(len(self.outputs)))
 
     def _track(self, lane: int) -> Track:
-        """One output as a regression."""
-        seen, alone = self._seen, Program(Regression(self.names[lane]), self.trackers[lane])
-        phi = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
-        known = Known(self.record.known.columns[..., lane]).changed(interval=seen["dt"][:, lane])
+        """One output by itself, as a regression where the others are among its regressors."""
+        alone, u = self.programs[lane].alone, self.u
+        known, names = Known(self.record.known.columns[..., lane]), self.labels.u
+        if alone is None:
+            seen, names = self._seen, self.names[lane]
+            alone, known = Program(Regression(names), self.trackers[lane]), known.changed(interval=seen["dt"][:, lane])
+            u = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
         tile = alone.tile()
         shapes = {name: value.shape for name, value in state_of(tile).items() if name != "u"}
         state = state_of(self._tile, lane)
@@ -182,8 +185,8 @@ class Outputs(Many):
         start = {name: value for name, value in self.starts[lane].items() if name in own} if self.starts else None
         others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
         missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
-        labels = replace(self.labels, y=self.outputs[lane], u=self.names[lane], missing=missing)
-        record = Record(self.y[:, lane], phi, known, self.record.time, labels)
+        labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing)
+        record = Record(self.y[:, lane], u, known, self.record.time, labels)
         return Track(alone, record, Lane(out, tile), start)
 
     def keys(self) -> tuple[str, ...]:

@@ -33,11 +33,30 @@ class Program:
 
     model: Model
     tracker: Tracker
+    output: str | None = None
+    """Which of several outputs it follows, in a lane beside the others."""
+
+    @property
+    def alone(self) -> Program | None:
+        """The program of its output by itself; None where the model needs the other outputs, or has none."""
+        model = None if self.output is None else self.model.alone(self.output)
+        return None if model is None else Program(model, self.tracker)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return self.tracker.names_for(self.model)
+        if self.output is None:
+            return self.tracker.names_for(self.model)
+        own = () if self.alone is None else self.alone.names
+        return tuple(f"{name}[{self.output}]" for name in own) or self.model.names_of(self.output)
+
+    @property
+    def start(self) -> State:
+        """Fields of a lane before the first sample, beside those of the model."""
+        if self.output is None:
+            return self.tracker.state_for(self.model)
+        own = self.model if self.alone is None else self.alone.model
+        return {**own.memory(), **self.tracker.state_for(own)}
 
     @property
     def steps(self) -> TrackerSteps:
@@ -85,8 +104,8 @@ STANDING = ("interval", "noise", "drift", "each")
 def tile_of(programs: Sequence[Program], states: Sequence[State] = (), **more: Any) -> Array:
     """A tile with a lane for each program (all of one model), at its start or with the given fields."""
     model = programs[0].model
-    starts = {one.tracker: {**one.tracker.state_for(model), **more} for one in programs}
-    tile = make_tile(model.n, model.m, model.memory(), [starts[one.tracker] for one in programs])
+    starts = {one: {**one.start, **more} for one in programs}
+    tile = make_tile(model.n, model.m, model.memory(), [starts[one] for one in programs])
     for lane, state in enumerate(states):
         for name, value in state.items():
             tile[name][0, ..., lane] = value

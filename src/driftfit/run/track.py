@@ -17,6 +17,7 @@ from driftfit.run.program import Program
 from driftfit.run.result import Track, track_record
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track_outputs import OutputsFleet, track_outputs
+from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -47,7 +48,9 @@ def track(
     if single:
         assert isinstance(tracker, Tracker)
         records = records.told(bound, [_checked(tracker, keep)], prob)
-        return _one(Program(bound, tracker), records.part(0), keep, warm_start)
+        run = _one(Program(bound, tracker), records.part(0), keep, warm_start)
+        warn_unlearned(run)
+        return run
     if by is None and not isinstance(tracker, Tracker):
         names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
         records = records.repeated(names)
@@ -56,7 +59,9 @@ def track(
         _checked(one, keep)
     programs = {one: Program(bound, one) for one in trackers}
     records = records.told(bound, trackers)
-    return run_fleet([programs[one] for one in trackers], records, keep, failed, warm_start)
+    fleet = run_fleet([programs[one] for one in trackers], records, keep, failed, warm_start)
+    warn_unlearned(fleet)
+    return fleet
 
 
 def track_one(
@@ -114,6 +119,4 @@ def _one(program: Program, record: Record, keep: str, before: Run | None) -> Tra
         (start,) = carried(before, [program])
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
-    run = track_record(program, record, keep, start)
-    program.tracker.inspect(run)
-    return run
+    return track_record(program, record, keep, start)

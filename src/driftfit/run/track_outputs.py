@@ -139,6 +139,8 @@ def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run
     if model.shared:
         return run_shared(model, tracker, signals, keep, before)
     programs = programs_of(model.bind(signals.labels.u or signals.u.shape[1]), tracker)
+    for lane, one in enumerate(programs):
+        (one.model if one.alone is None else one.alone.model).inspect(signals.y[:, lane], signals.u)
     starts = carried(before, programs)
     record = Record(signals.y, signals.u, known_of(programs[0], signals), signals.time, signals.labels)
     tile, keep = tile_of(programs, starts), keep_of(keep, programs[0].tracker)

@@ -34,7 +34,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel, log
-from driftfit.engine.settings import numbers, warn
+from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coordinates import (
@@ -268,18 +268,13 @@ class AdaptiveKalman(Tracker):
         lately = ~never & ~learned(lane)
         said = []
         if never.any():
-            said.append(("Not learned", f"{', '.join(names[never])}: never moved apart from the others; std is inf"))
+            said.append(
+                ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
+            )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: the last regressors do not tell"))
+            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (*said, *proportion(lane), *resolution(lane))
 
-    def inspect(self, run: Any) -> None:
-        lane = run.state
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
-            warn(
-                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, because their "
-                "regressors never varied separately from the others: std is inf. The other parameters are not "
-                "affected; to avoid this warning leave out columns that are constant or repeat another.",
-                UserWarning,
-            )
+        return never & bool(lane["settled"] and lane["seen_samples"] >= window(len(never)))

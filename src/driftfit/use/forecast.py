@@ -133,6 +133,11 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
     if live.awaits:
         live.apply(inputs[0])
         inputs = [*inputs[1:], None]
+    apart = live.alone()
+    if apart:
+        rows = np.array([live.inputs_of(row) for row in inputs])
+        found = [forecast_from(program, tile, rows) for program, tile in apart]
+        return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
     parts: list[tuple[Array, ...]] = []
     lagged = None if model.shared or not live.trackers[0].covariance else LagErrors.of(model, model.n)
     for row in inputs:

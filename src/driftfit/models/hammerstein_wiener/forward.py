@@ -15,6 +15,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Thresholds
+from driftfit.models.hammerstein_wiener.products import Structure
 
 GRID = 64
 WIDER = 0.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -63,7 +64,7 @@ class LiveOutputs(Plain, storage.Kept):
         self._alarms: dict[str, LiveAlarm] = {}
         self._place: Any = None
         self._rows = row_model(self.model, given[0].tracker) if self.model.shared else self.model
-        self.programs = tuple(Program(self._rows, one.tracker) for one in given)
+        self.programs = tuple(replace(one, model=self._rows) for one in given)
         self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self._tile = tile_of(self.programs, carried(warm_start, self.programs))
         self._out = self.programs[0].written(self._tile, 1)
@@ -195,7 +196,7 @@ class LiveOutputs(Plain, storage.Kept):
             )
         for name, rule in rules.items():
             lane = self.model.outputs.index(name)
-            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.model.names_of(name), wait)
+            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.names[lane], wait)
         return self.alarms
 
     @property
@@ -240,6 +241,15 @@ class LiveOutputs(Plain, storage.Kept):
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
 
+    def alone(self) -> list[tuple[Program, Array]]:
+        """Each output with its state as a tile of its own; none where outputs are regressors of each other."""
+        found = [(one.alone, lane) for lane, one in enumerate(self.programs)]
+        return [(one, one.resting(state_of(self._tile, lane))) for one, lane in found if one is not None]
+
+    def inputs_of(self, u: Any) -> Array:
+        """u as floats (m,), NaN where it is not known."""
+        return self._inputs(u)
+
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each from all samples so far: theta and std.
 
@@ -281,7 +291,7 @@ class LiveOutputs(Plain, storage.Kept):
     @property
     def names(self) -> tuple[Any, ...]:
         """Names of the parameters, of each output where they have one theta each."""
-        return self._rows.names if self.model.shared else tuple(map(self.model.names_of, self.model.outputs))
+        return self._rows.names if self.model.shared else tuple(one.names for one in self.programs)
 
     @property
     def ignored(self) -> int:
@@ -336,7 +346,7 @@ class LiveOutputs(Plain, storage.Kept):
             window.restore(state)
         for name, state in extra.get("alarms", {}).items():
             lane = model.outputs.index(name)
-            live._alarms[name] = LiveAlarm.of(state, trackers[lane], model.names_of(name))
+            live._alarms[name] = LiveAlarm.of(state, trackers[lane], live.names[lane])
         into = {name: live._tile[name][0] for name in storage.fields(live._tile)}
         storage.restore(source, trackers[0], arrays, "state_", into)
         return live
