@@ -25,7 +25,7 @@ from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.use import simulate, system
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
-from driftfit.use.simulate import Prediction
+from driftfit.use.prediction import Prediction
 from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
 

@@ -315,7 +315,7 @@ class JointARX(ARX):
 
     @property
     def steps(self) -> ModelSteps:
-        return _steps(self.na, self.lags, self.intercept, len(self.outputs))
+        return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
@@ -325,7 +325,7 @@ class JointARX(ARX):
 
 
 @lru_cache
-def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
+def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
     m = len(lags)
     nb = tuple(b for b, _ in lags) or (0,)
     nk = tuple(k for _, k in lags) or (0,)

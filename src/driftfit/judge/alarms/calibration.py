@@ -26,7 +26,8 @@ from driftfit.judge.statistics.scale import core
 from driftfit.models.arx import ARX
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track, burn_in
-from driftfit.use.simulate import input_regressors, moved
+from driftfit.use.prediction import moved
+from driftfit.use.simulate import input_regressors
 
 TIMES = 50.0
 """Expected false alarms in all simulated records together."""
