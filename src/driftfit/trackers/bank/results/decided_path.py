@@ -55,7 +55,8 @@ class EventSmoothed:
 
     @property
     def std(self) -> Array:
-        return np.asarray(np.sqrt(np.einsum("tii->ti", self.covs)))
+        """inf for what the record never told apart."""
+        return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(np.einsum("tii->ti", self.covs)))
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n)."""
