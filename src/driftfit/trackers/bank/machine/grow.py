@@ -21,10 +21,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, core, log, part, sized
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
-from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KIND, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.bank.leaves.own_sensor import add_noise, clean_lags, weigh_own
 from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
@@ -177,6 +178,10 @@ def grow(
         if sensors[j, FROZEN] > 0.0:
             leave(B, at, columns, n, C, m)
             frozen(B, at, columns, y, last, sensors[j, STUCK], r, unknown, X[likely])
+        elif sensors[j, OWN] > 0.0:
+            add_noise(B, at, columns, expected, y, r * noise, unknown, last, sensors[j, OWN], X, likely)
+            correct(n, B, at, columns, C, m, g, expected, y, 0.0, X, likely + 1)
+            weigh_own(B, at, columns, expected, y, r * noise, unknown, last, sensors[j, OWN], X, likely)
         else:
             noise_j = sensors[j, FACTOR] * r * noise
             correct(n, B, at, columns, C, m, g, expected, y - sensors[j, VALUE], noise_j, X, likely + 1)
@@ -187,6 +192,8 @@ def grow(
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
             remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected, own_lags, most, r)
+            if own_lags and sensors[j, OWN] > 0.0:
+                clean_lags(B, at, columns, n, expected, y, r * noise, unknown, last, sensors[j, OWN])
             block, spare = slice(at, at + columns), X[len(X) - na :]
             shift_covariance(A, K, B, block, n, na, own_lags, m, expected, r, most, spare)
         weigh(A, K, B, at, columns, j, Hm, own, alike, prior, X, likely, parent, event)
