@@ -64,6 +64,7 @@ from driftfit.trackers.bank.machine.layout import (
     MOST,
     NOW,
     OPEN,
+    OWNERS,
     PARENTS,
     PHI,
     PLAIN,
@@ -189,8 +190,8 @@ def advance(
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
     decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, gap: Array, moving: Array,
-    path: Array, lag_prob: Array, theta: Array, cov: Array, na: int, unknown: bool, same: bool, plain: bool,
-    walks: bool, apart: bool,
+    path: Array, lag_prob: Array, theta: Array, cov: Array, judges: int, na: int, unknown: bool, same: bool,
+    plain: bool, walks: bool, apart: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite, or
     the chain of the changes.
@@ -283,7 +284,7 @@ def advance(
             take_back(T, K, many[OPEN], gap, H, Hm)
         L = grow(
             A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], now[MOST], na, Qt, maps,
-            theta0, sensors, prior, own, alike, bases, parent, event, X,
+            theta0, sensors, prior, own, alike, bases, parent, event, judges, X,
         )  # fmt: skip
         gone = normalise(B, L)
         many[PARENTS], many[LEAVES] = K, L
@@ -472,7 +473,7 @@ def bank(table: int) -> None:
             packed(t, AT.chain), packed(t, AT.initial)[0], packed(t, AT.given)[0], packed(t, AT.loss),
             packed(t, AT.knobs)[0], packed(t, AT.bases)[0], packed(t, AT.stamps)[0], packed(t, AT.decided),
             packed(t, AT.parts), root, packed(t, AT.samples), packed(t, AT.Qt), packed(t, AT.news), packed(t, AT.gap),
-            packed(t, AT.moving), packed(t, AT.path), lag_prob, theta, cov, t[FLAGS, 0], t[FLAGS, 1] > 0,
+            packed(t, AT.moving), packed(t, AT.path), lag_prob, theta, cov, t[OWNERS, 0], t[FLAGS, 0], t[FLAGS, 1] > 0,
             t[FLAGS, 2] > 0, t[PLAIN, 0] > 0, t[PLAIN, 1] > 0, t[PLAIN, 2] > 0,
         )  # fmt: skip
         head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]

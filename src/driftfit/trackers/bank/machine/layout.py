@@ -49,12 +49,12 @@ shapes have one type of record and one driver. Row k of the table says where, in
 AT: Any = namedtuple("AT", PACKED)(*range(len(PACKED)))
 """Rows of the table by the names of the arrays, for the machine."""
 GIVEN, FACTORS = AT.given, AT.factors
-PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
-BASE, REPORT, PHI, POWERS, THETA, COV, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
-"""Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
-and whether the noise is unknown and events are independent; of PLAIN whether all leaves have one regressor, all changes
-are walks and all sensors differ in their noise alone, whether all changes are walks, and whether what may have happened
-since the last used sample is one floor; and how many rows there are.
+PLACES, ADDRESSES, REPORTED = len(PACKED), 9, PACKED[-2:]
+BASE, REPORT, PHI, POWERS, THETA, COV, MANY, NOW, OWNERS, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 12)
+"""Further rows of the table, whose first entry is an address, OWNERS that of the user's own likelihoods; of FLAGS the
+output lags that leaves have of their own, and whether the noise is unknown and events are independent; of PLAIN whether
+all leaves have one regressor, all changes are walks and all sensors differ in their noise alone, whether all changes
+are walks, and whether what may have happened since the last used sample is one floor; and how many rows there are.
 """
 
 

@@ -1,4 +1,4 @@
-"""The machines of a bank: the one of `advance`, and it with some of its parts exchanged."""
+"""The machines of a bank, and the steps that run them."""
 
 from __future__ import annotations
 
@@ -9,21 +9,29 @@ from typing import Any
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Outside, exchanged
 from driftfit.trackers.bank.leaves import square_root_form
-from driftfit.trackers.bank.leaves.own_sensor import chosen, own_likelihood
+from driftfit.trackers.bank.leaves.own_sensor import entry_of, own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.steps import STEPS
 
 
 @cache
+def _factored() -> Outside:
+    """The machine of `advance` with the parts exchanged that work on covariances."""
+    (machine,) = exchanged([bank], square_root_form.PARTS)
+    return machine  # type: ignore[no-any-return]
+
+
+@cache
 def made(factored: bool, own: tuple[Callable[..., Any], ...]) -> tuple[Outside, TrackerSteps]:
-    """The machine and the steps that run it, for leaves that keep factors, or sensors with likelihoods of the user's
-    ``own``; compiled when it is first asked for.
+    """The machine for leaves that keep factors or covariances, and steps that also know where the user's ``own``
+    likelihoods are.
     """
-    others: dict[Any, Any] = dict(square_root_form.PARTS) if factored else {}
+    others: dict[Any, Any] = {bank: _factored()} if factored else {}
+    machines = STEPS.machines
     if own:
-        others[own_likelihood] = chosen(own)
+        entry, others[own_address] = entry_of(own)
+        machines = (*machines, entry)
     if not others:
         return bank, STEPS
-    (machine,) = exchanged([bank], others)
-    correct, begin = exchanged([STEPS.correct, STEPS.begin], {bank: machine})
-    return machine, STEPS._replace(correct=correct, begin=begin)
+    correct, begin = exchanged([STEPS.correct, STEPS.begin], others)
+    return others.get(bank, bank), STEPS._replace(correct=correct, begin=begin, machines=machines)
