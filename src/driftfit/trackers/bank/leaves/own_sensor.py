@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.callback import address_of, call
-from driftfit.engine.kernel import Array, State, core, floats, kernel, outside
+from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
 
 LARGEST = 1e12
@@ -34,7 +34,7 @@ LOG_P, NOISE, CLEAN = range(3)
 """What a function says."""
 
 
-@core
+@shared
 def judge(
     address: int, which: float, B: Array, at: int, l: int, expected: Array, y: float, r: float, unknown: bool,
     last: float, said: Array,
@@ -49,7 +49,7 @@ def judge(
     said[CLEAN] = said[CLEAN] if abs(said[CLEAN]) < np.inf else y
 
 
-@core
+@shared
 def judge_all(
     address: int, which: float, B: Array, at: int, columns: int, expected: Array, y: float, r: float, unknown: bool,
     last: float, X: Array, row: int, said: Array,
@@ -61,7 +61,7 @@ def judge_all(
         expected[0, l] += said[NOISE]
 
 
-@core
+@shared
 def weigh_all(
     address: int, which: float, B: Array, at: int, columns: int, expected: Array, y: float, r: float, unknown: bool,
     last: float, X: Array, row: int, said: Array,
@@ -73,7 +73,7 @@ def weigh_all(
         X[row, l] = said[LOG_P]
 
 
-@core
+@shared
 def clean_all(
     address: int, which: float, B: Array, at: int, columns: int, n: int, expected: Array, y: float, r: float,
     unknown: bool, last: float, said: Array,
@@ -101,13 +101,13 @@ def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
         said[0, 0], said[0, 1], said[0, 2] = chosen(which, y, y_hat, h, r, last)
 
     likelihoods.__annotations__ = {name: "float" for name in ("which", "y", "y_hat", "h", "r", "last")}
-    machine = outside(likelihoods)
+    entry = machine(likelihoods)
 
     @kernel
     def address(s: State) -> int:
-        return address_of(machine)  # type: ignore[no-any-return]
+        return address_of(entry)  # type: ignore[no-any-return]
 
-    return machine, address
+    return entry, address
 
 
 def _chosen(functions: Sequence[Callable[..., Any]]) -> Any:

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST, LOG, WEIGHT, variance_factor
 from driftfit.trackers.bank.machine.layout import OPEN, TAKEN
 
@@ -42,7 +42,7 @@ def further(dt: float) -> int:
     return int(min(dt, MOST_STEPS) - 0.5) if dt > 1.0 else 0
 
 
-@core
+@shared
 def go_on(
     path: Array, many: Array, P: Array, row: Array, alike: bool, Hm: int, dt: float, used: bool, Q: Array, X: Array
 ) -> None:  # fmt: skip
@@ -62,7 +62,7 @@ def go_on(
             Q[c, k] *= share if used else 0.0
 
 
-@core
+@shared
 def open_gap(path: Array, H: int) -> None:
     """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare, whose last entry
     says how many leaves there is room for.
@@ -72,13 +72,13 @@ def open_gap(path: Array, H: int) -> None:
             path[row, k] = 1.0 if row < 2 * H and k == row % H else 0.0
 
 
-@core
+@shared
 def step(P: Array, row: Array, alike: bool, e: int, to: int) -> float:
     """p(next event is ``to`` | e): a row for all where they are ``alike``."""
     return row[to] if alike else P[e, to]  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def lengthen(path: Array, P: Array, row: Array, alike: bool, Hm: int, Q: Array, share: float, X: Array) -> None:
     """One more sample of which nothing is known, in which change c adds ``share`` of Q[c]."""
     H = len(row)
@@ -105,7 +105,7 @@ def lengthen(path: Array, P: Array, row: Array, alike: bool, Hm: int, Q: Array, 
     path[2 * H, path.shape[1] - 1] = 1.0  # the first sample may lead from any event into a mode
 
 
-@core
+@shared
 def add_variance(h: Array, L: int, n: int, na: int, Z: Array, path: Array, H: int, Hd: int, event: Array) -> None:
     """h <- h + z' mean[s] z, for leaves whose last events are s."""
     for l in range(L):
@@ -116,7 +116,7 @@ def add_variance(h: Array, L: int, n: int, na: int, Z: Array, path: Array, H: in
                 at += 1
 
 
-@core
+@shared
 def add_covariance(
     P: Array, B: Array, L: int, unknown: bool, path: Array, H: int, Hd: int, event: Array, X: Array
 ) -> None:  # fmt: skip
@@ -133,14 +133,14 @@ def add_covariance(
                     at += 1
 
 
-@core
+@shared
 def widen_leaf(A: Array, n: int, k: int, q: Array, X: Array) -> None:
     """C + q of one leaf, q being a lower triangle; X is spare."""
     for i in range(n * (n + 1) // 2):
         A[FIRST + n + i, k] += q[i]
 
 
-@core
+@shared
 def origins(B: Array, L: int, group: Array, K: int, event: Array, origin: Array) -> None:
     """origin[s, k]: share of the weight of group k that had s as its last event before the gap."""
     for s in range(len(origin)):
@@ -157,7 +157,7 @@ def origins(B: Array, L: int, group: Array, K: int, event: Array, origin: Array)
             origin[s, k] /= total
 
 
-@core
+@shared
 def split(
     A: Array, K: int, T: Array, floors: int, n: int, Hm: int, path: Array, P: Array, row: Array, alike: bool,
     standing: bool, prior: Array, X: Array,
@@ -216,7 +216,7 @@ def split(
     return count
 
 
-@core
+@shared
 def next_event(
     P: Array, row: Array, alike: bool, standing: bool, Hm: int, p: Array, prior: Array, k: int
 ) -> None:  # fmt: skip
@@ -235,7 +235,7 @@ def next_event(
                 prior[e, k] = 0.0
 
 
-@core
+@shared
 def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> None:
     """What the leaf of one mode remembers: that mode at every floor of the gap, and sensors as they were likely."""
     block = H + 1
@@ -256,7 +256,7 @@ def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> N
             T[k, at + H] = T[k, at + H] / quiet if quiet > 0.0 else 0.0
 
 
-@core
+@shared
 def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, kappa: float) -> None:
     """What the leaf of all other courses remembers: the mean without the course of one mode."""
     block = H + 1

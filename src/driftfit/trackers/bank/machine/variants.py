@@ -7,7 +7,8 @@ from functools import cache
 from typing import Any
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Outside, exchanged
+from driftfit.engine.kernel import Machine
+from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import square_root_form
 from driftfit.trackers.bank.leaves.own_sensor import entry_of, own_address
 from driftfit.trackers.bank.machine.advance import bank
@@ -15,14 +16,14 @@ from driftfit.trackers.bank.machine.steps import STEPS
 
 
 @cache
-def _factored() -> Outside:
-    """The machine of `advance` with the parts exchanged that work on covariances."""
-    (machine,) = exchanged([bank], square_root_form.PARTS)
+def _factored() -> Machine:
+    """The machine of `advance` with the parts substituted that work on covariances."""
+    (machine,) = substituted([bank], square_root_form.PARTS)
     return machine  # type: ignore[no-any-return]
 
 
 @cache
-def made(factored: bool, own: tuple[Callable[..., Any], ...]) -> tuple[Outside, TrackerSteps]:
+def made(factored: bool, own: tuple[Callable[..., Any], ...]) -> tuple[Machine, TrackerSteps]:
     """The machine for leaves that keep factors or covariances, and steps that also know where the user's ``own``
     likelihoods are.
     """
@@ -33,5 +34,5 @@ def made(factored: bool, own: tuple[Callable[..., Any], ...]) -> tuple[Outside, 
         machines = (*machines, entry)
     if not others:
         return bank, STEPS
-    correct, begin = exchanged([STEPS.correct, STEPS.begin], others)
+    correct, begin = substituted([STEPS.correct, STEPS.begin], others)
     return others.get(bank, bank), STEPS._replace(correct=correct, begin=begin, machines=machines)
