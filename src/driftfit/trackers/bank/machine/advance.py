@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from driftfit.engine.kernel import Array, core, floats, outside, part, wholes
+from driftfit.engine.kernel import Array, floats, machine, part, shared, wholes
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
@@ -60,6 +60,7 @@ from driftfit.trackers.bank.machine.layout import (
     LEAVES,
     LIMIT,
     MANY,
+    MOST,
     NOW,
     OPEN,
     PARENTS,
@@ -272,8 +273,8 @@ def advance(
         if many[OPEN] > 0:
             take_back(T, K, many[OPEN], gap, H, Hm)
         L = grow(
-            A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], na, Qt, maps, theta0,
-            sensors, prior, own, alike, bases, parent, event, X,
+            A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], now[MOST], na, Qt, maps,
+            theta0, sensors, prior, own, alike, bases, parent, event, X,
         )  # fmt: skip
         gone = normalise(B, L)
         many[PARENTS], many[LEAVES] = K, L
@@ -291,8 +292,8 @@ def advance(
             many[IMPOSSIBLE] += 1
             L = recover(A, K, B, len(A))
             many[LEAVES], many[EXPANDED] = L, 1
-            shift_covariance(B, L, B, slice(0, L), n, na, False, m, h, now[R], X[len(X) - na :])
-            push(B, L, n, na, now[IN_Y], True, y_hat)
+            shift_covariance(B, L, B, slice(0, L), n, na, False, m, expected, now[R], now[MOST], X[len(X) - na :])
+            push(B, L, n, na, now[IN_Y], True, y_hat, now[MOST])
             outlook(T, event, True, first, alike, L, P, row, prior, dt, Hm, apart, wide, False, gap, X)
             shift(T, L, prior, Hm)
         many[FLOORS] += 1
@@ -305,8 +306,8 @@ def advance(
         )  # fmt: skip
     else:
         seen = now[IN_SEEN] > 0.0
-        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, h, now[R], X[len(X) - na :])
-        push(B, L, n, na, now[IN_Y], seen, y_hat)
+        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, expected, now[R], now[MOST], X[len(X) - na :])
+        push(B, L, n, na, now[IN_Y], seen, y_hat, now[MOST])
         if dt != 0.0:
             if not expanded:
                 write_out(T, L, H, Hm, parent, event, news, T2)
@@ -373,7 +374,7 @@ def refused(now: Array, many: Array) -> bool:
     return False
 
 
-@core
+@shared
 def certain(prior: Array, L: int) -> None:
     """The first event, for sure."""
     for l in range(L):
@@ -387,7 +388,7 @@ def store(sample: Array, now: Array, phi: Array) -> None:
         sample[TIME + 1 + i] = phi[i]
 
 
-@core
+@shared
 def recover(A: Array, K: int, B: Array, rows: int) -> int:
     """The parents again, as if the sample had not come."""
     for row in range(rows):
@@ -406,7 +407,7 @@ def lone_density(now: Array) -> float:
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
     """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
     H = len(P)
@@ -432,7 +433,7 @@ def note(ring: Array, clock: int, window: float, now: Array, lag_prob: Array) ->
         ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
 
 
-@outside
+@machine
 def bank(table: int) -> None:
     """One sample, by the table of a bank. Only here, where Numba lets a function own memory, can arrays be made of
     addresses; so they are handed to `advance`, into which this writes them.
