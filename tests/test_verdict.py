@@ -182,7 +182,9 @@ def test_a_mean_that_wanders_as_noise_does_is_followed_as_well_by_lags():
     assert said.drifts is False
     assert said.pays is False
     assert said.rivals[1].p < 1e-4
-    assert "Tracking them predicts better than constants, but not than constants with two more lags" in said.sentences[0]
+    assert (
+        "Tracking them predicts better than constants, but not than constants with two more lags" in said.sentences[0]
+    )
 
 
 def correlated(seed, T=300, rho=0.6, jump=0.0):
