@@ -71,7 +71,7 @@ def errors(run: Track, burn: int | None = None) -> Errors:
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
     arx = constant_least_squares(small, Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    lagged = _with_lags(steady, y, run._known[:, 1])
+    lagged = _with_lags(steady, y, run.known.noise)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
     own = (tracked, y - persistence(y), constant, lagged, arx["e"][:, 0])
     scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
