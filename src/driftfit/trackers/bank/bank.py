@@ -45,17 +45,16 @@ from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves import forget, square_root_form
+from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
-from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
 from driftfit.trackers.bank.machine.start import GROWTH, begin
-from driftfit.trackers.bank.machine.steps import STEPS
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.variants import made
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
 from driftfit.trackers.parts.excitation import window
@@ -204,6 +203,13 @@ class Bank(Tracker):
         """Whether it may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
         walks = not any(one.forgets for one in self.all_changes)
         return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
+
+    @property
+    def chained(self) -> bool:
+        """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
+        merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
+        walks = not any(one.forgets for one in self.all_changes)
+        return len(self.all_changes) > 1 and not self._apart and not merging and walks
 
     @property
     def change_names(self) -> tuple[str, ...]:
@@ -397,7 +403,8 @@ class Bank(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        machine, steps = square_root_form.made() if self.form == "sqrt" else (bank, STEPS)
+        own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
+        machine, steps = made(self.form == "sqrt", own)
         machine.load()
         return steps
 
