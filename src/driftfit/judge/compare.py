@@ -91,6 +91,6 @@ def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
 
 def compare(run: Track) -> Comparison:
     """Score a run beside persistence, constant least squares and constant ARX."""
-    tracked, last, ls, _, constant, scored = errors(run)
-    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in (tracked, last, ls, constant))
-    return Comparison(tracked, last, ls, constant, int(scored.sum()))
+    made = errors(run)
+    shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
+    return Comparison(*(root_mean_square(error[made.scored]) for error in shown), samples=int(made.scored.sum()))
