@@ -93,4 +93,5 @@ def compare(run: Track) -> Comparison:
     """Score a run beside persistence, constant least squares and constant ARX."""
     made = errors(run)
     shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
-    return Comparison(*(root_mean_square(error[made.scored]) for error in shown), samples=int(made.scored.sum()))
+    tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)
+    return Comparison(tracked, last, ls, constant, int(made.scored.sum()))
