@@ -178,7 +178,8 @@ class Verdict(Printed):
         if self.rivals[1].p < self.level:
             return (
                 "Tracking them predicts better than constants, but not than constants with two more lags of "
-                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). Lags may be all that is missing."
+                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). Lags may be all that "
+                "is missing."
             )
         return (
             f"Tracking them does not clearly pay here: the one-step error is {size} than that of {who} "

@@ -42,6 +42,16 @@ class Structure(NamedTuple):
     columns: tuple[int, ...] | None
 
 
+def unscored(T: int, n: int) -> int:
+    """Samples at the beginning that score no structure, of at most n parameters: 100, or half of a short record."""
+    return max(50, 5 * n, min(100, T // 2))
+
+
+def price(n: int, start: int) -> float:
+    """What n parameters cost in the log-likelihood of the first ``start`` samples, which is not scored."""
+    return 0.5 * n * float(np.log(start))
+
+
 class Predicted(NamedTuple):
     """What a structure said of every sample before its output was seen; NaN where it said nothing."""
 
