@@ -5,6 +5,7 @@ from importlib.metadata import version
 from driftfit.data import prepare
 from driftfit.engine.settings import DataWarning
 from driftfit.judge.segment import segment
+from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -48,6 +49,7 @@ __all__ = [
     "Hybrid",
     "Kalman",
     "Live",
+    "LiveSelection",
     "OutputError",
     "Regression",
     "Sensor",

@@ -170,7 +170,7 @@ class Track(Judged):
         with np.errstate(invalid="ignore", divide="ignore"):
             gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
         terms = np.where(counted, gaussian if own is None else own[:, self._lane], np.nan)
-        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
+        if self.model.implicit and not self.tracker.output_error:
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
 
@@ -277,10 +277,7 @@ class Track(Judged):
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
-        convert = getattr(self.model, "polynomials", None)
-        if convert is None:
-            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
-        return cast("tuple[Array, list[Array]]", convert(self.theta))
+        return self.model.polynomials(self.theta)
 
     def blocks(
         self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
