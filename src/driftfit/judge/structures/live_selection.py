@@ -6,7 +6,8 @@ A candidate that predicts better gains weight; what is long past is forgotten, s
 that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, as each
 density stands for a prediction that was made before its output was seen. A sample that one candidate cannot use moves
 no weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
-long to come right when a candidate becomes true. Over the same samples the weights are those of ``select(..).average(a)``.
+long to come right when a candidate becomes true. Over the same samples the weights are those of
+``select(..).average(a)``.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is what Feng
 and Hong (2021), section 6, leave open. Cost: that of the candidates.
