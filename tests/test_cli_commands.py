@@ -171,7 +171,7 @@ def test_detect_scores_labels_and_writes_alarms(table):
     page = Path("page.html").read_text()
     assert "Faults and alarms" in page
     assert "2024-03-01 11:20:00" in page  # the label begins
-    assert "1 of 1 labelled stretches found" in page
+    assert "1 of 1 labelled intervals found" in page
     said = run("detect", *DATED, "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
     assert "b1[valve]" in said
     assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
@@ -229,7 +229,7 @@ def test_page_of_a_fleet_marks_labels(table):
     fleet = track(ARX(1, 1), K, np.stack([y, y]), np.stack([u, u])[..., None], by="row")
     fleet.report("page.html", labels={0: wrong})
     page = Path("page.html").read_text()
-    assert "Stretches labelled as wrong" in page
+    assert "Intervals labelled as wrong" in page
     assert ">200<" in page
     with pytest.raises(ValueError, match="which has no result"):
         fleet.report("page.html", labels={7: wrong})

@@ -200,7 +200,7 @@ def test_a_reference_in_local_time():
 def test_a_tracker_that_adapts_is_warned_of():
     y, u = arx_record(200, 3)
     run = track(ARX(2, 2), AdaptiveKalman(), y, u)
-    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault away.*\"band\".*tune"):
+    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"band\".*tune"):
         run.detect("innovation")
     run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
 

@@ -45,7 +45,7 @@ def test_those_that_move_are_found_and_named(fleet):
     assert said["<1>"].said == fleet["<1>"].verdict()
     assert said["<1>"].pays
     assert said.rows[-1].key == "<6>"
-    assert "In 2 of 6" in said.sentences[0]
+    assert "move in 2 of 6" in said.sentences[0]
     assert "1 cannot be tested" in said.sentences[-1]
     table = said.table
     assert table["key"][0] in said.drifting
@@ -140,7 +140,7 @@ def test_outputs_of_one_record(tmp_path):
     run.report(tmp_path / "outputs.html")
     page = (tmp_path / "outputs.html").read_text()
     assert "<h1>level, flow</h1>" in page
-    assert "Those that move most clearly" in page
+    assert "The series that move most clearly" in page
     rows = np.stack([u, u[:, ::-1]], axis=1)
     theta = np.column_stack([np.ones(T), gain])
     y = np.einsum("toi,ti->to", rows, theta) + 0.1 * rng.normal(size=(T, 2))
@@ -172,7 +172,7 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
         judged = [str(len(row.alarms.onsets)), *row.first.split()]
         told = next(line for line in printed if line[0] == row.key)
         assert told[1 : 1 + len(judged)] == judged
-        assert (told[-1] == "something") == row.faulty
+        assert (told[-1] == "fault") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
     with pytest.raises(KeyError, match="too short"):
         said["<6>"]
@@ -217,11 +217,11 @@ def test_without_faults_few_series_are_accused():
         ({"every": 0.5}, "every"),
         ({"every": "ten"}, "every"),
         ({"every": np.inf}, "every"),
-        ({}, "where the parameters"),
+        ({}, "normal range of the parameters"),
         ({"reference": {}}, "names"),
         ({"reference": {"b1[u]": 1.0}}, "low <= high"),
         ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
-        ({"reference": {"<1>": 140}}, "nothing for <0>, <2>"),
+        ({"reference": {"<1>": 140}}, "missing for <0>, <2>"),
     ],
 )
 def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
@@ -235,5 +235,5 @@ def test_a_page_about_nothing_says_so(tmp_path):
     run.report(tmp_path / "nothing.html")
     page = (tmp_path / "nothing.html").read_text()
     assert "2 cannot be tested" in page
-    assert "No diagnostic can be told" in page
-    assert not any(claim in page for claim in ("In none of", "within limits", "move most clearly"))
+    assert "No diagnostic can be computed" in page
+    assert not any(claim in page for claim in ("No drift is found in any of", "within limits", "move most clearly"))

@@ -168,7 +168,7 @@ def test_dates_without_a_zone_are_in_that_of_the_table():
     ("exclude", "says"),
     [
         ([(5, 3)], "must not end before"), ((3, 5), "each interval must be"), (["ab"], "each interval must be"),
-        ([("x", 5)], "is a number"), ([(1, 2, 3)], "each interval must be"),
+        ([("x", 5)], "must be a number"), ([(1, 2, 3)], "each interval must be"),
     ],
 )  # fmt: skip
 def test_wrong_stretches_are_named(exclude, says):

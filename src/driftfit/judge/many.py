@@ -129,18 +129,18 @@ class ManyVerdicts(Printed):
         tested, paying = (int(np.isfinite([getattr(row, q) for row in self.rows]).sum()) for q in ("q", "q_pays"))
         drifting, pays = len(self.drifting), sum(row.pays for row in self.rows)
         found = (
-            f"In {drifting} of {tested} the parameters move; of those at most {100.0 * self.level:g} % stand still, on "
+            f"Parameters move in {drifting} of {tested}; at most {100.0 * self.level:g} % of those are constant, on "
             "average (false discovery rate)."
             if drifting
-            else f"In none of {tested} is a drift found. One that is small beside the noise cannot be ruled out."
+            else f"No drift is found in any of {tested}. A drift much smaller than the noise cannot be ruled out."
             if tested
             else ""
         )
         names = Counter(name for row in self.rows for name in row.moving).most_common(3)
-        which = f"Most often it is {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
-        gain = f"Following them pays in {pays} of {paying}." if paying else ""
+        which = f"The most frequent: {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
+        gain = f"Tracking pays in {pays} of {paying}." if paying else ""
         rest = len(self.rows) - tested
-        short = f"{rest} cannot be tested: too few samples, or regressors that do not span." if rest else ""
+        short = f"{rest} cannot be tested: they have too few samples, or regressors that do not span." if rest else ""
         return tuple(filter(None, (found, which, gain, short)))
 
     @property

@@ -124,12 +124,12 @@ class ManyAlarms(Printed):
             ("Alarms", f"{begun} in {len(self.alarmed)} series; {self.expected:.2g} false alarms expected"),
             (
                 "Series",
-                f"{len(self.faulty)} had something; of those at most {100.0 * self.level:g} % had nothing, on average",
+                f"{len(self.faulty)} with a fault; at most {100.0 * self.level:g} % of those are false, on average",
             ),
         )
         table = table_of("The most extreme first", "", "alarms", "the first", "p", "q", "", names=1)
         for row in self.rows[:SHOWN]:
-            numbers = (p_text(row.alarms.p), p_text(row.q), "something" if row.faulty else "")
+            numbers = (p_text(row.alarms.p), p_text(row.q), "fault" if row.faulty else "")
             table.add_row(Text(key_text(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
         yield table
         if len(self.rows) > SHOWN:

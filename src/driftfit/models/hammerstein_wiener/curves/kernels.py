@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, exp, floats, kernel, outside
+from driftfit.engine.kernel import Array, exp, floats, kernel, machine
 
 POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE, SATURATION, SIGMOIDS = range(8)
 
@@ -238,7 +238,7 @@ def machine_of(function: Any) -> Any:
         function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
 
     machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a place on disk of its own
-    return outside(machine_evaluate)
+    return machine(machine_evaluate)
 
 
 evaluate = machine_of(every)
