@@ -124,9 +124,9 @@ def _reach(model: Model, still: Kalman, run: Track) -> Iterator[str]:
 
 def _touched(model: Model, still: Kalman, run: Track) -> Iterator[str]:
     for name in ("y", *(("u",) if model.m else ())):
-        record = {"y": run.y.copy(), "u": run.u.copy()}
-        record[name][AT] = np.nan
-        lost = np.flatnonzero(run.ok & ~track(model, still, **record).ok)
+        y, u = run.y.copy(), run.u.copy()
+        (y if name == "y" else u)[AT] = np.nan
+        lost = np.flatnonzero(run.ok & ~track(model, still, y, u).ok)
         said = model.touched(AT, name)
         expected = [AT] if said is None and name == "y" else None if said is None else list(said)
         if expected is not None and lost.tolist() != expected:
