@@ -92,5 +92,5 @@ def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
 def compare(run: Track) -> Comparison:
     """Score a run beside persistence, constant least squares and constant ARX."""
     tracked, last, ls, _, constant, scored = errors(run)
-    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in (tracked, last, ls, constant))
-    return Comparison(tracked, last, ls, constant, int(scored.sum()))
+    rms = [root_mean_square(error[scored]) for error in (tracked, last, ls, constant)]
+    return Comparison(rms[0], rms[1], rms[2], rms[3], int(scored.sum()))

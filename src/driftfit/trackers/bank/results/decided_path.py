@@ -113,7 +113,7 @@ def with_drift(problem: Problem, quiet: Array) -> Problem:
     def unlikely(log_factor: float) -> float:
         tried, shape = wider(log_factor), problem.phi.shape
         m, C = np.empty(shape), np.empty((*shape, shape[1]))
-        return -forward(tried.phi, tried.y, tried.r, tried.Q, tried.m0, tried.C0.copy(), m, C)
+        return -float(forward(tried.phi, tried.y, tried.r, tried.Q, tried.m0, tried.C0.copy(), m, C))
 
     best = minimize_scalar(unlikely, bounds=(0.0, np.log(WIDER)), method="bounded", options={"xatol": CLOSE})
     return wider(best.x) if best.fun < unlikely(0.0) else problem
@@ -172,7 +172,7 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
     """Factors of the noise variance, inf where the sensor said nothing."""
     factor = np.ones(len(run))
     sensors = {sensor.name: sensor for sensor in bank.all_sensors}
-    reach = getattr(run.model, "output_lags", 0)
+    reach = run.model.output_lags or 0
     for event in events:
         if event.kind == "sensor":
             sensor = sensors[event.name]
