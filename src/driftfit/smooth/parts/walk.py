@@ -168,7 +168,7 @@ def replay(run: Track) -> Array:
     Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
     """
     model, tracker = run.model, run.tracker
-    tile = make_tile(model.n, model.m, model.memory(), [{**tracker.state_for(model), "used_noise": 1.0}])
+    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
     out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *tracker.noted)))
     steps = attentive(tracker.steps_for(model))
     drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
