@@ -315,7 +315,7 @@ def test_a_drift_of_the_shape_of_products():
     errors = [np.median(np.linalg.norm(x - s.xi, axis=1)[500:]) for x in (found.xi, plain.xi)]
     assert errors[0] < 0.9 * errors[1]
     assert found.theta.shape == (1500, 14)
-    with pytest.raises(ValueError, match="one variance, or those"):
+    with pytest.raises(ValueError, match="one variance, or four"):
         product_drift(s.model, xi, (1.0, 2.0))
 
 

@@ -159,9 +159,9 @@ def test_what_does_not_fit_is_named():
     z, phi = measured()
     with pytest.raises(ValueError, match=r"y must be \(T, 2\)"):
         track(ARX(1, 1, ny=2), FLS(1.0), y[:, 0], u)
-    with pytest.raises(ValueError, match="shared=True speaks of several outputs"):
+    with pytest.raises(ValueError, match="shared=True needs several outputs"):
         Regression(2, shared=True)
-    with pytest.raises(ValueError, match="each once"):
+    with pytest.raises(ValueError, match="all different"):
         ARX(1, 1, ny=["a", "a"])
     with pytest.raises(ValueError, match="ny must be a whole number"):
         ARX(1, 1, ny=0)

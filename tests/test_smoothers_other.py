@@ -245,7 +245,7 @@ class TestFixedLag:
         with pytest.raises(ValueError, match="no samples are kept"):
             Live(Regression(2), FLS(1.0)).smooth()
         noisy = HammersteinWiener(1, 1, output=Polynomial(2), output_noise=0.1)
-        with pytest.raises(ValueError, match="what the measurement noise of the model adds"):
+        with pytest.raises(ValueError, match="does not support the output_noise"):
             Live(noisy, Kalman(0.1, 0.4, p0=1.0), lag=3)
         with pytest.raises(ValueError, match="lag must be a whole number"):
             Live(Regression(2), FLS(1.0), lag=-1)

@@ -170,7 +170,7 @@ def test_the_headline_is_one_statement_of_both_answers():
     assert said.drifts is False
     assert said.pays
     assert "No drift" not in str(said)
-    assert said.sentences[0].startswith("Something can be followed")
+    assert said.sentences[0].startswith("Tracking reduces the error")
     assert "smaller than that of constants" in said.sentences[0]
 
 
@@ -299,8 +299,8 @@ def test_records_that_can_tell_nothing():
     assert np.isnan(said.p)
     assert said.drifts is None
     assert said.pays is None
-    assert "18 samples can be used, and 24 are the least" in said.sentences[0]
-    assert "0 samples are left after the first 50" in said.sentences[0]
+    assert "18 samples can be used, and at least 24 are needed" in said.sentences[0]
+    assert "0 samples remain after the first 50" in said.sentences[0]
     assert track(ARX(2, 2), Kalman(q=1e-3, r=0.1), y, u).verdict(burn=5).scored == 15
     same = track(ARX(2, 2), Kalman(q=1e-3, r=0.1), *arx_record(200, 1)[:1], np.zeros(200)).verdict()
     assert np.isnan(same.p)

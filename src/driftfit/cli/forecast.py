@@ -45,7 +45,7 @@ def forecast(
         ahead = 10 if u is None else len(u)
     if u is None and given.inputs:
         raise ValueError(
-            f"forecast: the inputs to come are needed: --future FILE with the columns {', '.join(given.inputs)}."
+            f"forecast: future inputs are needed: --future FILE with the columns {', '.join(given.inputs)}."
         )
     run: Track = given.run()
     made = run.forecast(ahead, None if u is None else u[:ahead])

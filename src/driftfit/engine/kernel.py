@@ -252,7 +252,8 @@ MOST_ENTRIES = 256
 
 KEPT = 300
 """Parts whose code is kept for drivers to come, of some 0.2 MB each; a driver takes in some twenty to sixty, and the
-same for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in turn.
+same for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
+turn.
 """
 
 

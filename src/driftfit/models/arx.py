@@ -86,7 +86,7 @@ class ARX(Model):
             self._set("inputs", 0)
         if counts - {self._count}:
             raise ValueError(
-                f"ARX: nb={self.nb!r}, nk={self.nk!r} and inputs={self.inputs!r} speak of different numbers of inputs."
+                f"ARX: nb={self.nb!r}, nk={self.nk!r} and inputs={self.inputs!r} imply different numbers of inputs."
             )
         one_of("ARX", "start", self.start, ("drop", "zero"))
         if self.inputs is not None and self.n == 0:
@@ -112,7 +112,7 @@ class ARX(Model):
         count = inputs if isinstance(inputs, int) else len(inputs)
         if self.inputs is None:
             if count == 0:
-                raise ValueError(f"ARX: nb={self.nb!r} asks for an input, but there is no u; give u, or nb=0.")
+                raise ValueError(f"ARX: nb={self.nb!r} needs an input, but there is no u; give u, or nb=0.")
             return replace(self, inputs=count if isinstance(inputs, int) else tuple(inputs))
         if count != self.m:
             raise ValueError(

@@ -208,7 +208,7 @@ class Track(Judged):
     def hypotheses(self) -> Hypotheses:
         """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
         if not self.tracker.weighs:
-            raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
+            raise ValueError(f"hypotheses: {type(self.tracker).__name__} has no hypotheses; track with a Bank.")
         from driftfit.trackers.bank.results.results import Hypotheses
 
         return Hypotheses(self)
@@ -227,7 +227,7 @@ class Track(Judged):
         from driftfit.smooth.smoothed import Smoothed
 
         if self._start is not None:
-            raise ValueError("smooth: what a warm start knew of the past cannot be smoothed; track the whole record.")
+            raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         if self.tracker.weighs:
             return cast("Smoothed", self.hypotheses.smooth())
         return Smoothed.of(self, keep, order_by, undetermined)
@@ -279,7 +279,7 @@ class Track(Judged):
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
         convert = getattr(self.model, "polynomials", None)
         if convert is None:
-            raise ValueError(f"polynomials: {type(self.model).__name__} has none; they belong to ARX.")
+            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
         return cast("tuple[Array, list[Array]]", convert(self.theta))
 
     def blocks(

@@ -116,7 +116,7 @@ class Shared:
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
         """The smoothed path: theta (T, n) as here, residuals of every output (T, ny)."""
         if order_by is not None:
-            raise ValueError("smooth: order_by= would tear the rows of an instant apart; it is for single outputs.")
+            raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
         return SmoothedShared(self.rows.smooth(keep, undetermined=undetermined), self)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
@@ -183,7 +183,7 @@ def row_model(model: Model, tracker: Tracker, m: int | None = None) -> Model:
     assert isinstance(model, Regression)
     if not tracker.covariance:
         raise ValueError(
-            f"{type(tracker).__name__} carries no covariance, so one row of an instant would not know of the others; "
+            f"{type(tracker).__name__} carries no covariance, so the rows of an instant could not inform each other; "
             "use FLS, Kalman or RLS with shared=True."
         )
     alone = replace(model, ny=1, shared=False)

@@ -84,7 +84,7 @@ def track_outputs(
     one_of("track", "keep", keep, ("std", "cov"))
     failed: Mapping[Hashable, str] = {}
     if reading.units is not None:
-        raise ValueError("track: units= is for single outputs; several outputs carry none.")
+        raise ValueError("track: units= is not supported for several outputs.")
     if data is not None:
         model, found, failed = of_table(model, y, u, data, by, reading)
     elif by == "row":
@@ -103,7 +103,7 @@ def track_outputs(
     if isinstance(tracker, Sequence):
         raise ValueError("track: a grid of trackers over several outputs is for one record; leave by= out.")
     if before is not None and not isinstance(before, Mapping):
-        raise ValueError(f"warm_start: with by= it is what such a run gave, from key to record; got {before!r}.")
+        raise ValueError(f"warm_start: with by= pass the result of such a run, from key to record; got {before!r}.")
     starts = before or {}
     runs = {key: run_one(model, tracker, one, keep, starts.get(key)) for key, one in found.items()}
     return OutputsFleet(runs, failed, ("series",) if by == "row" else (by,) if isinstance(by, str) else by)
@@ -120,6 +120,8 @@ def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run
     bound = model.bind(signals.labels.u or u.shape[1])
     trackers = trackers_of(bound, tracker)
     starts = taken_over(before, bound, trackers)
+    for lane, output in enumerate(bound.outputs):
+        (bound.alone(output) or bound).inspect(y[:, lane], u)
     known = known_of(bound, trackers, signals._replace(gaps=gaps))
     tile = joint_tile(bound, trackers, starts)
     out = np.empty(len(y), output_type(tile, trackers[0].outputs, keep_of(keep, trackers[0])))

@@ -75,7 +75,7 @@ def report(
 def check_path(path: str | PathLike[str]) -> Path:
     """Where a page goes; ValueError where the name is not that of a page."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"report: the page is HTML, so its name ends in .html; got {str(path)!r}.")
+        raise ValueError(f"report: the page is HTML, so its name must end in .html; got {str(path)!r}.")
     return Path(path)
 
 
@@ -92,13 +92,13 @@ def page(run: Track, title: str | None = None, alarms: Alarms | None = None, lab
         section("Parameters", _parameter_table(facts, said) + _system_table(run)),
         section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
         section("Diagnostics", _checks(health) + picture(draw_diagnosis(health), run, DIAGNOSTICS)),
-        section("Settings, and what was left out", _settings(run, facts)),
+        section("Settings and omitted data", _settings(run, facts)),
         section("How to read this", READING),
     ]
     return document(heading, sections)
 
 
-PARAMETERS = "Each parameter after every sample (line) with its 95 % band: what was known then, nothing looks ahead."
+PARAMETERS = "Each parameter after every sample (line) with its 95 % band. Each estimate uses the past only."
 SIGNALS = (
     "Above: the output (dots) and its prediction one sample before. Below: the prediction error and its 95 % band."
 )
@@ -186,7 +186,7 @@ def _settings(run: Track, facts: Summary) -> str:
     missing_y, missing_u = int(np.sum(~np.isfinite(run.y))), int(np.sum(~np.isfinite(run.u).all(axis=1)))
     pairs = [
         ("Model", facts.model), ("Tracker", facts.tracker), ("Signals", facts.signals), ("Time", facts.span),
-        ("Samples", f"{facts.samples}, of which {facts.used} used and {facts.samples - facts.used} skipped"),
+        ("Samples", f"{facts.samples}, of which {facts.used} were used and {facts.samples - facts.used} skipped"),
         ("Missing", f"{missing_y} outputs, {missing_u} samples with a missing input"),
         ("Rows left out", facts.dropped or "none"), ("Log-likelihood", f"{facts.loglik:.6g}"),
         ("Made by", f"driftfit {__version__}"),

@@ -63,7 +63,7 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
         f"{picture(plot_alarms(row.alarms, _given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
         for row in shown
     )
-    return table(f"Stretches labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
+    return table(f"Intervals labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
         pictures
     )
 
@@ -98,11 +98,11 @@ def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
 def _said(alarms: Alarms, wrong: Array | None) -> str:
     text = (
         f"Alarm: {alarms.kind}, one false alarm in {alarms.every:g} samples. {len(alarms.onsets)} alarms; "
-        f"{p_text(alarms.p)} is the chance that a record without a fault gets as extreme as this one."
+        f"A record without a fault is as extreme as this one with probability {p_text(alarms.p)}."
     )
     if wrong is not None:
         score = alarms.score(wrong)
-        text += f" {score.found} of {score.events} labelled stretches found, {score.false} false alarms."
+        text += f" {score.found} of {score.events} labelled intervals found, {score.false} false alarms."
     return f"<p>{escape(text)}</p>"
 
 

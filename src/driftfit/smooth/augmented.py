@@ -92,7 +92,7 @@ def augmented(
     T, n = walk.phi.shape
     started = np.flatnonzero(walk.drift)
     if started.size and np.ptp(walk.drift[started]) > 0.0:
-        raise ValueError("augmented: the sweeps need even steps; run.smooth() of an FLS run takes any.")
+        raise ValueError("augmented: the sweeps need even steps; run.smooth() of an FLS run does not.")
     before = vector("augmented", "theta0", run.tracker.theta0, n)
     theta = np.array(np.broadcast_to(before if start is None else np.asarray(start, dtype=float), (T, n)))
     if printed == "corrected" and T == 1:

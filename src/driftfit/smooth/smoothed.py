@@ -77,7 +77,7 @@ class Smoothed:
             size = len(run.names) * (2 if len(walk.trend) else 1)
             raise ValueError(
                 f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
-                'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
+                'leave them out of the model, or take the solution nearest to theta0 with undetermined="min_norm".'
             )
         if undetermined == "nan":
             smoothed.theta[unknown] = np.nan
@@ -113,7 +113,7 @@ class Smoothed:
 
     def _of_slopes(self, values: Array) -> Array:
         if not len(self.walk.trend):
-            raise ValueError("slope: theta itself walks at random here; FLS(mu, differences=2) gives it a slope.")
+            raise ValueError("slope: theta is a plain random walk here; use FLS(mu, differences=2).")
         return values
 
     @cached_property
@@ -203,8 +203,8 @@ def noise_variance(walk: Walk, path: Path) -> float:
     least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
     if free <= 0 or path.cost <= least:
         warnings.warn(
-            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual to estimate the noise from; "
-            "the path is given without bands.",
+            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual from which to estimate the "
+            "noise; the path has no bands.",
             RuntimeWarning,
             stacklevel=4,
         )

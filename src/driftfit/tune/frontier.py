@@ -63,7 +63,7 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     """
     check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
-        raise ValueError("frontier: of one output at a time: take run[name], and frontier(run[name].model, .y, .u).")
+        raise ValueError("frontier: takes one output at a time: use run[name], and frontier(run[name].model, .y, .u).")
     if mu is None:
         steady = track(model, FLS(1.0), y, u, **known).smooth()
         used = steady.walk.weight > 0.0

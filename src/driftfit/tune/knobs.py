@@ -80,8 +80,8 @@ def _find(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knob
     if missing == ["forgetting"]:
         return _memory(record, tracker, bounds)
     raise ValueError(
-        f"tune: {tracker!r} leaves {', '.join(missing) or 'nothing'} open; what can be found is mu, q and r, or "
-        "forgetting. Leave out what is to be found, as in FLS(), Kalman(r=0.1) or RLS()."
+        f"tune: {tracker!r} leaves {', '.join(missing) or 'nothing'} open; tune can find mu, q and r, or "
+        "forgetting. Leave out the settings to be found, as in FLS(), Kalman(r=0.1) or RLS()."
     )
 
 

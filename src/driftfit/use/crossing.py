@@ -170,7 +170,7 @@ def _limit(below: float | None, above: float | None) -> tuple[float, str]:
         raise ValueError("crossing: give one limit, below= or above=.")
     limit, side = (below, "below") if below is not None else (above, "above")
     if limit is None or not np.isfinite(limit):
-        raise ValueError(f"crossing: {side}={limit!r} is no finite number.")
+        raise ValueError(f"crossing: {side}={limit!r} is not finite.")
     return float(limit), side
 
 
@@ -181,7 +181,7 @@ def _fields(tile: Array) -> dict[str, Array]:
 def _known(run: Track, cov: Array, place: int | None = None) -> Array:
     """A covariance; ValueError where nothing is known yet of what it is about."""
     if not np.isfinite(cov if place is None else cov[place, place]).all():
-        raise ValueError("crossing: nothing is known yet of a parameter that it needs: its std is infinite.")
+        raise ValueError("crossing: a parameter that it needs is not determined yet: its std is infinite.")
     return cov
 
 
@@ -235,9 +235,13 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
     """F from paths of the output, (h + 1,); at the end itself nothing has been measured beyond it."""
     model = run.model
     if u is None and model.m:
-        raise ValueError(f"crossing: the output depends on {model.m} inputs; give those to come, u= ({h}, {model.m}).")
+        raise ValueError(
+            f"crossing: the output depends on {model.m} inputs; give their future values, u= ({h}, {model.m})."
+        )
     if run.tracker.output_error or "slope" in storage.fields(run._tile):
-        raise ValueError("crossing: the output is run on for parameters that walk at random; ask for a parameter.")
+        raise ValueError(
+            "crossing: the crossing of the output needs parameters that are random walks; ask for a parameter."
+        )
     p, rng = model.reach, np.random.default_rng(0)
     r = noise_at(run, -1)
     now, q = _covariances(run)
@@ -245,7 +249,7 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
     inputs = np.concatenate([run.u[len(run) - p :], later])
     past = np.tile(run.y[len(run) - p :], (DRAWS, 1))
     if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
-        raise ValueError("crossing: the last samples and the inputs to come must be known, where lags hold them.")
+        raise ValueError("crossing: the last samples and the future inputs must be known, because lags contain them.")
     zero = np.zeros(len(now))
     theta = run.theta[-1] + rng.multivariate_normal(zero, _known(run, now), DRAWS, method="eigh")
     values, vectors = np.linalg.eigh(q)

@@ -104,7 +104,9 @@ def systems(run: Track, theta: Array) -> Array:
         return theta
     structure = getattr(run.model, "structure", None)
     if structure is None or theta.shape[-1] != structure.n_x:
-        raise ValueError(f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which is no system.")
+        raise ValueError(
+            f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which do not define a system."
+        )
     return np.asarray(structure.products(theta))
 
 

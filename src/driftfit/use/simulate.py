@@ -69,7 +69,7 @@ def ahead(run: Track, k: int) -> Prediction:
     whole("ahead", "k", k, 1)
     if getattr(run.tracker, "differences", 1) > 1:
         raise ValueError(
-            "ahead: predictions over a record hold theta, which moves along its slope here; run.forecast follows it."
+            "ahead: predictions over a record assume a constant theta, but here it follows its slope; use run.forecast."
         )
     if not isinstance(run.model, ARX | Regression):
         from driftfit.use.draws import ahead_by_draws
@@ -182,7 +182,7 @@ def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int,
     if isinstance(model, Regression):
         return 0, np.hstack([u, *one])
     if not isinstance(model, ARX) or len(model.outputs) > 1:
-        raise ValueError(f"predictions over a record are for ARX and Regression with one output; got {model!r}.")
+        raise ValueError(f"predictions over a record need ARX or Regression with one output; got {model!r}.")
     columns = [moved(u[:, j], nk + i, rest) for j, (nb, nk) in enumerate(model.lags) for i in range(nb)]
     return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
 

@@ -82,7 +82,7 @@ def arx_of(run: Followed) -> ARX:
     """The ARX model of a run; ValueError where it has another."""
     if not isinstance(run.model, ARX) or len(run.model.outputs) > 1 or run.names != run.model.names:
         raise ValueError(
-            f"poles, gains and responses belong to runs of ARX with one output; this one followed {run.model!r}."
+            f"poles, gains and responses belong to runs of ARX with one output; this run has {run.model!r}."
         )
     return run.model
 

@@ -46,8 +46,8 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
     """Runs over simulated records with the parameters of sample ``at``; ValueError for models with other regressors."""
     if not isinstance(run.model, ARX | Regression) or len(run.model.outputs) > 1:
         raise ValueError(
-            "detect: a calibration simulates records, which is for ARX and Regression with one output; "
-            f"this run followed {run.model!r}. Give a reference= instead."
+            "detect: a calibration simulates records, which needs ARX or Regression with one output; "
+            f"this run has {run.model!r}. Give a reference= instead."
         )
     rng = np.random.default_rng(seed)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))

@@ -148,14 +148,14 @@ class Alarms(Printed):
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         judged = len(self.active) - self.start
         expected = judged / self.every
-        chance = "that a record without a fault gets as extreme as this one"
+        chance = "is the probability that a record without a fault is this extreme"
         limits = (f"{name} {self.rule.limit_text(j)}" for j, name in enumerate(self.names))
         yield facts(
             ("Alarm", f"{self.kind}, one false alarm in {self.every:g} samples"),
             ("Limits", f"{', '.join(limits)}{' (by simulation)' if self.rule.simulated else ''}"),
             ("Samples", f"{judged} judged from sample {self.start} on; {expected:.2g} false alarms expected"),
             ("Alarms", f"{len(self.onsets)}"),
-            *([] if np.isnan(self.p) else [("Chance", f"{p_text(self.p)} {chance}")]),
+            *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
         table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
         for t in self.onsets[:20]:
@@ -270,9 +270,9 @@ def _highest(statistic: Array, start: int) -> Array:
 def _warn_of_following(run: Track) -> None:
     """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
     warnings.warn(
-        f"detect: {type(run.tracker).__name__} finds its own drift and noise, so it follows a fault away: its "
-        "innovations are soon normal again, and a slow fault hardly shows in them. Watch where the parameters are, "
-        'detect("band", reference=...), or track with numbers that are fitted to the reference and then stay, '
+        f"detect: {type(run.tracker).__name__} estimates its own drift and noise, so it follows a fault: its "
+        "innovations are soon normal again, and a slow fault is hardly visible in them. Watch the parameters with "
+        'detect("band", reference=...), or track with settings that are fitted to the reference and then kept, '
         "tune(model, Kalman(), ...).tracker.",
         UserWarning,
         stacklevel=4,

@@ -38,16 +38,16 @@ def stretch(run: Track, reference: Any) -> tuple[int, int]:
         first, end = reference
     elif reference is None or isinstance(reference, tuple | list):
         raise ValueError(
-            'detect: say where the parameters belong, reference={"b1": (0.9, 1.1)}, how many of the first samples are '
-            f"normal, reference=500, or from when to when, reference=(from, to); got {reference!r}."
+            'detect: give the normal range of the parameters, reference={"b1": (0.9, 1.1)}, the number of first '
+            f"samples that are normal, reference=500, or an interval, reference=(from, to); got {reference!r}."
         )
     else:
         first, end = 0, whole("detect", "reference", reference, 1)
     first = max(first, burn(run))
     if not first + LEAST <= end <= len(run):
         raise ValueError(
-            f"detect: the reference leaves too little: of its samples up to {end} those from {first} on count (the run "
-            f"has {len(run)}, and starts until {burn(run)}), and {LEAST} are needed."
+            f"detect: the reference is too short: it covers samples {first} to {end} (the run has {len(run)}, of "
+            f"which the first {burn(run)} are its start), but {LEAST} samples are needed."
         )
     return first, end
 
@@ -69,7 +69,7 @@ def as_date(given: Any, zone: str | None) -> np.datetime64:
     try:
         date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
     except ValueError:
-        raise ValueError(f"detect: {given!r} is no date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
+        raise ValueError(f"detect: {given!r} is not a date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
     if isinstance(date, np.datetime64):
         if zone is None:
             return date

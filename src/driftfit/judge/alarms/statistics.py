@@ -58,7 +58,7 @@ def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
         edges = np.zeros(0)
     if edges.ndim != 2 or len(edges) != 2 or not (edges[0] <= edges[1]).all():
         raise ValueError(
-            f"detect: a reference names parameters, each with a band (low, high), low <= high; got {dict(reference)!r}."
+            f"detect: a reference maps parameters to bands (low, high), low <= high; got {dict(reference)!r}."
         )
     return edges
 
@@ -79,7 +79,7 @@ def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[Alar
     check_fits(rule, run.tracker, run.names)
     if isinstance(reference, Mapping):
         raise ValueError(
-            'detect: the reference of "innovation" is a number of samples, such as reference=500, or (from, to).'
+            'detect: the reference of "innovation" must be a number of samples, such as reference=500, or (from, to).'
         )
     if reference is not None:
         first, start = stretch(run, reference)

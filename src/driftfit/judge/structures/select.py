@@ -104,7 +104,7 @@ class Selection(Printed):
         found = self._structure(name).model
         if found is None:
             raise ValueError(
-                "select: a subset of regressors is no model by itself; regressors(name) says what it holds."
+                "select: a subset of regressors is not a model by itself; regressors(name) says what it holds."
             )
         return found
 
@@ -168,7 +168,7 @@ def grid(kind: type[Model], **choices: Any) -> list[Model]:
     out; ValueError where none is left.
     """
     if not (isinstance(kind, type) and issubclass(kind, Model)):
-        raise TypeError(f"grid: it makes the models, so give their class, as in grid(ARX, na=[1, 2]); got {kind!r}.")
+        raise TypeError(f"grid: give the class of the models, as in grid(ARX, na=[1, 2]); got {kind!r}.")
     options = [value if isinstance(value, list | range) else [value] for value in choices.values()]
     models: list[Model] = []
     refused = ""
@@ -254,7 +254,8 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
         model = replace(model, inputs=m)
     if not isinstance(inputs, int) and model.input_names not in ((), tuple(inputs)):
         raise ValueError(
-            f"select: candidates name the same inputs in the same order; {model!r} has others than {', '.join(inputs)}."
+            f"select: all candidates must name the same inputs in the same order; {model!r} does not have "
+            f"{', '.join(inputs)}."
         )
     return model.bind(inputs)
 

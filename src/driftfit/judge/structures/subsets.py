@@ -27,7 +27,7 @@ def subsets(
 ) -> tuple[list[Structure], list[Predicted]]:
     """Subsets of the regressors of one model: all, or those that a search visits."""
     if full.columns is None:
-        raise ValueError("select: subsets are those of the regressors of ARX or Regression; give a list of models.")
+        raise ValueError("select: subsets of regressors need an ARX or Regression; otherwise give a list of models.")
     unknown = [name for name in keep if name not in pool.names]
     if unknown:
         raise ValueError(f"select: there is no regressor {unknown[0]!r}; there is {', '.join(pool.names)}.")

@@ -196,8 +196,9 @@ def locating(lanes: bool = False) -> Any:
 
     def locate(m: Array, p: Places, right: float) -> Any:
         m[LATE, 0] = 0.0
-        if not (m[STEP, 0] > 0.0 and abs(right) < LARGEST):
+        if not m[STEP, 0] > 0.0 or right != right:
             return np.nan
+        right = min(max(right, -LARGEST), LARGEST)  # the level beyond all levels of the grid is infinite
         if not rises(m, p):
             return on_envelope(m, p, right)
         below = EIGHT * count(m, p, p[COARSE], EIGHT, right)

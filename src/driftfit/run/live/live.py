@@ -93,7 +93,7 @@ class Live(Operated, Asked, Kept):
         self._alarms: tuple[LiveAlarm, ...] = ()
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
-            raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
+            raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
         self._window = Window(self.model, tracker, lag) if lag else None
         start = None if warm_start is None else carried(warm_start, self.model, tracker)
         self._open(fresh_tile(self.model, tracker, start))
@@ -259,7 +259,7 @@ class Live(Operated, Asked, Kept):
         Row 0 is what `Track.smooth` would say of that sample of a record that ends now.
         """
         if self._window is None:
-            raise ValueError("Live.smooth: no samples are kept; say how many, as in Live(model, tracker, lag=20).")
+            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
         return self._window.smooth(self._tile)
 
     def lane(self) -> dict[str, Array]:

@@ -78,10 +78,10 @@ class Operated(_OfStream):
         """
         chosen = self._chosen(which)
         if p is None and theta is None:
-            raise ValueError("Live.reset: say p= (how far they may have moved, as a variance), theta=, or both.")
+            raise ValueError("Live.reset: give p= (the variance of their possible change), theta=, or both.")
         if self._window is not None:
             raise ValueError(
-                "Live.reset: smoothing with lag= does not know of resets; keep a second stream without it."
+                "Live.reset: smoothing with lag= does not support resets; keep a second stream without lag=."
             )
         count = len(chosen)
         if p is not None:
@@ -121,7 +121,7 @@ class Asked(_OfStream):
     def hypotheses(self) -> LiveHypotheses:
         """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
         if not self.tracker.weighs:
-            raise ValueError(f"hypotheses: {type(self.tracker).__name__} weighs none; track with a Bank.")
+            raise ValueError(f"hypotheses: {type(self.tracker).__name__} has no hypotheses; track with a Bank.")
         from driftfit.trackers.bank.results.live_results import LiveHypotheses
 
         return LiveHypotheses(cast("Live", self))

@@ -19,7 +19,7 @@ from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
-from driftfit.run.output_lanes import end_of, joint_tile, taken_over, trackers_of
+from driftfit.run.output_lanes import end_of, joint_tile, parameter_names, taken_over, trackers_of
 from driftfit.run.shared_outputs import row_model
 from driftfit.run.warm_start import End, Run
 from driftfit.smooth.fixed_lag import FixedLag, Window
@@ -55,7 +55,7 @@ class LiveOutputs(storage.Kept):
         self._pace = Pace(self._clock, model.reach)
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
-            raise ValueError("Live: what a warm start knows cannot be smoothed yet; give lag= or warm_start=.")
+            raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
         before = None if warm_start is None else warm_start.end()
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
@@ -196,12 +196,12 @@ class LiveOutputs(storage.Kept):
         absent = [name for name in rules if name not in self.model.outputs]
         if self.model.shared or absent:
             raise ValueError(
-                f"Live.detect: rules are for outputs with a theta of their own; got {list(rules)}, and the outputs are "
+                f"Live.detect: rules are for outputs with separate theta; got {list(rules)}, and the outputs are "
                 f"{', '.join(self.model.outputs)}."
             )
         for name, rule in rules.items():
             lane = self.model.outputs.index(name)
-            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.model.names_of(name), wait)
+            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.names[lane], wait)
         return self.alarms
 
     @property
@@ -252,7 +252,7 @@ class LiveOutputs(storage.Kept):
         Each is (lag + 1, ny, n), or (lag + 1, n) where the outputs share one theta.
         """
         if not self._windows:
-            raise ValueError("Live.smooth: no samples are kept; say how many, as in Live(model, tracker, lag=20).")
+            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
         found = [window.smooth(self._tile, lane) for lane, window in enumerate(self._windows)]
         if self.model.shared:
             ny = len(self.model.outputs)
@@ -288,7 +288,7 @@ class LiveOutputs(storage.Kept):
     @property
     def names(self) -> tuple[Any, ...]:
         """Names of the parameters, of each output where they have one theta each."""
-        return self._rows.names if self.model.shared else tuple(map(self.model.names_of, self.model.outputs))
+        return self._rows.names if self.model.shared else parameter_names(self.model, self.trackers)
 
     @property
     def ignored(self) -> int:
@@ -343,7 +343,7 @@ class LiveOutputs(storage.Kept):
             from driftfit.run.live.alarm import LiveAlarm
 
             lane = model.outputs.index(name)
-            live._alarms[name] = LiveAlarm.of(state, trackers[lane], model.names_of(name))
+            live._alarms[name] = LiveAlarm.of(state, trackers[lane], live.names[lane])
         into = {name: live._tile[name][0] for name in storage.fields(live._tile)}
         storage.restore(source, trackers[0], arrays, "state_", into)
         return live

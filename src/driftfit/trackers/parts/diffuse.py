@@ -49,9 +49,10 @@ ALMOST_ANY = 1e13
 SIZE, STD, LOOSE, ROW, WORK = range(5)
 """Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
 
-Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, NOW = range(9)
+Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
 """Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
-variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation."""
+variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation,
+and the column by which a regressor enters."""
 
 
 def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:

@@ -67,7 +67,7 @@ def track_ratios(
         For another model, or a fade outside 0 to 1.
     """
     if not isinstance(model, HammersteinWiener):
-        raise ValueError(f"track_ratios: takes a HammersteinWiener; got {type(model).__name__}.")
+        raise ValueError(f"track_ratios: needs a HammersteinWiener model; got {type(model).__name__}.")
     keep = numbers("track_ratios", "fade", fade, ndim=0, low=0.0, strict=True)
     if not keep < 1.0:
         raise ValueError(f"track_ratios: fade must lie between 0 and 1; got {fade!r}.")

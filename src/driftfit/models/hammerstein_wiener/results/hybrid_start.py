@@ -57,7 +57,7 @@ def hand_off(
         Such as `Kalman`.
     then : ExtendedKalman or OutputError
         Its theta0 and p0 are replaced by the separation and ``widen`` times its covariance.
-    y, u : (T,)
+    y, u : (T,), and (T,) or (T, m)
     at : int or None
         The last sample of stage one. None: the first at which a window of 3 n samples excites every product, its
         scaled Gram matrix having no eigenvalue below ``limit``.
@@ -70,11 +70,12 @@ def hand_off(
     output, inputs = as_output(y), as_inputs(u, len(as_output(y)))
     last = _sufficient(model, first, output, inputs, limit) if at is None else whole("hand_off", "at", at, 1)
     if not last < len(output) - 1:
-        raise ValueError(f"hand_off: at={last} leaves nothing of the {len(output)} samples to the second filter.")
+        raise ValueError(f"hand_off: at={last} leaves none of the {len(output)} samples for the second filter.")
     before = track(model, first, output[: last + 1], inputs[: last + 1])
     found = before.blocks("gls")
     assert found.cov is not None
-    head = np.abs(found.c[-1, 0])
+    bound = before.model
+    head = np.abs(found.c[-1, bound.structure.leads]).min()
     if head < WEAK:
         raise ValueError(
             f"hand_off: {type(then).__name__} has c_1 = 1, but with |c| = 1 the curve has c_1 = {head:.1g}; order the "
@@ -86,7 +87,6 @@ def hand_off(
     assert cov is not None
     P = widen * 0.5 * (cov[-1] + cov[-1].T)
     tracker = replace(then, theta0=found.xi[-1], p0=P)
-    bound = before.model
     ends, own = before.end().state, tracker.state_for(bound)
     lags = {name: ends[name] for name in bound.memory() if name not in own}
     blocks = np.array(ends["blocks"])
@@ -112,5 +112,6 @@ def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, li
         if found.size:
             return int(at[found[0]])
     raise ValueError(
-        f"hand_off: no window of {3 * n} samples excites all {n} products; see diagnose_blocks(run).dull(), or say at=."
+        f"hand_off: no window of {3 * n} samples excites all {n} products; see diagnose_blocks(run).dull(), or pass "
+        "at=."
     )

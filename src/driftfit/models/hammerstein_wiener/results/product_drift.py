@@ -45,7 +45,7 @@ def product_drift(model: HammersteinWiener, xi: Array, q: Any) -> Array:
     given = numbers("product_drift", "q", q, low=0.0)
     four = given if isinstance(given, tuple) else (given,) * 4
     if len(four) != 4:
-        raise ValueError(f"product_drift: q is one variance, or those of a, b, c and d; got {q!r}.")
+        raise ValueError(f"product_drift: q must be one variance, or four for a, b, c and d; got {q!r}.")
     na, nb, n_in, n_out, intercept = model.structure
     counts = [na, sum(nb), sum(n_in) - len(n_in), n_out - 1, int(intercept)]
     variances = np.repeat([*four, max(four)], counts)
@@ -79,7 +79,7 @@ def track_products(
         For another model, or variances below 0.
     """
     if not isinstance(model, HammersteinWiener):
-        raise ValueError(f"track_products: takes a HammersteinWiener; got {type(model).__name__}.")
+        raise ValueError(f"track_products: needs a HammersteinWiener model; got {type(model).__name__}.")
     whole("track_products", "every", every, 1)
     output = as_output(y)
     inputs = as_inputs(u, len(output))
@@ -115,7 +115,7 @@ def renewed(live: Live, q: Any) -> Live:
     model, tracker = live.model, live.tracker
     if not isinstance(model, HammersteinWiener) or not isinstance(tracker, Kalman) or np.ndim(tracker.q) != 2:
         raise ValueError(
-            "renewed: takes a stream of a HammersteinWiener model and a Kalman filter with a full matrix q."
+            "renewed: needs a stream of a HammersteinWiener model and a Kalman filter with a full matrix q."
         )
     xi = _separated(model, live.theta, None)
     if xi is None:

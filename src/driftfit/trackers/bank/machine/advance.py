@@ -60,6 +60,7 @@ from driftfit.trackers.bank.machine.layout import (
     LEAVES,
     LIMIT,
     MANY,
+    MOST,
     NOW,
     OPEN,
     PARENTS,
@@ -272,8 +273,8 @@ def advance(
         if many[OPEN] > 0:
             take_back(T, K, many[OPEN], gap, H, Hm)
         L = grow(
-            A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], na, Qt, maps, theta0,
-            sensors, prior, own, alike, bases, parent, event, X,
+            A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], now[MOST], na, Qt, maps,
+            theta0, sensors, prior, own, alike, bases, parent, event, X,
         )  # fmt: skip
         gone = normalise(B, L)
         many[PARENTS], many[LEAVES] = K, L
@@ -291,8 +292,8 @@ def advance(
             many[IMPOSSIBLE] += 1
             L = recover(A, K, B, len(A))
             many[LEAVES], many[EXPANDED] = L, 1
-            shift_covariance(B, L, B, slice(0, L), n, na, False, m, h, now[R], X[len(X) - na :])
-            push(B, L, n, na, now[IN_Y], True, y_hat)
+            shift_covariance(B, L, B, slice(0, L), n, na, False, m, expected, now[R], now[MOST], X[len(X) - na :])
+            push(B, L, n, na, now[IN_Y], True, y_hat, now[MOST])
             outlook(T, event, True, first, alike, L, P, row, prior, dt, Hm, apart, wide, False, gap, X)
             shift(T, L, prior, Hm)
         many[FLOORS] += 1
@@ -305,8 +306,8 @@ def advance(
         )  # fmt: skip
     else:
         seen = now[IN_SEEN] > 0.0
-        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, h, now[R], X[len(X) - na :])
-        push(B, L, n, na, now[IN_Y], seen, y_hat)
+        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, expected, now[R], now[MOST], X[len(X) - na :])
+        push(B, L, n, na, now[IN_Y], seen, y_hat, now[MOST])
         if dt != 0.0:
             if not expanded:
                 write_out(T, L, H, Hm, parent, event, news, T2)

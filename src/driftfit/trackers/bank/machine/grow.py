@@ -23,8 +23,9 @@ from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KIND, apply
-from driftfit.trackers.bank.leaves.lags import shift_covariance, widen_by_lags
+from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
@@ -89,9 +90,13 @@ def correct(
         for i in range(n):
             k = times(gain, load(g, i, l))
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(k, eps)))
-            for j in range(i + 1):
+            for j in range(i):
                 store(B, FIRST + n + entry, at + l, minus(load(C, entry, l), times(k, load(g, j, l))))
                 entry += 1
+            was = load(C, entry, l)
+            left = minus(was, times(k, load(g, i, l)))
+            store(B, FIRST + n + entry, at + l, higher(left, times(fill(LEFT), was)))
+            entry += 1
 
 
 @shared
@@ -151,8 +156,8 @@ def frozen(
 @shared
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
-    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, alike: bool,
-    bases: Array, parent: Array, event: Array, X: Array,
+    least: float, most: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool,
+    alike: bool, bases: Array, parent: Array, event: Array, X: Array,
 ) -> int:  # fmt: skip
     """The children of K leaves, with their weights not normalised; returns how many there are. ``alike`` says that the
     prior is the same for all leaves.
@@ -181,9 +186,9 @@ def grow(
                 gaussian(X, likely, columns)
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
-            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], own_lags)
+            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected, own_lags, most, r)
             block, spare = slice(at, at + columns), X[len(X) - na :]
-            shift_covariance(A, K, B, block, n, na, own_lags, m, expected[0], r, spare)
+            shift_covariance(A, K, B, block, n, na, own_lags, m, expected, r, most, spare)
         weigh(A, K, B, at, columns, j, Hm, own, alike, prior, X, likely, parent, event)
         encode(A, K, B, at, columns, j, Hd, Hm, bases, event)
     return int(columns * Hm)
@@ -199,8 +204,9 @@ def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None
 
 @shared
 def remember(
-    A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, y_hat: Array, own: bool
-) -> None:
+    A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, expected: Array, own: bool,
+    most: float, r: float,
+) -> None:  # fmt: skip
     """Output lags of the children: the parent's, one later, and y or what the leaf expected."""
     first = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
@@ -208,7 +214,8 @@ def remember(
             for l in range(K):
                 B[first + i, np.uint64(c + l)] = A[first + i - 1, l]
     for l in range(columns):
-        B[first, np.uint64(at + l)] = y_hat[l] if own else y
+        believed = own and plausible(expected, l, most, r)
+        B[first, np.uint64(at + l)] = expected[1, l] if believed else y
 
 
 @part

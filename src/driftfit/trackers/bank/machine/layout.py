@@ -23,9 +23,11 @@ AGAIN says that the present one was just refused.
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, SIZE,
-) = range(20)  # fmt: skip
-"""Numbers of the present sample: what comes in, and what goes out."""
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
+) = range(21)  # fmt: skip
+"""Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
+prediction may have in its output lags (`driftfit.hypotheses.lags`).
+"""
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
 HEAD = 4
@@ -37,9 +39,9 @@ many nominal intervals had passed.
 TOLD = 8
 """Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
 PACKED = (
-    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
-    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "news", "gap", "moving", "lag_prob", "brief", "decided",
+    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "fixed", "sizes", "factors", "maps", "theta0",
+    "sensors", "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt",
+    "ring", "news", "gap", "moving", "lag_prob", "brief", "decided",
 )  # fmt: skip
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.

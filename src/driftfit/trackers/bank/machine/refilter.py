@@ -9,6 +9,8 @@ Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered 
 
 from __future__ import annotations
 
+import math
+
 from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
@@ -103,7 +105,7 @@ def floor(
 ) -> int:  # fmt: skip
     return int(
         grow(
-            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, na, Q, maps,
-            places, sensors, prior, own, not own, bases, parent, event, X,
+            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, math.inf, na, Q,
+            maps, places, sensors, prior, own, not own, bases, parent, event, X,
         )
     )  # fmt: skip

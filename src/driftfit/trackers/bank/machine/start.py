@@ -35,7 +35,7 @@ def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, la
     lag_prob[0, 0] = 1.0
     y_hat = B[WEIGHT, :1]
     y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
-    push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat)
+    push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat, np.inf)
     now[LAST] = now[IN_Y] if now[IN_SEEN] > 0.0 else now[LAST]
     many[CLOCK] += 1
     if many[SETTLED] == READY:

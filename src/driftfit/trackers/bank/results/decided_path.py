@@ -74,7 +74,7 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
     bank: Any = run.tracker
     if any(change.forgets for change in bank.all_changes):
         raise ValueError(
-            "smooth: a Change that forgets or resets is no random walk, which is what can be smoothed; give its q "
+            "smooth: only random walks can be smoothed, and a Change that forgets or resets is not one; give its q "
             "instead, or cut the record at the changes with driftfit.smooth.piecewise.piecewise(run)."
         )
     measured = measurements(run, events)

@@ -250,7 +250,7 @@ class Hypotheses:
         one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
         """
         if (threshold is None) == (rate is None):
-            raise ValueError("alarm: give threshold= or rate= (false alarms per sample), one of them.")
+            raise ValueError("alarm: give either threshold= or rate= (false alarms per sample).")
         if threshold is None:
             assert rate is not None
             threshold = self._threshold(rate, reference)
