@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.data.clock import Clock, instants
-from driftfit.data.signals import as_numbers
+from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.run.result import Track
