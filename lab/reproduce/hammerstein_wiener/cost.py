@@ -15,8 +15,8 @@ from driftfit.models.hammerstein_wiener.curves.basis import Legendre
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation.paths import empty
 from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
-from driftfit.run.track import track
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 
 ORDERS = ((2, 2, 3, 3), (3, 3, 3, 4), (4, 4, 5, 5))
 REPEATS = 5
@@ -45,8 +45,8 @@ def measure(
         y, u = rng.uniform(-3.0, 3.0, (2, samples))
         xi = rng.normal(size=(samples, model.structure.n_x))
         theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
-        *groups, quality = empty(model, samples)
-        parts = (model.structure.sizes, model.rise, tuple(groups), quality)
+        groups, quality = empty(model, samples)
+        parts = (model.structure.sizes, model.rise, groups, quality)
         row = {}
         for place, method in enumerate(METHODS[:3]):
             row[method] = least(partial(separate, theta, (na, n_out, place), *parts), samples)
