@@ -14,12 +14,12 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.results import Track
 from driftfit.run.fleet import FEWEST
 from driftfit.run.live.live import Live
-from driftfit.run.result import Track
-from driftfit.run.track import track
-from driftfit.smooth.parts.walk import replay
+from driftfit.smooth.problem import replay
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 
 T = 60
 AT = 30
