@@ -41,7 +41,7 @@ def track(
         raise ValueError("track: prob= is for one series and one tracker.")
     if len(model.outputs) > 1:
         return track_outputs(model, tracker, y, u, data, by, reading, keep, warm_start)
-    records, failed = _records(y, u, data, by, reading)
+    records, failed = records_of(y, u, reading, data, by)
     records = records.for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
@@ -74,8 +74,10 @@ def track_one(
     return run
 
 
-def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Records, dict[Hashable, str]]:
-    """What is to be run, and the reasons of what cannot be."""
+def records_of(
+    y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
+) -> tuple[Records, dict[Hashable, str]]:
+    """What is to be run, from arrays or a table, and the reasons of what cannot be."""
     if data is not None:
         from driftfit.data.tables import read_records  # narwhals and polars take as long to import as all the rest
 

@@ -35,7 +35,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, one_series
+from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
 from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
@@ -45,6 +45,7 @@ from driftfit.judge.structures.candidates import Pool, Predicted, Structure, poo
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.run.track import records_of
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -195,6 +196,7 @@ def select(
     tracker: Tracker | None = None,
     keep: Sequence[str] = (),
     most: int | None = None,
+    data: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -208,8 +210,8 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or the model whose regressors are to be chosen, at most 30.
-    y, u, time, dt, weights, drift, limits, exclude
-        As for `track`; one number or (T,) for drift.
+    y, u, data, time, dt, weights, drift, limits, exclude
+        As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     tracker : Tracker
         How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
         parameters: one q, not a vector.
@@ -234,8 +236,11 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    records = one_series(y, u, reading)
-    factor("drift", drift, len(records.y))
+    records, _ = records_of(y, u, reading, data)
+    if data is None:
+        factor("drift", drift, len(records.y))
+    elif records.drifts is not None:
+        raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
