@@ -5,6 +5,7 @@ from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
 from driftfit.fleets import Fleet, Outputs, OutputsFleet, Shared
 from driftfit.judge.segment import segment
+from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -78,6 +79,7 @@ __all__ = [
     "Legendre",
     "Live",
     "LiveOutputs",
+    "LiveSelection",
     "Model",
     "OutputError",
     "Outputs",

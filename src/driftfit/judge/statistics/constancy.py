@@ -176,7 +176,7 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
         if k > 1 and gain < 2.0 * new.shape[1] * np.log(np.log(N)):
             break
         basis, w = np.column_stack([basis, new]), w - new @ explained
-    return np.sqrt(N) * basis[:, n:]
+    return np.asarray(np.sqrt(N) * basis[:, n:])
 
 
 def _alternative(found: Noise, still: Fit, beside: Array) -> Array:

@@ -24,7 +24,7 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program
-from driftfit.run.result import Track, track_record
+from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
 
 TOGETHER = 32
@@ -40,6 +40,16 @@ class Structure(NamedTuple):
     n: int
     model: Model | None
     columns: tuple[int, ...] | None
+
+
+def unscored(T: int, n: int) -> int:
+    """Samples at the beginning that score no structure, of at most n parameters: 100, or half of a short record."""
+    return max(burn_in(n), min(100, T // 2))
+
+
+def price(n: int, start: int) -> float:
+    """What n parameters cost in the log-likelihood of the first ``start`` samples, which is not scored."""
+    return 0.5 * n * float(np.log(start))
 
 
 class Predicted(NamedTuple):
@@ -124,8 +134,8 @@ def pool_of(models: Sequence[Model], names: Sequence[str], record: Record) -> tu
 
 def _terms(model: Model) -> list[Term] | None:
     """What the columns of a model are; None for a model that is no ARX or Regression with one output."""
-    one: list[Term] = [("1", 0, 0)] if getattr(model, "intercept", False) else []
-    if len(model.outputs) > 1 or hasattr(model, "log_jacobian"):
+    one: list[Term] = [("1", 0, 0)] if model.intercept else []
+    if len(model.outputs) > 1 or model.implicit:
         return None
     if isinstance(model, Regression):
         return [*(("u", j, 0) for j in range(model.m)), *one]

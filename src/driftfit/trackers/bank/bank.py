@@ -253,7 +253,7 @@ class Bank(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         cleans = any(one.cleans for one in self.all_sensors)
-        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        state = self._state(model.n, (model.output_lags or 0) if cleans else 0)
         if len(model.outputs) == 1 or model.shared:
             return state
         sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]

@@ -172,7 +172,7 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
     """Factors of the noise variance, inf where the sensor said nothing."""
     factor = np.ones(len(run))
     sensors = {sensor.name: sensor for sensor in bank.all_sensors}
-    reach = getattr(run.model, "output_lags", 0)
+    reach = run.model.output_lags or 0
     for event in events:
         if event.kind == "sensor":
             sensor = sensors[event.name]
