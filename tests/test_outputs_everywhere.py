@@ -97,8 +97,13 @@ def test_tables_units_rows_and_grids():
     assert len(rows["q"].to_table("pandas")) == 80
     with pytest.raises(ValueError, match="y must name 2 columns"):
         track(joint, TRACKER, "level", "u", data=data)
-    with pytest.raises(ValueError, match="units= is not supported"):
-        track(joint, TRACKER, ["level", "flow"], "u", data=data, units={"u": "m"})
+    given = {"level": "m", "u": "V"}
+    measured_in = track(joint, TRACKER, ["level", "flow"], "u", data=data[:80], time="t", units=given)
+    assert measured_in["level"].units == ("", "", "m/V")
+    assert measured_in.to_table("pandas").attrs["units"]["prediction[level]"] == "m"
+    assert measured_in.summary()["level"].rows[2].unit == "m/V"
+    with pytest.raises(ValueError, match="so data= is needed"):
+        track(joint, TRACKER, y, u, units={"u": "m"})
     with pytest.raises(ValueError, match=r"y must be \(units, T, 2\)"):
         track(joint, TRACKER, y, u, by="row")
 

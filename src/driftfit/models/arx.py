@@ -296,6 +296,13 @@ class JointARX(ARX):
         own = [f"a{i + 1}[<-{output}]" for output in self.outputs for i in range(self.na)]
         return (*own, *self._input_names())
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        inputs = self.input_names or tuple(f"u{j + 1}" for j in range(self.m))
+        given = (name for name, (nb, _) in zip(inputs, self.lags, strict=True) for _ in range(nb))
+        past = (output for output in self.outputs for _ in range(self.na))
+        return (*past, *given, *(("",) if self.intercept else ()))
+
     def names_of(self, output: str) -> tuple[str, ...]:
         named = []
         for name in self.names:

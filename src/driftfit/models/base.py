@@ -68,6 +68,11 @@ class Model(Settings, ABC):
         """Whether all outputs measure one theta, instead of having one each."""
         return False
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """For every parameter the signal that its regressor holds, empty for a constant; of several outputs."""
+        return self.input_names if len(self.input_names) == self.n else ("",) * self.n
+
     def names_of(self, output: str) -> tuple[str, ...]:
         """Names of the parameters of one of several outputs."""
         return tuple(f"{name}[{output}]" for name in self.names)

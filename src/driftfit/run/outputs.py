@@ -168,10 +168,12 @@ class Outputs(Many):
     def _track(self, lane: int) -> Track:
         """One output by itself, as a regression where the others are among its regressors."""
         alone, u = self.programs[lane].alone, self.u
-        known, names = Known(self.record.known.columns[..., lane]), self.labels.u
+        known, names, units = Known(self.record.known.columns[..., lane]), self.labels.u, dict(self.labels.units)
         if alone is None:
             seen, names = self._seen, self.names[lane]
             alone, known = Program(Regression(names), self.trackers[lane]), known.changed(interval=seen["dt"][:, lane])
+            held = zip(names, self.model.sources, strict=True)
+            units |= {name: units[source] for name, source in held if source in units}
             u = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
         tile = alone.tile()
         shapes = {name: value.shape for name, value in state_of(tile).items() if name != "u"}
@@ -185,7 +187,7 @@ class Outputs(Many):
         start = {name: value for name, value in self.starts[lane].items() if name in own} if self.starts else None
         others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
         missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
-        labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing)
+        labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing, units=units)
         record = Record(self.y[:, lane], u, known, self.record.time, labels)
         return Track(alone, record, Lane(out, tile), start)
 

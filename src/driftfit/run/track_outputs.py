@@ -104,8 +104,8 @@ def track_outputs(
 ) -> Outputs | Shared | OutputsFleet:
     """Follow a model with several outputs; the arguments are those of `track`."""
     failed: Mapping[Hashable, str] = {}
-    if reading.units is not None:
-        raise ValueError("track: units= is not supported for several outputs.")
+    if reading.units is not None and data is None:
+        raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
     if data is not None:
         model, found, failed = of_table(model, y, u, data, by, reading)
     elif by == "row":
@@ -305,9 +305,9 @@ def of_table(
     many = [] if isinstance(weights, str) or np.ndim(weights) == 0 else list(weights)
     many = [many[j] for j in place] if len(many) == ny else many
     columns = [*outputs[1:], *inputs, *many]
-    common = replace(reading, weights=1.0 if many else weights, units=None)
+    common = replace(reading, weights=1.0 if many else weights)
     records, failed = read_records(data, outputs[0], columns, by, common)
-    labels = replace(PLAIN, time=records.labels.time, zone=records.labels.zone, dt=records.labels.dt)
+    labels = replace(records.labels, y="y", u=(), by=("series",))
     found = {}
     for k, key in enumerate(records.keys):
         one = records.part(k)
