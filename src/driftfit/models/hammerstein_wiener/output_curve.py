@@ -263,7 +263,7 @@ def laying(values: Any) -> Any:
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
         start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
         wide = high - low
-        margin = WIDER * (wide if wide > 0.0 else max(abs(high), 1.0))
+        margin = WIDER * (wide if wide > 0.0 else abs(high) if high != 0.0 else 1.0)
         short = (low < start and start > m[BOTTOM, 0]) or (high > end and end < m[TOP, 0])
         if low <= high and (m[STEP, 0] == 0.0 or short or end - start > WIDE * (wide + 2.0 * margin)):
             start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])

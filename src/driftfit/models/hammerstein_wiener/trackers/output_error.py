@@ -41,7 +41,6 @@ from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     SEEN,
     SIZE,
     TIME,
-    V_POWER,
     VALID,
     E,
     R,
@@ -132,7 +131,7 @@ class OutputError(Tracker):
     def state(self, n: int) -> Mapping[str, Any]:
         """The part of the state that depends on the number n of minimal parameters alone."""
         own = np.zeros(SIZE)
-        own[[R, Q_W, P_W, V_POWER]] = self.r, self.q_w, self.p_w, 1.0
+        own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
         return {
             "theta": vector("OutputError", "theta0", self.theta0, n),
             "P": matrix("OutputError", "p0", self.p0, n),

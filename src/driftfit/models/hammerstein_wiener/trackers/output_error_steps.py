@@ -46,13 +46,16 @@ FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
 REACH = 3.0
 """Times the largest w of the outputs seen: w is held within that."""
-FARTHEST = 1e6
-"""The same before any output was seen."""
-LARGEST_VARIANCE = 1e20
-"""Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
+WIDEST = 1e3
+"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without end in an outage.
+The cross-covariances shrink along."""
+MEMORY, FIRST, LARGE = 100.0, 10.0, 25.0
+"""Samples over which the power of v is remembered; how many are taken as they come, and the multiple of it by which a
+later square counts at most: a fault code may not make a scale of its own."""
 
-TIME, R, Q_W, P_W, V_POWER, BEGUN, VALID, SEEN, OK, E, S2, SIZE = range(12)
-"""Numbers of the filter: nominal intervals times the drift, variances, power of v, whether w stands, what comes out."""
+TIME, R, Q_W, P_W, V_POWER, COUNTED, BEGUN, VALID, SEEN, OK, E, S2, SIZE = range(13)
+"""Numbers of the filter: nominal intervals times the drift, variances, power of v and of how many samples, whether w
+stands, what comes out."""
 
 
 @core
@@ -83,8 +86,10 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
 
 
 @core
-def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
-    """The time update of w and of S."""
+def advance(
+    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
+) -> None:  # fmt: skip
+    """The time update of w, which is held within reach whatever the poles do, and of S."""
     na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
     n_w, N = len(w), len(S)
     at_bc = na + nb + n_out - 1
@@ -114,11 +119,12 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array,
             S[i, j] = S[i - 1, j - 1]
         for x in range(n_w, N):
             S[x, i] = S[x, i - 1]
-    shrink = np.sqrt(LARGEST_VARIANCE / own) if own > LARGEST_VARIANCE else 1.0
+    most = WIDEST * WIDEST * reach * reach
+    shrink = np.sqrt(most / own) if own > most else 1.0
     for x in range(1, N):
         S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
-    S[0, 0] = min(own, LARGEST_VARIANCE)
-    w[0] = total
+    S[0, 0] = min(own, most)
+    w[0] = min(max(total, -reach), reach)
 
 
 @core
@@ -165,20 +171,22 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     v = m[f, 0]
     for k in range(1, p[N_IN]):
         v += theta[na + nb + k - 1] * m[f + k, 0]
-    own[V_POWER] += 0.01 * (v * v - own[V_POWER]) if abs(v) < 1e6 else 0.0
+    if abs(v) < LARGEST:
+        square = min(v * v, LARGE * own[V_POWER]) if own[COUNTED] >= FIRST and own[V_POWER] > 0.0 else v * v
+        own[COUNTED] = min(own[COUNTED] + 1.0, MEMORY)
+        own[V_POWER] += (square - own[V_POWER]) / own[COUNTED]
 
 
 @core
-def hold(m: Array, p: Places, w: Array) -> None:
-    """Keep the present w within reach of the outputs seen, whatever the poles do."""
+def reach_of(m: Array, p: Places) -> float:
+    """How large w may be, by the outputs seen."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
     if p[IDENTITY] == 0:
         rising, last = rises(m, p), GRID - 1
         low = level(m, p, p[CURVE], 0) if rising else m[p[LEVEL], 0]
         high = level(m, p, p[CURVE], last) if rising else m[p[LEVEL] + last, 0]
     reach = REACH * max(abs(low), abs(high))
-    reach = reach if reach > 0.0 and reach < np.inf else FARTHEST
-    w[0] = min(max(w[0], -reach), reach)
+    return reach if reach > 0.0 and reach < LARGEST else LARGEST
 
 
 @lru_cache
@@ -203,8 +211,8 @@ def _work(out: Kind) -> Any:
         known, power = inputs_known(m, p), 0.0
         for j in range(nb):
             power += theta[na + j] * theta[na + j]
-        advance(p, theta, phi, w, S, row, moved, own[Q_W] + (0.0 if known else power * own[V_POWER]))
-        hold(m, p, w)
+        q_w = own[Q_W] + (0.0 if known else power * own[V_POWER])
+        advance(p, theta, phi, w, S, row, moved, q_w, reach_of(m, p))
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
         fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])

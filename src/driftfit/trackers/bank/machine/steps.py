@@ -181,6 +181,12 @@ def correct(s: State, l: int) -> None:
 
 
 @kernel
+def report(s: State, l: int) -> None:
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
+
+
+@kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
     if s.many[SETTLED, l] > 0:
@@ -191,6 +197,8 @@ def begin(s: State, l: int) -> None:
         alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
         if s.framed[l] > 0:
             read_framed(s, l)
+        elif s.many[SETTLED, l] > 0:
+            report(s, l)
         else:
             spanned_variance(s, l)
 
@@ -234,12 +242,6 @@ def alone(s: State, l: int, counts: bool) -> None:
     run(s, l)
     if ready:
         s.scale[l] = 1.0
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
 
 
 @kernel
