@@ -8,8 +8,10 @@ Two questions that have different answers:
   variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
   do not enter. Where constants are true, "they move" is said with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
-  constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`).
+* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
+  same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
+  (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, which a drifting parameter does as well: so
+  following pays where the run beats the better of constants without lags and with them.
 
 The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
 rejects, its own still does when what was named before it is taken into account
@@ -30,17 +32,17 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import whole
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.attribution import Attribution, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, facts, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, facts, table_of
 
-RIVALS = ("persistence", "constant LS", "constant ARX")
+RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """Below this p-value of whiteness the residuals of segments are said to be correlated."""
 
@@ -78,8 +80,8 @@ class Verdict(Printed):
     drifts : bool or None
         The parameters move: ``p`` is below ``level``. None where the record cannot tell.
     pays : bool or None
-        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
-        where there are too few samples to compare.
+        The run predicts better than constant least squares on the past, without lags or with them, whichever is the
+        better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
         Joint test of all parameters; NaN where the record cannot tell.
     statistic : float
@@ -90,7 +92,7 @@ class Verdict(Printed):
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
-        The same of persistence, constant LS and constant ARX, with paired tests.
+        The same of persistence, constant LS, LS with lags and constant ARX, with paired tests.
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
@@ -116,6 +118,11 @@ class Verdict(Printed):
     burn: int
 
     @property
+    def constants(self) -> Paired:
+        """The rival that decides whether following pays: constant least squares, or with lags where that is better."""
+        return better_constants(self.rivals)
+
+    @property
     def moving(self) -> tuple[str, ...]:
         """Names of the parameters that move."""
         return tuple(moved.name for moved in self.parameters if moved.moves)
@@ -128,48 +135,54 @@ class Verdict(Printed):
     def _drift(self) -> str:
         if self.drifts is None:
             least = least_rows(len(self.parameters))
-            short = f"{self.samples} samples can be used, and {least} are the least that tell."
-            alike = "its regressors do not tell the parameters apart, or explain it without error."
-            return f"The record cannot say whether parameters move: {short if self.samples < least else alike}"
+            short = f"{self.samples} samples can be used, and at least {least} are needed."
+            alike = "its regressors do not distinguish the parameters, or explain the output without error."
+            return f"The record cannot show whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
             return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
         if self.pays:
             reason = (
-                "once correlated noise is allowed for. A model with too few lags has that, and a parameter that "
-                "wanders as fast looks the same."
+                "once correlated noise is allowed for. A model with too few lags causes such noise, and a parameter "
+                "that varies as fast looks the same."
                 if self.lags
-                else "by a test of the whole record, which a small or a fast drift escapes."
+                else "by a test on the whole record, which misses small and fast drifts."
             )
             return (
-                "Something can be followed, but it is not shown that parameters move: constants are not rejected "
+                "Tracking reduces the error, but there is no evidence that parameters move: constants are not rejected "
                 f"({p_equals(self.p)}, level {self.level:g}) {reason}"
             )
         return (
             f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
-            "A drift that is small beside the noise cannot be ruled out."
+            "A drift that is small compared with the noise cannot be ruled out."
         )
 
     def _which(self) -> str:
         if not self.drifts:
             return ""
         if not self.moving:
-            return "Which of them moves cannot be told: their regressors are too alike, or the move is spread over all."
-        return f"It is {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
+            return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
+        return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
-        steady = self.rivals[1]
+        steady = self.constants
         if self.pays is None:
             return (
-                f"Predictions cannot be compared: {self.scored} samples are left after the first {self.burn}, and "
-                f"{COMPARED} are the least; burn= leaves out fewer."
+                f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
+                f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
         change = 100.0 * (self.rms / steady.rms - 1.0)
+        who = "constants" if steady is self.rivals[1] else "constants with lags"
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            follow = "Following the parameters pays" if self.drifts else "Following it pays"
-            return f"{follow}: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
+        if self.rivals[1].p < self.level:
+            return (
+                "Tracking them predicts better than constants, but not than constants with two more lags of "
+                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). "
+                "Lags may be all that is missing."
+            )
         return (
-            f"Following them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"Tracking them does not clearly pay here: the one-step error is {size} than that of {who} "
             f"({p_equals(steady.p)})."
         )
 
@@ -178,9 +191,9 @@ class Verdict(Printed):
         told = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             told += (
-                "The residuals are correlated, also where parameters are constant: a model with too few lags does "
-                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} "
-                "of it; try one more lag in the model."
+                "The residuals are correlated, even within segments of constant parameters. A model with too few "
+                f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
+                f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model."
             )
         return told.strip()
 
@@ -199,6 +212,11 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def better_constants(rivals: tuple[Paired, ...]) -> Paired:
+    """Of constant least squares without lags and with them, the one with the smaller error."""
+    return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
 def _told(moved: Moved) -> str:
@@ -254,7 +272,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
-        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
+        pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
         p=test.p_joint,
         statistic=test.joint,
         level=level,

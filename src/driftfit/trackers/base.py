@@ -148,7 +148,7 @@ class Tracker(Settings, ABC):
         if not self.covariance or P is None or P.shape != (n, n):
             raise ValueError(
                 f"{type(self).__name__} carries no covariance that can be widened; "
-                "say where the parameters stand now, with theta=."
+                "give the new values of the parameters with theta=."
             )
         scale = float(lane["scale"])
         np.einsum("ii->i", P)[:] += p / scale if scale > 0.0 else p

@@ -39,6 +39,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
@@ -48,11 +49,13 @@ from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_f
 from driftfit.judge.statistics.supremum import suprema, together
 
 POINTS = 48
-"""At most so many points of the path enter the statistics and their null."""
+"""At most so many points of the path enter the suprema and their null; every second of them enters the mean squares."""
 ROWS = 200
 """At most about so many rows of the covariance of the joint path."""
 CELLS = 200
 """At most so many places for breaks, where the noise is looked for."""
+MOST_LAGS = 3
+"""At most so many lags of all regressors are taken in where these are not independent of the noise."""
 EDGE = 0.05
 """Share of a record at each end where no date is looked for."""
 
@@ -112,31 +115,34 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
 
 def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
     N, n = X.shape
-    still = fit
+    still, beside = fit, np.zeros((N, 0))
     if len(found.ar):
-        c = found.level
-        X, y = whitened(X / c[:, None], found.held / c, found.ar)
-        X, y = X * c[:, None], y * c
-        still = robust_fit(X, y)
-    psi = _alternative(found, still)
+        c = found.level[:, None]
+        rows, y = whitened(X / c, found.held / found.level, found.ar)
+        beside = c * missing_lags(X / c, rows, found) if lags is None else beside
+        X, y = rows * c, y * found.level
+        still = robust_fit(np.column_stack([X, beside]), y)
+    psi = _alternative(found, still, beside)
     rest = min(plugged_in(X, psi), rule_of_thumb(N)) if lags is None else 0
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
-    A = _profile(X * still.inside[:, None], X, ends)
-    V = _profile(*(2 * (_summed(X * psi[:, None], rest),)), ends)
-    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < n or np.linalg.matrix_rank(V[-1], 1e-12) < n:
+    whole = np.column_stack([X, beside])
+    A = _profile(whole * still.inside[:, None], whole, ends)
+    V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
+    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < len(A[-1]) or np.linalg.matrix_rank(V[-1], 1e-12) < n:
         return _nothing(N, n)
-    S, inverse = np.cumsum(X * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
+    S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
-    own = np.einsum("ij,bjck,kl->bicl", inverse, null, inverse, optimize=True)
-    path = S @ inverse
-    var = np.einsum("ij,jk,ki->i", inverse, V[-1], inverse)
+    own, path = _turned(null, inverse[:n]), S @ inverse[:n].T
+    var = np.diag(inverse @ V[-1] @ inverse)[:n]
+    S, null, V = S[:, :n], np.ascontiguousarray(null[:, :n, :, :n]), V[:, :n, :n]
     least, apart = shortest(n), len(found.breaks) > 0
-    L, p = _each(S[ends - 1], null, np.diag(V[-1]))
-    _, p_path = _each(path[ends - 1], own, var)
+    mean = np.arange(m)[::-2][::-1]
+    L, p = _each(S[ends[mean] - 1], _thinned(null, mean), np.diag(V[-1]))
+    _, p_path = _each(path[ends[mean] - 1], _thinned(own, mean), var)
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
-    joint, p_mean = _joint(S[ends - 1], null, V[-1])
+    joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
     p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
@@ -145,8 +151,36 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, shown, found, len(found.ar) + rest)
 
 
-def _alternative(found: Noise, still: Fit) -> Array:
-    """Bounded residuals of the segments, on the rows of the test.
+def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
+    """Lags of the regressors X (N, n) that are not in ``rows``, the white rows: (N, q), Q' Q = N I.
+
+    Where regressors hold lags of y, as in ARX, correlated noise is not independent of them, and least squares leaves
+    noise that no autoregression makes white. The regression with one more lag of everything has white noise where that
+    of the first was an autoregression of order one; further lags come in as long as they gain by the criterion of
+    Hannan and Quinn (1979). Their coefficients are not tested: beside other regressors they cost a degree of freedom
+    each.
+    """
+    N, n = X.shape
+    w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
+    basis = linalg.qr(rows, mode="economic")[0]
+    w = w - basis @ (basis.T @ w)
+    for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
+        lagged = np.zeros((N, n))
+        lagged[k:] = X[:-k]
+        lagged[: len(found.ar)] = 0.0
+        lagged -= basis @ (basis.T @ lagged)
+        Q, R, _ = linalg.qr(lagged, mode="economic", pivoting=True)
+        new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
+        explained = new.T @ w
+        gain = -N * np.log1p(-explained @ explained / (w @ w))
+        if k > 1 and gain < 2.0 * new.shape[1] * np.log(np.log(N)):
+            break
+        basis, w = np.column_stack([basis, new]), w - new @ explained
+    return np.asarray(np.sqrt(N) * basis[:, n:])
+
+
+def _alternative(found: Noise, still: Fit, beside: Array) -> Array:
+    """Bounded residuals of the segments, on the rows of the test, without what regressors ``beside`` explain.
 
     Each is that of a fit without it: a short segment fits its own rows too well (MacKinnon and White, 1985).
     """
@@ -157,6 +191,7 @@ def _alternative(found: Noise, still: Fit) -> Array:
     if len(found.ar):
         held = np.clip(v / c, -HELD, HELD)
         v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
+    v = v - beside @ np.linalg.lstsq(beside, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
 
 
@@ -196,6 +231,17 @@ def _null(A: Array, V: Array, inverse: Array) -> Array:
     return np.ascontiguousarray(cov)
 
 
+def _thinned(cov: Array, points: Array) -> Array:
+    """Covariance of some points of a path."""
+    return cov[points][:, :, points]
+
+
+def _turned(cov: Array, M: Array) -> Array:
+    """Covariance (m, n, m, n) of a path whose rows are multiplied by M (n, n)."""
+    turned: Array = np.ascontiguousarray(np.swapaxes(M @ np.swapaxes(cov, 1, 2) @ M.T, 1, 2))
+    return turned
+
+
 def _weights(cov: Array) -> Array:
     """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
     weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
@@ -216,7 +262,7 @@ def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
     lower = np.linalg.cholesky(V)
     root = np.linalg.inv(lower)
     L = float(np.sum((S @ root.T) ** 2) / m)
-    white = np.einsum("ij,bjck,lk->bicl", root, cov, root, optimize=True).reshape(m * n, m * n)
+    white = _turned(cov, root).reshape(m * n, m * n)
     return L, tail(_weights(white) / m, L)
 
 

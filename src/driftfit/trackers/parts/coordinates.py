@@ -26,8 +26,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, core, cubes, exp, floats, kernel
-from driftfit.engine.kernel import outside as machine
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, machine, shared
 from driftfit.trackers.parts.diffuse import (
     ENTERING,
     MACHINES,
@@ -47,7 +46,7 @@ OUTGROWN = 1e12
 dropped above it, which moves an estimate by less than a millionth of its standard deviation."""
 
 
-@core
+@shared
 def place(phi: Array, S: Array, work: Array, now: Array) -> None:
     """x in ``work[ROW]``, up to the column by which phi leaves the span, if it does."""
     entering, u, _ = outside(phi, S, work)

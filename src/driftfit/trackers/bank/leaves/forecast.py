@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.kernel import Array, kernel, part, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import WEIGHT, total
 
-FACTOR, VALUE, FROZEN, STUCK, CLEANS = range(5)
-"""Columns of the table of sensors."""
+FACTOR, VALUE, FROZEN, STUCK, CLEANS, OWN = range(6)
+"""Columns of the table of sensors; OWN is the number of the user's function (`own_sensor`), 0 for none."""
 
 
-@core
+@shared
 def expect(
     w: Array, L: int, y: Array, h: Array, factor: Array, prior: Array, sensors: Array, r: float, noise: float,
     last: float, X: Array,

@@ -9,34 +9,49 @@ the output lags,
 
 after a prediction was put in, and a zero row for an output that was measured. It is a plug-in still: that a and the
 lags are wrong together is left out, and so is what later outputs tell of earlier ones. Merged leaves take the spread of
-their lags into V.
+their lags into V. A prediction that cannot be an output (`PLAUSIBLE`) is not put in: y is, or where there is none the
+largest that can be.
 """
 
 from __future__ import annotations
 
-from driftfit.engine.kernel import Array, core
+import math
+
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST
 
+PLAUSIBLE, VAGUE = 1e4, 1e12
+"""Square of a prediction in mean squares of the outputs, and its variance in variances of the noise, beyond which it is
+no output: the lags of an unstable leaf would run away.
+"""
 
-@core
+
+@kernel
+def plausible(expected: Array, l: int, most: float, r: float) -> bool:
+    """Whether what leaf l expects may be an output at all."""
+    return expected[1, l] * expected[1, l] <= most and expected[0, l] <= VAGUE * r  # type: ignore[no-any-return]
+
+
+@shared
 def covariance_row(n: int, na: int) -> int:
     """The first row of V, whose lower triangle is the last thing in a leaf."""
     return FIRST + n + n * (n + 1) // 2 + na
 
 
-@core
-def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array) -> None:
-    """Output lags of leaves that took no sample in: y where it was seen, else what each expected."""
+@shared
+def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array, most: float) -> None:
+    """Output lags of leaves that took no sample in: y where it was seen, else what each expected, within bounds."""
+    limit = math.sqrt(most)
     at = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
         for l in range(L):
             B[at + i, l] = B[at + i - 1, l]
     if na > 0:
         for l in range(L):
-            B[at, l] = y if seen else y_hat[l]
+            B[at, l] = y if seen else min(max(y_hat[l], -limit), limit)
 
 
-@core
+@shared
 def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
     at = covariance_row(n, na)
@@ -51,13 +66,14 @@ def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: 
             at += 1
 
 
-@core
+@shared
 def shift_covariance(
-    A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, h: Array, r: float, X: Array
+    A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, expected: Array, r: float,
+    most: float, X: Array,
 ) -> None:  # fmt: skip
-    """V of the children: one lag later, and the variance of what was put in, zero where that was measured.
+    """V of the children: one lag later, and the variance of what was put in, zero where that was measured or given up.
 
-    A may be B. Needs na rows of X.
+    ``expected`` has z'C z and z'm of every column. A may be B. Needs na rows of X.
     """
     first = covariance_row(n, na)
     if first >= len(B):
@@ -79,13 +95,13 @@ def shift_covariance(
     for i in range(na - 1, 0, -1):
         to = B[first + i * (i + 1) // 2, block]
         for l in range(len(to)):
-            to[l] = X[i - 1, l] if own else 0.0
+            to[l] = X[i - 1, l] if own and plausible(expected, l, most, r) else 0.0
     to = B[first, block]
     for l in range(len(to)):
-        to[l] = h[l] + r if own else 0.0
+        to[l] = expected[0, l] + r if own and plausible(expected, l, most, r) else 0.0
 
 
-@core
+@shared
 def merge_covariance(B: Array, members: Array, n: int, na: int, share: Array, A: Array, to: int) -> None:
     """Column ``to`` of A: the average of V and the spread of the lags, whose mean stands there already."""
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2

@@ -18,15 +18,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, core, cubes, floats, kernel, wholes
-from driftfit.engine.kernel import outside as machine
+from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.layout import AT, LEAVES, ROWS
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 
 
-@core
+@shared
 def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float, W: Array) -> None:
     """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are where it goes, where Q is and where sizes are, or
     -1 where there are none."""
@@ -49,7 +48,7 @@ def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float
             M[to + a * (a + 1) // 2 + b] = total
 
 
-@core
+@shared
 def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, noise: float, g: Array) -> None:
     """Row j of a covariance whose lower triangle lies from ``at`` on, ``step`` apart."""
     n, h = len(x), noise
@@ -64,7 +63,7 @@ def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, no
         M[at + k * step] = h if b == j else -sign * g[b]
 
 
-@core
+@shared
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
     """All leaves, and what may have happened since the last used sample; returns the mean noise variance."""
     n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
@@ -80,10 +79,13 @@ def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unkn
     gap, columns = table[3 * AT.gap] // 8, table[3 * AT.gap + 2]
     for i in range(1, table[3 * AT.gap + 1]):
         enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
+    path, columns, H = table[3 * AT.path] // 8, table[3 * AT.path + 2], table[3 * AT.prior + 1]
+    for i in range(2 * H, table[3 * AT.path + 1] - 1):
+        enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
     return mean
 
 
-@core
+@shared
 def enter_mixture(z: Array, P: Array, x: Array, now: Array, noise: float, g: Array) -> None:
     n, j, sign = len(x), int(now[ENTERING]), now[OK]
     h, e = noise, now[Y]

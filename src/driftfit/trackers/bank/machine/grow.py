@@ -19,12 +19,14 @@ import math
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, log, part, sized
+from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
-from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KIND, apply
-from driftfit.trackers.bank.leaves.lags import shift_covariance, widen_by_lags
+from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
+from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
@@ -63,7 +65,7 @@ def develop(
     return K * len(Q)
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def ahead(
     n: int, A: Array, K: int, phi: Array, na: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array,
     m: Array, Z: Array, g: Array, expected: Array,
@@ -75,7 +77,7 @@ def ahead(
     return int(columns)
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def correct(
     n: int, B: Array, at: int, columns: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
     X: Array, row: int,
@@ -89,12 +91,16 @@ def correct(
         for i in range(n):
             k = times(gain, load(g, i, l))
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(k, eps)))
-            for j in range(i + 1):
+            for j in range(i):
                 store(B, FIRST + n + entry, at + l, minus(load(C, entry, l), times(k, load(g, j, l))))
                 entry += 1
+            was = load(C, entry, l)
+            left = minus(was, times(k, load(g, i, l)))
+            store(B, FIRST + n + entry, at + l, higher(left, times(fill(LEFT), was)))
+            entry += 1
 
 
-@core
+@shared
 def leave(B: Array, at: int, columns: int, n: int, C: Array, m: Array) -> None:
     """A sensor that says nothing of theta."""
     for l in range(0, columns, WIDTH):
@@ -135,7 +141,7 @@ def student(B: Array, at: int, X: Array, out: int, columns: int, fade: float, le
         store(B, S, at + l, higher(plus(scale, far), times(fill(least), more)))
 
 
-@core
+@shared
 def frozen(
     B: Array, at: int, columns: int, y: float, last: float, width: float, r: float, unknown: bool, out: Array
 ) -> None:
@@ -148,14 +154,14 @@ def frozen(
         out[l] = -0.5 * (LOG_2PI + log(wide) + far * far / wide) if abs(last) < np.inf else -np.inf
 
 
-@core
+@shared
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
-    least: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool, alike: bool,
-    bases: Array, parent: Array, event: Array, X: Array,
+    least: float, most: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool,
+    alike: bool, bases: Array, parent: Array, event: Array, judges: int, X: Array,
 ) -> int:  # fmt: skip
     """The children of K leaves, with their weights not normalised; returns how many there are. ``alike`` says that the
-    prior is the same for all leaves.
+    prior is the same for all leaves; ``judges`` is where likelihoods of the user's own are.
     """
     n, Hd, Hm = len(phi), len(Q), len(sensors)
     tri = n * (n + 1) // 2
@@ -172,6 +178,11 @@ def grow(
         if sensors[j, FROZEN] > 0.0:
             leave(B, at, columns, n, C, m)
             frozen(B, at, columns, y, last, sensors[j, STUCK], r, unknown, X[likely])
+        elif sensors[j, OWN] > 0.0:
+            which, said, noisy = sensors[j, OWN], X[len(X) - 1], r * noise
+            judge_all(judges, which, B, at, columns, expected, y, noisy, unknown, last, X, likely, said)
+            correct(n, B, at, columns, C, m, g, expected, y, 0.0, X, likely + 1)
+            weigh_all(judges, which, B, at, columns, expected, y, noisy, unknown, last, X, likely, said)
         else:
             noise_j = sensors[j, FACTOR] * r * noise
             correct(n, B, at, columns, C, m, g, expected, y - sensors[j, VALUE], noise_j, X, likely + 1)
@@ -181,15 +192,18 @@ def grow(
                 gaussian(X, likely, columns)
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
-            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected[1], own_lags)
+            remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected, own_lags, most, r)
+            if own_lags and sensors[j, OWN] > 0.0:
+                which, said, noisy = sensors[j, OWN], X[len(X) - 1], r * noise
+                clean_all(judges, which, B, at, columns, n, expected, y, noisy, unknown, last, said)
             block, spare = slice(at, at + columns), X[len(X) - na :]
-            shift_covariance(A, K, B, block, n, na, own_lags, m, expected[0], r, spare)
+            shift_covariance(A, K, B, block, n, na, own_lags, m, expected, r, most, spare)
         weigh(A, K, B, at, columns, j, Hm, own, alike, prior, X, likely, parent, event)
         encode(A, K, B, at, columns, j, Hd, Hm, bases, event)
     return int(columns * Hm)
 
 
-@core
+@shared
 def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None:
     """A row of children as their parents have it."""
     for c in range(at, at + columns, K):
@@ -197,10 +211,11 @@ def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None
             B[row, np.uint64(c + l)] = A[row, l]
 
 
-@core
+@shared
 def remember(
-    A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, y_hat: Array, own: bool
-) -> None:
+    A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, expected: Array, own: bool,
+    most: float, r: float,
+) -> None:  # fmt: skip
     """Output lags of the children: the parent's, one later, and y or what the leaf expected."""
     first = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
@@ -208,7 +223,8 @@ def remember(
             for l in range(K):
                 B[first + i, np.uint64(c + l)] = A[first + i - 1, l]
     for l in range(columns):
-        B[first, np.uint64(at + l)] = y_hat[l] if own else y
+        believed = own and plausible(expected, l, most, r)
+        B[first, np.uint64(at + l)] = expected[1, l] if believed else y
 
 
 @part
@@ -243,7 +259,7 @@ def weigh(
             parents[np.uint64(to + l)], events[np.uint64(to + l)] = l, e
 
 
-@core
+@shared
 def encode(
     A: Array, K: int, B: Array, at: int, columns: int, j: int, Hd: int, Hm: int, bases: Array, events: Array
 ) -> None:
