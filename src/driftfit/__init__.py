@@ -1,4 +1,4 @@
-"""driftfit follows the parameters of a system while they change."""
+"""driftfit tracks the parameters of a system while they change."""
 
 from importlib.metadata import version
 

@@ -1,13 +1,13 @@
-"""The promises of a tracker as code, for trackers that stand outside this package as well.
+"""The promises of a tracker as code, which also serve trackers outside this package.
 
     from driftfit.checks import check_tracker
 
     for sentence in check_tracker(MyTracker(gain=0.1)):
         print(sentence)
 
-Every check drives the tracker over a small simulated record and says in a sentence what is broken and where to look.
-It takes about as long as compiling the tracker three times. Keeping all promises does not make a tracker good: compare
-its one-step errors with those of others (`Track.summary`).
+Every check runs the tracker on a small simulated record. If a promise is broken, it returns a sentence that says which
+and where to look. This takes about as long as compiling the tracker three times. A tracker that keeps all promises is
+not necessarily good: compare its one-step errors with those of others (`Track.summary`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ LONG = 20_000
 
 
 def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
-    """The promises that a tracker breaks, a sentence each; an empty list when it keeps them all.
+    """The promises that a tracker breaks, one sentence each; an empty list if it keeps them all.
 
     Parameters
     ----------
@@ -48,11 +48,11 @@ def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
     broken = list(_settings(tracker))
     try:
         run = track(bound, tracker, *record())
-    except Exception as error:  # whatever it is: its author wants to read it
+    except Exception as error:  # whatever the error is, the author of the tracker wants to read it
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return [*broken, f"It does not run: {type(error).__name__}: {first.strip()}"]
     broken += _missing(tracker, bound)
-    if broken and "poison" in broken[-1]:  # nothing else can be told apart
+    if broken and "poison" in broken[-1]:  # nothing else can be distinguished
         return broken
     for check in (_live, _lanes, _causal, _unused, _no_time, _each, _variances, _rest, _saving, _learning):
         broken += check(tracker, bound, run)
@@ -78,7 +78,7 @@ def damaged(seed: int = 0, bad: float = np.nan) -> tuple[Array, Array]:
 
 
 def _differ(one: Track, other: Track, upto: int | None = None) -> str | None:
-    """The first result in which two runs differ, and from which sample on."""
+    """The first result in which two runs differ, and the first sample at which they do."""
     for name in one._out.dtype.names or ():
         a, b = one._written(name)[:upto], other._written(name)[:upto]
         wrong = ~((a == b) | (np.isnan(a) & np.isnan(b)))
@@ -140,7 +140,7 @@ def _causal(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
         yield f"It looks ahead: a change of sample 120 shows before ({difference})."
     elif run.prediction[120] != other.prediction[120]:
         yield "The prediction of an output depends on that output: write s.y_hat from theta as it was before."
-    own = tracker.own_model(1, 1, 1) is not None  # whose equation may have another sign or scale
+    own = tracker.own_model(1, 1, 1) is not None  # its equation may have another sign or scale
     if not own and not np.allclose(run.innovation[run.ok], (run.y - run.prediction)[run.ok]):
         yield "s.e is not s.y[l] - s.y_hat[l] at samples that are used."
 

@@ -1,4 +1,4 @@
-"""What can be asked of a run once it is there; `Track` inherits these."""
+"""The methods of a result that judge and use it; `Track` inherits them."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 
 class JudgedMany:
-    """Questions to many runs at once, by key: a fleet, or the outputs of one record; see `driftfit.judge.many`."""
+    """Methods of many runs with keys, a fleet or the outputs of one record; see `driftfit.judge.many`."""
 
     def _runs(self) -> dict[Hashable, Track]:
         raise NotImplementedError
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
-        """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
+        """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
         from driftfit.judge.many import verdicts
 
         return verdicts(self._runs(), level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
-        """What `Track.diagnose` says of each, and how often each number is out of bounds."""
+        """Diagnose every run, and count how often each diagnostic is out of bounds."""
         from driftfit.judge.many import diagnoses
 
         return diagnoses(self._runs())
@@ -50,10 +50,10 @@ class JudgedMany:
         reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:
-        """Alarms of all of them, one false in ``every`` samples of all together, and which of them had something.
+        """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
 
-        ``level`` is a false discovery rate, ``reference`` one for all or a mapping from every key to its own; kinds and
-        other settings are those of `driftfit.judge.alarms.detect`.
+        ``level`` is a false discovery rate; ``reference`` is one for all runs or a mapping from every key to its own.
+        Kinds and other settings are those of `driftfit.judge.alarms.detect`.
         """
         from driftfit.judge.alarms.many import alarms
 
@@ -67,9 +67,9 @@ class JudgedMany:
         alarms: ManyAlarms | None = None,
         labels: Mapping[Hashable, Array] | None = None,
     ) -> None:
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+        """Write one self-contained HTML page with all runs in one table, and pictures of the clearest.
 
-        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
         from driftfit.show.report import check_path
         from driftfit.show.report_many import page_of_many
@@ -79,10 +79,10 @@ class JudgedMany:
 
 
 class Judged:
-    """Questions to a run. Each is a module of its own, imported when it is asked."""
+    """Methods of a run. Each is implemented in its own module, which is imported when it is called."""
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
-        """Is the time variation real, which parameters move, and does following them pay? See
+        """Is the time variation real, which parameters move, and does tracking them pay? See
         `driftfit.judge.verdict`.
         """
         from driftfit.judge.verdict import verdict
@@ -90,7 +90,7 @@ class Judged:
         return verdict(cast("Track", self), level, lags, burn)
 
     def segment(self, **settings: Any) -> Segmentation:
-        """Segments of the whole record with constant parameters, with dates and their intervals; `driftfit.segment`."""
+        """Segments of the record with constant parameters, with dates and their intervals; `driftfit.segment`."""
         from driftfit.judge.segment import segmented
 
         return segmented(cast("Track", self), **settings)
@@ -102,13 +102,13 @@ class Judged:
         return diagnose(cast("Track", self))
 
     def ahead(self, k: int) -> Prediction:
-        """Every output predicted from k samples before it, the inputs given; see `driftfit.use.simulate`."""
+        """Every output predicted from k samples before it, given the inputs; see `driftfit.use.simulate`."""
         from driftfit.use.simulate import ahead
 
         return ahead(cast("Track", self), k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
-        """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
+        """Outputs that inputs u would cause in the system at a sample, with bands; see `driftfit.use.simulate`."""
         from driftfit.use.simulate import simulate
 
         return simulate(cast("Track", self), u, at, y)
@@ -141,7 +141,7 @@ class Judged:
         return largest_pole(cast("Track", self), at)
 
     def dc_gain(self, at: Any = None) -> Response:
-        """Gain (T, m) of every input for signals that stand, with its standard deviation."""
+        """Static gain (T, m) of every input, with its standard deviation."""
         from driftfit.use.system import dc_gain
 
         return dc_gain(cast("Track", self), at)
@@ -165,7 +165,7 @@ class Judged:
         return frequency_response(cast("Track", self), w, input, at)
 
     def to_scipy(self, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
-        """The system of a sample as `scipy.signal.dlti`, from one input to y."""
+        """The system at a sample as `scipy.signal.dlti`, from one input to y."""
         from driftfit.use.system import to_scipy
 
         return to_scipy(cast("Track", self), at, dt, input)
@@ -177,7 +177,7 @@ class Judged:
         return long_run(cast("Track", self), at, level)
 
     def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
-        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.judge.alarms.detect`.
+        """Alarms at a set rate of false alarms, one in ``every`` samples; see `driftfit.judge.alarms.detect`.
 
         ``kind`` may also be the rule of another run, ``said.rule``.
         """
@@ -194,7 +194,7 @@ class Judged:
         return plot_system(cast("Track", self), input, at, **settings)
 
     def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
-        """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
+        """Simulated and measured outputs of a record that was not used, with bands and the fit in per cent."""
         from driftfit.use.system_plots import plot_validation
 
         return plot_validation(cast("Track", self), y, u, at, level)
@@ -209,7 +209,7 @@ class Judged:
     ) -> None:
         """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.show.report`.
 
-        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
+        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a separate section.
         """
         from driftfit.show.report import report
 

@@ -19,7 +19,7 @@ from driftfit.run.result import Track
 from driftfit.show.summary import table_of
 
 SHOWN = 40
-"""Rows that are printed."""
+"""Most rows that are printed."""
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""``driftfit select``: which structure predicts best."""
+"""``driftfit select``: find the structure that predicts best."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``driftfit verdict``: is the time variation real, which parameters move, and does following them pay?"""
+"""``driftfit verdict``: is the time variation real, which parameters move, and does tracking them pay?"""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def verdict(
     lags: Annotated[int | None, typer.Option(help="Lags of correlation of the noise to allow for.")] = None,
     report: Report = None,
 ) -> None:
-    """Say whether the parameters move, which, when, and whether following them pays."""
+    """Report whether the parameters move, which ones and when, and whether tracking them pays."""
     run = given.run()
     say(run.verdict(level=level, lags=lags))
     if report is not None:

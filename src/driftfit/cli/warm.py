@@ -1,4 +1,4 @@
-"""``driftfit warm``: compile before the first user waits, as when a container image is built."""
+"""``driftfit warm``: compile before the first user has to wait, for example when a container image is built."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from driftfit.run.fleet import FEWEST
 from driftfit.show.summary import facts
 
 SAMPLES = 300
-"""Of the made-up record."""
+"""Length of the simulated record."""
 
 
 @app.command()
@@ -29,7 +29,7 @@ def warm(
     inputs: Annotated[int, typer.Option(help="How many inputs the record has.")] = 1,
     fleet: Annotated[bool, typer.Option("--fleet", help="For many series at once as well.")] = False,
 ) -> None:
-    """Compile what models and a tracker need (record, stream, summary, verdict), so that it is found on disk later."""
+    """Compile what models and a tracker need (record, stream, summary, verdict), and store it on disk for later."""
     from driftfit.run.live.live import Live
     from driftfit.run.track import track
 

@@ -1,1 +1,1 @@
-"""Data as users have them: arrays, tables and files, times, limits and labels; and results as tables and files."""
+"""Reading data: arrays, tables and files, times, limits and labels; and writing results as tables and files."""

@@ -1,9 +1,9 @@
 """Results as tables: polars, pandas, pyarrow, Arrow streams, CSV and Parquet.
 
-One row a sample. The columns: what tells the series of a fleet apart, the time (or the sample number) and the signals
-under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
-``theta_<name>`` and ``std_<name>``. Units stand where each format has room for them: ``attrs`` in pandas, the metadata
-of fields in pyarrow, the metadata of the file in Parquet.
+One row per sample. The columns are those that identify the series of a fleet, the time (or the sample number), the
+signals under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
+``theta_<name>`` and ``std_<name>``. Units are stored where each format has room for them: ``attrs`` in pandas, the
+metadata of fields in pyarrow, the metadata of the file in Parquet.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _time_name(run: Track | Outputs | Shared) -> str:
 
 
 def _signals(runs: Sequence[Track]) -> dict[str, list[Array]]:
-    """The columns of all runs, by name; a signal that is called like a result gets a trailing underscore."""
+    """The columns of all runs, by name; a signal with the name of a result gets a trailing underscore."""
     first = runs[0]
     inputs = first.labels.u or tuple(f"u{j + 1}" for j in range(first.u.shape[1]))
     columns = {_time_name(first): [run.time for run in runs], _free(first.labels.y): [run.y for run in runs]}
@@ -88,7 +88,7 @@ def units_of(result: Track | Fleet) -> dict[str, str]:
 
 
 def outputs_table(runs: Outputs | Shared | OutputsFleet, kind: str = "polars") -> Any:
-    """Records of several outputs: each result with its output in brackets, inputs and parameters under their names."""
+    """Records of several outputs: each result has its output in brackets; inputs and parameters have their names."""
     one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
     if isinstance(runs, dict):
         parts = []
@@ -118,7 +118,7 @@ def _of_outputs(run: Outputs | Shared) -> pl.DataFrame:
 
 
 def forecasts_table(runs: Mapping[Any, Track], labels: Labels, h: int, u: Any) -> pl.DataFrame:
-    """The forecasts of many runs, one after the other, a row a sample."""
+    """The forecasts of many runs in one table, one row per sample."""
     parts = []
     for key, run in runs.items():
         found = run.forecast(h, u.get(key) if isinstance(u, Mapping) else u)
@@ -153,7 +153,7 @@ def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
 
     frame = pd.DataFrame({name: table[name].to_numpy() for name in table.columns})
     for name, kind in table.schema.items():
-        if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy knows no zones: these are UTC
+        if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy has no time zones: these times are UTC
             frame[name] = frame[name].dt.tz_localize("UTC").dt.tz_convert(kind.time_zone)
     frame.attrs["units"] = dict(units)
     return frame
@@ -168,7 +168,7 @@ def _to_pyarrow(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
 
 
 def to_parquet(result: Track | Fleet, path: str | PathLike[str]) -> None:
-    """Write a result as Parquet; units, model and tracker go into the metadata of the file, under "driftfit"."""
+    """Write a result as Parquet; units, model and tracker are stored in the metadata of the file, under "driftfit"."""
     runs, _ = _runs(result)
     trackers = dict.fromkeys(repr(run.tracker) for run in runs)
     about = {"model": repr(runs[0].model), "trackers": list(trackers), "units": units_of(result)}
@@ -176,7 +176,7 @@ def to_parquet(result: Track | Fleet, path: str | PathLike[str]) -> None:
 
 
 def check_ending(path: str | PathLike[str]) -> str:
-    """The ending of a file that results can be written to; ValueError for any other."""
+    """The ending of a file to which results can be written; ValueError for any other."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
         raise ValueError(f"{path}: results are written to {', '.join(ENDINGS)}, by the ending of the name.")
@@ -184,9 +184,9 @@ def check_ending(path: str | PathLike[str]) -> str:
 
 
 def write(result: Any, path: str | PathLike[str]) -> None:
-    """Write a result: a table as .csv or .parquet, or a whole run as .npz, by the ending of the name."""
+    """Write a result: a table as .csv or .parquet, or a complete run as .npz, depending on the ending of the name."""
     ending = check_ending(path)
-    single = hasattr(result, "to_parquet")  # one output
+    single = hasattr(result, "to_parquet")  # a single output
     if ending == ".npz" and hasattr(result, "save"):
         result.save(path)
     elif ending == ".npz":

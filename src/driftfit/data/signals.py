@@ -1,4 +1,4 @@
-"""Signals as users hand them over: arrays of numbers, times, and settings that must be complete."""
+"""Signals as users pass them: arrays of numbers, times, and settings that must be complete."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def check_ready(tracker: Tracker) -> Tracker:
-    """Refuse a tracker whose settings are not all numbers yet."""
+    """Raise an error for a tracker with missing settings."""
     missing = missing_settings(tracker)
     if missing:
         name = type(tracker).__name__
@@ -26,7 +26,7 @@ def check_ready(tracker: Tracker) -> Tracker:
 
 
 def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN, text is named with its place."""
+    """Values as floats; None and masked entries become NaN; for text the error names its position."""
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(float), np.nan)
     try:
@@ -89,7 +89,7 @@ def noise_of(weights: Any, T: int | None = None) -> Array:
 
 
 def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
-    """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise."""
+    """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise errors."""
     axis, _ = instants(time)
     if axis.shape != (T,):
         raise ValueError(f"time has shape {axis.shape}, but y has {T} samples.")

@@ -1,4 +1,4 @@
-"""Pictures of results. matplotlib is imported here and nowhere else."""
+"""Pictures of results. matplotlib is imported only here."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure that belongs to no window, so that it needs no display and is freed like any object."""
+    """An empty figure without a window, so that it needs no display and is freed like any object."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -58,7 +58,7 @@ def plot_track(run: Track, level: float = 0.95) -> Figure:
 
 
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-    """One parameter of the series that moved most, a panel a series, all at one scale."""
+    """One parameter of the series that moved most, one panel per series, all on one scale."""
     units = fleet.summary().units
     if which is None:
         which = Counter(unit.parameter for unit in units[:most]).most_common(1)[0][0]
@@ -88,12 +88,12 @@ def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: fl
 
 
 def named(name: str, unit: str) -> str:
-    """A name with its unit, where it has one."""
+    """A name with its unit, if it has one."""
     return f"{name} ({unit})" if unit else name
 
 
 def time_label(run: Track) -> str:
-    """What stands under the axis of time."""
+    """The label of the time axis."""
     if run._time is None:
         return "sample"
     name = run.labels.time or "time"
@@ -101,7 +101,7 @@ def time_label(run: Track) -> str:
 
 
 def date_axis(axis: Axes, run: Track) -> None:
-    """Ticks at round dates, in the time zone of the table, each part of the date written once."""
+    """Ticks at round dates in the time zone of the table; each part of the date is written once."""
     if run.time.dtype.kind != "M":
         return
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -113,9 +113,9 @@ def date_axis(axis: Axes, run: Track) -> None:
 
 
 def draw_prediction(axis: Axes, run: Track) -> None:
-    """The output, and what was predicted one step before it was seen."""
+    """The output, and its prediction one step ahead."""
     axis.plot(run.time, run.y, color=GREY, ls="", marker=".", ms=3.0, label="output")
-    # without knowledge the prediction is theta0's, which says nothing
+    # before anything is known the prediction is theta0's, which means nothing
     known = np.where(np.isinf(run.innovation_std), np.nan, run.prediction)
     axis.plot(run.time, known, color=BLUE, lw=0.9, label="one-step prediction")
     frame(axis, np.concatenate([run.y, run.prediction[settled(run)]]))
@@ -188,7 +188,7 @@ def plot_smoothed(smoothed: Smoothed, level: float = 0.95) -> Figure:
 
 
 def plot_segments(segments: Segments, level: float = 0.95) -> Figure:
-    """Constant parameters with bands, stretch by stretch, over the tracked path."""
+    """Constant parameters with bands, segment by segment, over the tracked path."""
     run, n = segments.run, len(segments.names)
     figure = new_figure(9.0, 1.7 * n + 0.8)
     axes = figure.subplots(n, 1, sharex=True, squeeze=False).ravel()

@@ -1,4 +1,4 @@
-"""The summary of a run: parameters now, and the comparison that keeps the numbers honest."""
+"""The summary of a run: the present parameters, and a comparison with simpler methods."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
 def printed(*parts: Any) -> str:
     """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
 
-    Left to itself rich hands what is printed to the display of a notebook, and takes colours and widths from the
-    environment.
+    By default rich sends output to the display of a notebook, and takes colours and widths from the environment.
     """
     text = StringIO()
     console = Console(
@@ -42,7 +41,7 @@ def printed(*parts: Any) -> str:
 
 
 class Printed(JupyterMixin):
-    """A result that rich draws: ``str`` gives it as plain text, and a notebook shows it as the value of a cell."""
+    """A result that rich draws: ``str`` returns it as plain text, and a notebook shows it as the value of a cell."""
 
     def __str__(self) -> str:
         return printed(self)
@@ -50,7 +49,7 @@ class Printed(JupyterMixin):
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter: now, its 95 % band, and the range of its path once the start is over."""
+    """One parameter: its value, its 95 % band, and the range of its path after the start."""
 
     name: str
     theta: float
@@ -139,7 +138,7 @@ def _signals(run: Track) -> str:
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:
-    """What was taken as missing though a number stood there."""
+    """Readings that were counted as missing although they contain a number."""
     return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
 
 
@@ -152,7 +151,7 @@ def _span(run: Track) -> str:
 
 
 def key_text(key: Hashable) -> str:
-    """The key of a series as text; that of several columns without brackets."""
+    """The key of a series as text; a key of several columns has no brackets."""
     return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
 
 
@@ -162,12 +161,12 @@ def counts(dropped: Mapping[str, int]) -> str:
 
 
 def shortened(text: str) -> str:
-    """Numbers of more than six digits in six."""
+    """Round numbers of more than six digits to six."""
     return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 
 
 def facts(*pairs: tuple[str, str]) -> Table:
-    """Names and what they are, side by side; text as it stands, since b1[flow] is not markup."""
+    """Names and values side by side, as plain text, since b1[flow] is not markup."""
     table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, value in pairs:
         table.add_row(Text(name, "bold"), Text(value))
@@ -175,11 +174,11 @@ def facts(*pairs: tuple[str, str]) -> Table:
 
 
 SHORT = 10
-"""Cells of at most so many signs stand on one line: numbers, and p-values such as < 0.0001."""
+"""A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
 class Numbers(Table):
-    """A table no wider than `WIDTH` or the terminal, in which nothing is cut: what is too wide is broken at blanks."""
+    """A table no wider than `WIDTH` or the terminal, in which nothing is cut off: long text is wrapped at blanks."""
 
     def add_row(self, *cells: Any, **options: Any) -> None:
         """Add a row; every column is at least as wide as its longest word."""
@@ -197,7 +196,7 @@ def _widen(column: Column, text: str) -> None:
 
 
 def table_of(title: str, *heads: str, names: int = 1) -> Table:
-    """A table of numbers over the full width: the first ``names`` columns to the left, numbers to the right."""
+    """A table of numbers over the full width; the first ``names`` columns are left-aligned, numbers right-aligned."""
     table = Numbers(
         title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, expand=True
     )

@@ -1,1 +1,1 @@
-"""Simulated truths: systems whose parameters are known at every sample, and the laws by which parameters drift."""
+"""Simulated systems whose parameters are known at every sample, and the laws by which parameters drift."""
