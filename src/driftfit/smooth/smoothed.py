@@ -1,4 +1,4 @@
-"""Smoothed: the path of a complete record, with what judges it."""
+"""The smoothed path of a complete record, and statistics to judge it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from driftfit.smooth import exact
 from driftfit.smooth.parts.walk import Path, Walk, ordered, walk_of
 
 ALONE = 1e-12
-"""Below this sqrt(1 - leverage) a sample alone determines a direction, and says nothing when it is left out."""
+"""Below this sqrt(1 - leverage) a sample alone determines a direction, and its leave-one-out residual is undefined."""
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,24 +31,26 @@ class Smoothed:
     theta, std : (T, n)
         Posterior mean and standard deviation; std is inf for parameters that the record does not determine.
     residual, loo : (T,)
-        y - phi' theta; and the same with theta from all samples but this one. The first is *not* a measure of fit: it
-        is shrunk by 1 - leverage. NaN where there is no sample; loo also where a sample alone determines a direction.
+        y - phi' theta; and the same with theta from all samples but this one. The first is *not* a measure of fit,
+        because it is shrunk by 1 - leverage. NaN where there is no sample, and loo also where a sample alone determines
+        a direction.
     leverage : (T,)
         Share of a sample in its own fit, in [0, 1].
     press, alone : float, int
-        Weighted mean square of ``loo``, and how many samples it leaves out because they alone determine a direction.
+        Weighted mean square of ``loo``, and the number of samples that it leaves out because they alone determine a
+        direction.
     cost, measurement_cost, dynamic_cost : float
-        The least J, and its two parts: weighted squared residuals, and the rest.
+        The minimum of J, and its two parts: weighted squared residuals, and the rest.
     r : float
-        Noise variance: the tracker's, or J / (N - rank) where it carries none (J / N under a proper prior).
+        Noise variance: the tracker's, or J / (N - rank) if it has none (J / N under a proper prior).
     rank : (T,) int
         Rank of the regressors up to each sample.
     method : "fast" or "safe"
-        Which path the solver took; it tests its own result.
+        The method of the solver, which tests its own result.
     walk : Walk
         The problem that was solved.
 
-    Bands hold under the random-walk model and its drift; they do not cover a drift that is set wrongly.
+    Bands are valid under the random-walk model and its drift; they do not account for a wrong drift.
     """
 
     def __init__(self, walk: Walk, path: Path, run: Track, order_by: Any = None) -> None:
@@ -103,7 +105,7 @@ class Smoothed:
 
     @property
     def slope(self) -> Array:
-        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        """Change of theta per nominal interval, (T, n), if the slope is a random walk (``differences=2``)."""
         return self._of_slopes(self._path.slope)
 
     @cached_property

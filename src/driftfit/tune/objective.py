@@ -1,4 +1,4 @@
-"""What tuning minimises: minus the log-likelihood, or the logarithm of a mean square of errors."""
+"""The objectives of tuning: minus the log-likelihood, or the logarithm of a mean square of errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from driftfit.tune.lanes import Record, score
 
 
 def along(record: Record, tracker: Tracker, order_by: Any) -> Record:
-    """The record as a regression whose samples are sorted by a variable."""
+    """The record as a regression with samples sorted by a variable."""
     model = record.model
     walk, _ = ordered(walk_of(run_record(record, constant(record, tracker))), order_by)
     known = np.ones((len(walk.y), 3))
@@ -30,9 +30,9 @@ def along(record: Record, tracker: Tracker, order_by: Any) -> Record:
 
 @dataclass(frozen=True)
 class Criterion:
-    """Points (S, p) to values (S,), to be minimised: minus the log-likelihood, or the log of a mean square.
+    """Maps points (S, p) to values (S,) to be minimised: minus the log-likelihood, or the log of a mean square.
 
-    In logarithms the unit of y is an offset, so that the tolerances of the search do not depend on it.
+    In logarithms the unit of y is only an offset, so the tolerances of the search do not depend on it.
     """
 
     record: Record
@@ -48,7 +48,7 @@ class Criterion:
             squares = score(self.record, trackers, self.h).h_step
         else:
             squares = np.array([_smoothed_score(self.record, tracker, self.method) for tracker in trackers])
-        tiny = np.finfo(float).tiny  # a perfect fit is the best there is, and has a logarithm
+        tiny = np.finfo(float).tiny  # a perfect fit is the best possible result and must have a logarithm
         return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
 
 
@@ -61,7 +61,7 @@ def run_record(record: Record, tracker: Tracker) -> Track:
 
 
 def _smoothed_score(record: Record, tracker: Tracker, method: str) -> float:
-    """Mean square of the leave-one-out residuals of the smoothed path, or its rotation-invariant relative."""
+    """Mean square of the leave-one-out residuals of the smoothed path, or the rotation-invariant variant of it."""
     path = run_record(record, tracker).smooth()
     weight = path.walk.weight
     used = weight > 0.0

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def plot_tuned(tuned: Tuned) -> Figure:
-    """One panel a knob: the criterion over its range, the choice, and its interval."""
+    """One panel per knob: the criterion over its range, the chosen value, and its interval."""
     curves = tuned.curves()
     figure = new_figure(4.6 * min(len(curves), 2), 3.2 * -(-len(curves) // 2))
     panels = figure.subplots(-(-len(curves) // 2), min(len(curves), 2), squeeze=False).ravel()
@@ -30,7 +30,7 @@ def plot_tuned(tuned: Tuned) -> Figure:
             panel.axvspan(max(low, axis(values).min()), min(high, axis(values).max()), color=BLUE, alpha=0.15, lw=0)
             if 0.0 < axis(best) < np.inf:
                 panel.axvline(float(axis(best)), color=RED, lw=1.0)
-        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; the top is what matters
+        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; only the top matters
             panel.set_ylim(criterion.max() - 12.0, criterion.max() + 1.0)
         panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
         panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(tuned.method, tuned.method))

@@ -1,12 +1,12 @@
-"""The search: a grid over every knob, then a quasi-Newton method whose gradients are lanes; profiles for intervals.
+"""The search: a grid over every knob, then a quasi-Newton method with gradients from lanes; profiles for intervals.
 
-    start      all knobs together on a grid of at least 4 points a decade, then each by itself (also at zero)
+    start      all knobs together on a grid of at least 4 points per decade, then each separately (also at zero)
     refine     L-BFGS-B on the finite knobs, central differences of 1e-3 decades
-    zero       a knob whose zero is at least as good is zero
+    zero       a knob is set to zero if zero is at least as good
     profile    along the ridge x_hat + delta C e_i / C_ii, C the inverse of the Hessian: where the objective has risen
                by chi2 / 2, on either side; with one knob this is the profile itself
 
-The objective is to be minimised; it takes points (S, p) and gives values (S,), +inf where a point is impossible.
+The objective is minimised; it maps points (S, p) to values (S,), +inf for impossible points.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ STEP = 1e-3
 CURVE = 0.03
 """The same for second differences, which lose twice as many digits."""
 CYCLES = 4
-"""Rounds over the knobs, at most."""
+"""Largest number of rounds over the knobs."""
 EDGE = 0.01
-"""Decades from an end of the range that count as being there."""
+"""Distance in decades from an end of the range that counts as being at the end."""
 
 
 class Counted:
-    """An objective that remembers every point that was asked for."""
+    """An objective that stores every point at which it was evaluated."""
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
@@ -60,7 +60,7 @@ def _axis(knobs: Knobs, i: int) -> Array:
 
 
 def _grid(f: Objective, knobs: Knobs) -> Array:
-    """All knobs that have the same range together, the others at their middle; then knob by knob."""
+    """A grid over all knobs with the same range together, with the others at their middle; then knob by knob."""
     p = len(knobs.low)
     together = (knobs.low == knobs.low[0]) & (knobs.high == knobs.high[0]) & (knobs.zero == knobs.zero[0])
     points = np.where(together, _axis(knobs, 0)[:, None], _middle(knobs))
@@ -81,7 +81,7 @@ def _grid(f: Objective, knobs: Knobs) -> Array:
 
 
 def _middle(knobs: Knobs) -> Array:
-    """Where a knob that is not varied stands: at 0, which is the scale of the data, or at the nearest end."""
+    """The value of a knob that is not varied: 0, which is the scale of the data, or the nearest end."""
     return np.asarray(np.clip(np.zeros(len(knobs.low)), knobs.low, knobs.high))
 
 
