@@ -169,13 +169,13 @@ class Smoothed:
         return cov
 
     def lag_cov(self, t: int) -> Array:
-        """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` where given."""
+        """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` if given."""
         lag: Array = self.r * self._covariances.lag_cov[t]
         return lag
 
     @cached_property
     def _covariances(self) -> Path:
-        """The path with its covariances; solved again unless they were kept."""
+        """The path with its covariances; the problem is solved again unless they were kept."""
         return self._path if len(self._path.cov) else solve(self.walk, "cov", self.order_by)
 
     def plot(self, level: float = 0.95) -> Figure:
@@ -186,7 +186,7 @@ class Smoothed:
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
-    """The smoothed path in time order; with ``order_by`` theta walks along that variable instead of along time."""
+    """The smoothed path in time order; with ``order_by`` theta is a random walk along that variable instead of time."""
     if order_by is None:
         return exact.smooth(walk, keep)
     arranged, order = ordered(walk, order_by)
@@ -200,7 +200,7 @@ def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
 
 
 def noise_variance(walk: Walk, path: Path) -> float:
-    """J / (N - rank); NaN, with a warning, where nothing is left over to estimate it from."""
+    """J / (N - rank); NaN, with a warning, if there are no degrees of freedom from which to estimate it."""
     free = walk.used - (int(path.rank.max()) if walk.p0 is None else 0)
     least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
     if free <= 0 or path.cost <= least:

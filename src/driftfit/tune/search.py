@@ -89,7 +89,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
     free = np.flatnonzero(np.isfinite(x))
     if not free.size:
         return x
-    # one grid cell around the best grid point, so that a second valley cannot catch the search
+    # one grid cell around the best grid point, so that the search cannot end in another valley
     reach = 1.0 / DECADE if len(x) == 1 else np.inf
     low, high = np.maximum(knobs.low[free], x[free] - reach), np.minimum(knobs.high[free], x[free] + reach)
 
@@ -103,7 +103,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
         slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
         return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
 
-    from scipy import optimize  # half a second to import
+    from scipy import optimize  # this import takes half a second
 
     options = {"ftol": 1e-14, "gtol": 1e-9, "maxiter": 100}  # the logarithm of a mean square is flat: 0.01 a decade^2
     found = optimize.minimize(
@@ -115,7 +115,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
 
 
 def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
-    """Set to zero what is not worse there, and refine the rest again."""
+    """Set knobs to zero where that is not worse, and refine the others again."""
     candidates = np.flatnonzero(knobs.zero & np.isfinite(x))
     changed = False
     for i in candidates:
@@ -128,7 +128,7 @@ def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
 
 
 def curvature(f: Objective, x: Array, free: Array) -> Array:
-    """The Hessian of the free knobs by second differences, NaN where the objective has none."""
+    """The Hessian of the free knobs by second differences; NaN where the objective has none."""
     k = free.size
     points = [x]
     pairs = [(i, j) for i in range(k) for j in range(i + 1)]
@@ -142,13 +142,13 @@ def curvature(f: Objective, x: Array, free: Array) -> Array:
     H = np.empty((k, k))
     for at, (i, j) in enumerate(pairs):
         pp, pm, mp, mm = values[1 + 4 * at : 5 + 4 * at]
-        # on the diagonal the two steps add up to one of twice the length, or to none
+        # on the diagonal the two steps add up to one of twice the length, or cancel
         H[i, j] = H[j, i] = (pp - pm - mp + mm) / (4.0 * CURVE**2)
     return H
 
 
 class Search:
-    """The best point, and what the objective does around it."""
+    """The best point, and the shape of the objective around it."""
 
     def __init__(self, f: Counted, knobs: Knobs, x: Array) -> None:
         self.f, self.knobs, self.x = f, knobs, x
@@ -169,7 +169,7 @@ class Search:
 
     @cached_property
     def inverse(self) -> Array:
-        """C, the inverse of the Hessian of the free knobs; diagonal where the objective is not convex."""
+        """C, the inverse of the Hessian of the free knobs; diagonal if the objective is not convex."""
         H = curvature(self.f, self.x, self.free)
         convex = np.isfinite(H).all() and np.linalg.eigvalsh(H).min(initial=np.inf) > 0.0
         C: Array = np.linalg.inv(H) if convex else np.full(H.shape, np.nan)
@@ -201,9 +201,9 @@ class Search:
         return points
 
     def profile(self, i: int, level: float) -> tuple[float, float]:
-        """Ends of the interval of knob i: where the objective has risen by half the chi-square quantile.
+        """Ends of the interval of knob i, at which the objective has risen by half the chi-square quantile.
 
-        -inf or inf where it has not before the end of the range.
+        -inf or inf if it does not rise that far within the range.
         """
         rise = 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
         start = self.x[i] if np.isfinite(self.x[i]) else self.knobs.low[i]
@@ -211,7 +211,7 @@ class Search:
         return (-np.inf if not np.isfinite(self.x[i]) else ends[0]), ends[1]
 
     def _crossing(self, i: int, start: float, end: float, rise: float) -> float:
-        """Where the root of the rise, which is nearly linear, passes 1 between start and end."""
+        """Where the square root of the rise, which is nearly linear, passes 1 between start and end."""
         nowhere = (
             np.copysign(np.inf, end - start) if end != start else (-np.inf if end == self.knobs.low[i] else np.inf)
         )
