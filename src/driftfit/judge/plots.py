@@ -1,4 +1,4 @@
-"""Pictures of what judges a run."""
+"""Plots of diagnostics, alarms and selections."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d
 
 
 def draw_diagnosis(said: Diagnosis) -> Figure:
-    """Six pictures on one page."""
+    """Six plots on one page."""
     figure = new_figure(11.0, 8.2)
     axes = figure.subplots(3, 2)
     _innovations(axes[0, 0], said)
@@ -116,7 +116,7 @@ def _paths(axis: Axes, said: Diagnosis) -> None:
 
 
 def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
-    """The output, and each statistic over its limit (a probability as it is), with alarms and labels shaded."""
+    """The output, and each statistic over its limit (probabilities unscaled), with alarms and labels shaded."""
     run, c = said.run, len(said.names)
     figure = new_figure(9.5, 1.5 * c + 2.0)
     axes = figure.subplots(c + 1, 1, sharex=True)
@@ -152,7 +152,7 @@ def plot_alarms(said: Alarms, labels: Array | None = None) -> Figure:
 
 
 def plot_selection(said: Selection, most: int) -> Figure:
-    """Distance from the best with standard errors, and the loss of the leading structures over time."""
+    """Distance from the best structure with standard errors, and the loss of the leading structures over time."""
     rows = said.rows[:most]
     figure = new_figure(11.0, max(3.2, 0.27 * len(rows) + 1.2))
     table, loss = figure.subplots(1, 2, width_ratios=[1.1, 1.0])

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 
 class Rows(NamedTuple):
-    """The N samples that can be used, scaled to the noise variance of weight 1."""
+    """The N usable samples, scaled to the noise variance of weight 1."""
 
     at: Array
-    """(N,): their places in the record."""
+    """(N,): their sample numbers in the record."""
     phi: Array
     """(N, n)"""
     y: Array
@@ -25,7 +25,7 @@ class Rows(NamedTuple):
 
 
 def regressors(run: Track) -> Rows:
-    """The samples of a regression that a record makes for the model of a run."""
+    """The record as samples of a regression for the model of a run."""
     out = constant_least_squares(run.model, run.y, run.u, run._known)
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run._known[:, 1] if len(run._known) == 1 else run._known[at, 1]

@@ -1,24 +1,25 @@
-"""Verdict: is the time variation real, which parameters move, by how much and when, and does following them pay?
+"""Verdict: is the time variation real, which parameters move, by how much and when, and does tracking them pay?
 
-Two questions that have different answers:
+The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
-  variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
-  do not enter. Where constants are true, "they move" is said with probability ``level``, as
+  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
+  do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
-  constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`).
+* *Does tracking them pay?* The one-step errors of the run are compared with those of persistence, constant least
+  squares on the past and a constant ARX model, on the same samples, with paired tests
+  (`driftfit.judge.statistics.paired`).
 
-The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
-rejects, its own still does when what was named before it is taken into account
-(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance.
+The first sentence combines both answers. A parameter is named as moving if the joint test rejects, its own test still
+rejects after the changes of the parameters named before it are taken into account
+(`driftfit.judge.statistics.attribution`), and its values before and after differ significantly.
 
-A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
-autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
-wanders as fast as the noise itself passes for such noise. Not for smooth fast oscillations: a parameter that swings
-many times within the record leaves little trace in a cumulated score. Cost: three constant fits, O(T n^2).
+A model with too few lags has correlated noise, which is hard to distinguish from a drifting intercept. The order of an
+autoregression of the noise is estimated from the record, or set by ``lags=``, and the verdict reports it. A parameter
+that varies as fast as the noise is mistaken for such noise. Do not use the verdict for smooth fast oscillations: they
+leave little trace in a cumulative score. Cost: three constant fits, O(T n^2).
 """
 
 from __future__ import annotations
@@ -42,18 +43,18 @@ from driftfit.show.summary import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "constant ARX")
 CORRELATED = 1e-3
-"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
+"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What the record says of one parameter.
+    """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
-    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
-    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
-    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
-    after the last step, which is ``before`` again after a fault that passed.
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which separates
+    parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
+    moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
+    first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
+    its value after the last step, which is ``before`` again after a temporary fault.
     """
 
     name: str
@@ -71,30 +72,30 @@ class Moved:
 
 @dataclass(frozen=True)
 class Verdict(Printed):
-    """What `Track.verdict` returns; printing it shows it.
+    """The result of `Track.verdict`; printing it shows the sentences and tables.
 
     Attributes
     ----------
     drifts : bool or None
-        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+        Whether the parameters move: ``p`` is below ``level``. None if the record does not determine it.
     pays : bool or None
-        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
-        where there are too few samples to compare.
+        Whether the run predicts better than constant least squares on the past: its paired p-value is below ``level``.
+        None if there are too few samples to compare.
     p : float
-        Joint test of all parameters; NaN where the record cannot tell.
+        p-value of the joint test of all parameters; NaN if the record does not determine it.
     statistic : float
-        Its part that is Nyblom's.
+        Nyblom's statistic of all parameters.
     level : float
-        Error rate: how often constants are said to move.
+        Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
-        The same of persistence, constant LS and constant ARX, with paired tests.
+        The same for persistence, constant LS and constant ARX, with paired tests.
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        The residuals are correlated, also within segments of constant coefficients.
+        Whether the residuals are correlated, even within segments of constant coefficients.
     lags : int
         Lags of correlation that were allowed for.
     burn : int
@@ -201,7 +202,7 @@ class Verdict(Printed):
 
 
 def _told(moved: Moved) -> str:
-    """What one parameter did, in words."""
+    """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:
         return text
@@ -210,7 +211,7 @@ def _told(moved: Moved) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value as it is written."""
+    """A p-value as text."""
     return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -227,12 +228,12 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     run : Track
         What `track` returned.
     level : number
-        Error rate of "the parameters move".
+        Error rate of the statement that the parameters move.
     lags : int or None
-        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        Lags of correlation of the noise to allow for; None estimates them from the record, and 0 is for a model whose
         one-step errors are known to be white.
     burn : int or None
-        So many samples at the beginning are not scored; max(50, 5 n) by default.
+        Number of samples at the beginning that are not scored; max(50, 5 n) by default.
 
     Raises
     ------
