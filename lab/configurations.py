@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,31 @@ BANKS: dict[str, Any] = {
     "FirstFloor": Bank(CHANGES, [Sensor.nominal(r=0.01)], p0=2.0, reduce=FirstFloor(2)),
     "beam, square root": Bank(CHANGES, SENSORS, p0=2.0, reduce=Beam(6), form="sqrt"),
 }
+FORGETTING = [
+    Change(1e-4),
+    Change(forget=0.9, prob=0.02),
+    Change(forget=0.9, kind="directional", prob=0.02),
+    Change(forget=0.9, kind="stabilised", anchor=[[3.0, 1.0], [1.0, 2.0]], prob=0.01),
+    Change(0.5, which=[1], reset=True, prob=0.01),
+    Change(2.0, reset=True, prob=0.01),
+]
+FAULTS = [Sensor.nominal(r=0.01), Sensor.outlier(kind="additive", prob=0.02), Sensor.frozen(resolution=0.01)]
+MARKOV = ([[0.97, 0.03], [0.3, 0.7]], [[0.96, 0.02, 0.02], [0.5, 0.4, 0.1], [0.1, 0.1, 0.8]])
+WAITING = Decide("auto", max_depth=3, wait_cost=0.005)
+EVERY_PART: dict[str, Any] = {
+    "a persistent prior, GPB(2)": Bank(CHANGES, FAULTS, MARKOV, reduce=GPB(2), p0=2.0),
+    "a persistent prior, IMM": Bank(CHANGES, FAULTS, MARKOV, reduce=IMM(), p0=2.0),
+    "a persistent prior, hybrid": Bank(CHANGES, FAULTS, MARKOV, reduce=Hybrid(6), p0=2.0),
+    "forgetting": Bank(FORGETTING, [Sensor.nominal(r=0.01)], reduce=Beam(7), p0=2.0),
+    "forgetting, IMM": Bank(FORGETTING, [Sensor.nominal(r=0.01)], reduce=IMM(), p0=2.0),
+    "unknown noise, GPB(2)": Bank(CHANGES, [Sensor.nominal(guess=0.1)], reduce=GPB(2), p0=2.0),
+    "unknown noise, limits": Bank(CHANGES, [Sensor.nominal(limit=4.0)], reduce=Beam(80)),
+    "waiting": Bank(CHANGES, SENSORS, reduce=WAITING, p0=2.0),
+    "waiting, unknown noise": Bank(CHANGES, [Sensor.nominal()], reduce=WAITING),
+    "FirstFloor, prior": Bank(CHANGES, [Sensor.nominal(r=0.01)], reduce=FirstFloor(3, "prior"), p0=2.0),
+    "lags for certain": Bank(CHANGES, FAULTS, MARKOV, reduce=Beam(6), p0=2.0, lag_variance=False),
+}
+"""Banks that between them use every part of the compiled routine, in both forms."""
 BLOCKS = HammersteinWiener(na=1, nb=1, input=Polynomial(2), output=Polynomial(2))
 
 
@@ -206,3 +232,13 @@ def configurations() -> Iterator[tuple[str, Configuration]]:
     yield "Hammerstein-Wiener, Kalman", of_record(BLOCKS, Kalman(q=1e-5, r=0.01, p0=1.0), 10)
     yield "Hammerstein-Wiener, extended", of_record(BLOCKS, ExtendedKalman(q=1e-5, r=0.01), 10)
     yield "Hammerstein-Wiener, output error", of_record(BLOCKS, OutputError(q=1e-5, r=0.01, q_w=1e-4), 10)
+    for at, (name, tracker) in enumerate(EVERY_PART.items()):
+        for form in ("covariance", "sqrt"):
+            yield f"Bank, {name}, {form}", of_record(ARX(1, 1), replace(tracker, form=form), 20 + at, time=uneven)
+    for name in ("Decide", "Hybrid", "IMM"):
+        yield f"Bank, {name}, two outputs", of_outputs(ARX(1, 1, inputs=2, ny=2), BANKS[name], 8, 2)
+    for n in (1, 3, 4, 7):
+        yield f"Bank, {n} parameters", of_record(Regression(n), Bank(), 40 + n)
+    told = rng.choice([0.0, 0.01, 0.2], T)
+    yield "Bank, told priors", of_record(ARX(1, 1), SIMPLE["Bank, beam"], 50, prob=np.stack([1.0 - told, told], 1))
+    yield "Bank, stream of faults", of_stream(ARX(1, 1), EVERY_PART["a persistent prior, hybrid"], 51)

@@ -10,7 +10,7 @@ from support import arx_record, damaged, run_lanes, same
 from test_bank import N, R, changes, record
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
-from driftfit.engine.kernel import exchanged
+from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves import leaves
 from driftfit.trackers.bank.leaves.factored import factorise, widened
@@ -270,7 +270,7 @@ def test_the_form_is_named():
 
 def test_parts_that_nothing_calls_are_named():
     with pytest.raises(ValueError, match="nothing calls match"):
-        exchanged([start.begin], {merge.match: leaves.spread})
+        substituted([start.begin], {merge.match: leaves.spread})
 
 
 @pytest.mark.parametrize("form", ["covariance", "sqrt"])

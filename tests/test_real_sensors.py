@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, Live, Regression, select, track, tune
+from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, Kalman, Live, Regression, select, track, tune
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
+from driftfit.trackers.parts.disproportion import LEVERAGE
+from driftfit.trackers.parts.noise_levels import OUTLIER, level_chain
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)
@@ -217,3 +220,91 @@ def test_smoothed_bands_hold_where_the_truth_walks(kind):
             )
     assert 0.93 < np.mean(inside) < 0.97
     assert np.mean(better) < 0.75
+
+
+def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
+    y, u = jumping(noise, level(0.0))
+    every = np.stack([u, u, u])
+    every[1, :, 2] = np.random.default_rng(3).normal(size=T)
+    with pytest.warns(UserWarning, match=r"in 2 of 3 series theta3 \(2\) could not be learned") as said:
+        fleet = track(MODEL, AdaptiveKalman(), np.stack([y, y, y]), every, by="row")
+    assert len(said) == 1
+    assert np.isinf(fleet[0].std[-1, 2])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_a_direction_enters_as_the_limit_of_wide_priors_however_weakly(unit):
+    """A set-point beside an intercept moves by the least step there is, and much later by more."""
+    x, y, u = np.random.default_rng(6).normal(size=(3, T)) * [[1.0], [0.1], [1.0]]
+    set_point = np.full(T, 50.0)
+    set_point[700:] += 1e-9
+    set_point[1000:] += u[1000:]
+    y = y + x + 0.5 * set_point + 3.0
+    columns = np.column_stack([x, set_point * unit])
+    run = track(Regression(2, intercept=True), AdaptiveKalman(), y, columns)
+    assert np.isinf(run.std[699, 1:]).all()
+    assert np.isfinite(run.std[700]).all()
+    assert run.std[700, 1] * unit > 1e7  # 0.1 / 1e-9, and not what rounding leaves
+    assert (np.abs(run.theta[700:1000, 0] - 1.0) < 0.1).all()
+    truth = np.array([1.0, 0.5 / unit, 3.0])
+    assert (np.abs(run.theta[1010:] - truth) < 5.0 * run.std[1010:]).all()
+    assert np.abs(run.theta[-1] / truth - 1.0)[:2].max() < 0.05
+    exact = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.01, form="sqrt"), y, columns)
+    np.testing.assert_allclose(run.std[700, 1], exact.std[700, 1], rtol=0.2)
+
+
+def test_the_density_of_a_sample_is_that_of_the_mixture():
+    """Against sums over modes and levels in numpy, and it integrates to 1 over what the next reading may be."""
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(400, 2))
+    y = x @ [1.0, 0.5] + 0.1 * rng.normal(size=400)
+    y[200:] += x[200:, 0]
+    y[300] += 5.0
+    live = Live(Regression(2), AdaptiveKalman())
+    run = track(Regression(2), AdaptiveKalman(), y, x)
+    for t in range(400):
+        lane = {name: np.array(value) for name, value in live.lane().items()}
+        live.update(y[t], x[t])
+        if t < 20:
+            continue
+        log_density = np.log(naive_density(lane, x[t], y[t]))
+        np.testing.assert_allclose(run.log_density[t], log_density, rtol=1e-9, atol=1e-9)
+        if t in (25, 201, 301):
+            grid = y[t] + np.sinh(np.linspace(-16.0, 16.0, 200001)) * 1e-3
+            density = naive_density(lane, x[t], grid)
+            assert abs(np.trapezoid(density, grid) - 1.0) < 1e-3
+    assert run.loglik == pytest.approx(np.nansum(run.log_density) - 0.5 * np.log(live.lane()["F"]).sum())
+
+
+def naive_density(lane, phi, y):
+    """The mixture before a sample in numpy: modes drift, levels move, and every pair predicts."""
+    S, c, r = lane["S"], lane["c"], float(lane["r"])
+    x = np.linalg.solve(S.T, phi)
+    chain = (1.0 - OUTLIER) * lane["nu"][:-1] @ level_chain()
+    levels = np.append(chain, OUTLIER)
+    leverage = max(1.0, np.max(phi**2 / (LEVERAGE * c)))
+    total = 0.0
+    for k, weight in enumerate(lane["mu"]):
+        lower = np.tril(lane["C"][:, :, k])
+        C = lower + np.tril(lower, -1).T + (S * (lane["ratio"][:, k] * r / c)) @ S.T
+        e, h = y - x @ lane["m"][:, k], x @ C @ x
+        for j, p in enumerate(levels):
+            scale = np.sqrt(h + leverage * lane["level"][j] * r)
+            law = stats.cauchy if j == len(levels) - 1 else stats.norm
+            total = total + weight * p * law.pdf(e, scale=scale)
+    return total
+
+
+def test_where_parameters_stand_can_be_said_in_a_stream():
+    y, u = jumping(noise, noise)
+    live = Live(MODEL, AdaptiveKalman())
+    for t in range(750):
+        live.update(y[t], u[t])
+    std = live.std.copy()
+    live.reset(["theta1"], p=1.0)
+    np.testing.assert_allclose(live.std, np.sqrt(std**2 + [1.0, 0.0, 0.0]))
+    live.update(y[750], u[750])
+    assert abs(live.theta[0] - 2.0) < 0.5  # one sample decides, since it may be anywhere
+    live.reset(["theta2"], theta=0.9)
+    assert live.theta[1] == 0.9
+    assert live.predict([0.0, 1.0, 0.0])[0] == pytest.approx(0.9)

@@ -16,6 +16,7 @@ from driftfit.models.hammerstein_wiener.results.constant_system import fit_const
 from driftfit.models.hammerstein_wiener.results.free_run import free_run
 from driftfit.models.hammerstein_wiener.separation.least_squares import refine
 from driftfit.models.hammerstein_wiener.separation.paths import split
+from driftfit.systems.arc_furnace import THRESHOLDS, valve
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)
@@ -100,6 +101,28 @@ def test_thresholds_are_found_from_a_wrong_start():
         y, u, _ = record(seed, T=2000, limits=(-0.7, 1.4))
         found = track(VALVES, Kalman(q=1e-8, r=4e-4, p0=1e2), y, u).blocks().of_input(1)[1]
         assert_allclose(found[-1], [1.0, 1.4, -0.7], atol=0.02)
+
+
+def test_a_valve_ends_where_it_is_fully_open():
+    """Equation (61) has limits of the input; a dead zone without them learns wrong thresholds."""
+    rng = np.random.default_rng(2)
+    u, y = rng.uniform(-15.0, 15.0, 2000), np.zeros(2000)
+    v = valve(u)
+    assert_allclose([v.max(), v.min()], [9.0, -9.0])
+    for t in range(2, 2000):
+        y[t] = 0.7 * y[t - 1] + 0.2 * v[t - 1] + 0.1 * v[t - 2] + 0.01 * rng.normal()
+    found = {}
+    for limit in (10.0, None):
+        zone = DeadZone(15.0, limit=limit)
+        run = track(HammersteinWiener(1, 2, input=zone), Kalman(q=1e-8, r=1e-4, p0=1e2), y, u)
+        found[limit] = run.blocks(input="c1").c[-1, 1:]
+        x = np.array([-20.0, -3.0, 0.5, 3.0, 20.0])
+        assert_allclose(zone.known(1.0, -1.0).value(x) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
+        assert_allclose(zone.split(x, x >= 1.0, x <= -1.0) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
+    assert_allclose(found[10.0], THRESHOLDS, atol=0.01)
+    assert np.abs(found[None] - THRESHOLDS).min() > 0.5
+    with pytest.raises(ValueError, match="limit"):
+        DeadZone(15.0, limit=0.0)
 
 
 def test_several_inputs_are_the_regression_they_are_written_as():

@@ -25,7 +25,7 @@ import numba
 import numpy as np
 from numba import types
 
-from driftfit.engine.kernel import Array, Driver, State, Step, kernel, routine
+from driftfit.engine.kernel import Array, Driver, State, Step, kernel
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
@@ -223,7 +223,6 @@ def _advance(tracker: TrackerSteps) -> Any:
     if begin is None:
         return advance
 
-    @routine
     def start(s: State) -> None:
         for l in range(s.theta.shape[1]):
             if s.root[l] > 0:
@@ -233,13 +232,15 @@ def _advance(tracker: TrackerSteps) -> Any:
                 correct(s, l)
                 report(s, l)
 
+    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
+
     @kernel
     def advance_or_start(s: State) -> None:
         some = 0
         for l in range(s.theta.shape[1]):
             some = max(some, s.root[l])
         if some > 0:
-            start(s)
+            started(s)
         else:
             advance(s)
 

@@ -66,6 +66,10 @@ class Model(Settings, ABC):
         """Names of the parameters of one of several outputs."""
         return tuple(f"{name}[{output}]" for name in self.names)
 
+    def alone(self, output: str) -> Model | None:
+        """The model of one of several outputs, where its regression needs none of the others; None where it does."""
+        return None
+
     @abstractmethod
     def memory(self) -> Mapping[str, Any]:
         """Fields of the record that hold the model's memory, with their values before the first sample."""

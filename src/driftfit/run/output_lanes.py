@@ -49,9 +49,23 @@ def shapes(tracker: Tracker, model: Model) -> tuple[Any, ...]:
     return tuple((name, np.shape(value)) for name, value in tracker.state_for(model).items())
 
 
+def parameter_names(model: Model, trackers: Sequence[Tracker]) -> tuple[tuple[str, ...], ...]:
+    """Names of the parameters of each output."""
+    found = []
+    for output, tracker in zip(model.outputs, trackers, strict=True):
+        alone = model.alone(output)
+        own = () if alone is None else tracker.names_for(alone)
+        found.append(tuple(f"{name}[{output}]" for name in own) or model.names_of(output))
+    return tuple(found)
+
+
 def joint_tile(model: Model, trackers: Sequence[Tracker], starts: Starts = ()) -> Array:
     """A tile with a lane for each tracker, at its start or with the given fields."""
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model) for tracker in trackers])
+    states = []
+    for output, tracker in zip(model.outputs, trackers, strict=True):
+        own = model.alone(output) or model
+        states.append({**own.memory(), **tracker.state_for(own)})
+    tile = make_tile(model.n, model.m, model.memory(), states)
     for lane, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., lane] = value

@@ -26,7 +26,7 @@ from driftfit.engine.settings import near
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.results import JudgedMany
-from driftfit.run.output_lanes import Starts, drive, end_of, joint_tile, shown
+from driftfit.run.output_lanes import Starts, drive, end_of, joint_tile, parameter_names, shown
 from driftfit.run.result import Track
 from driftfit.run.warm_start import End, fresh_tile
 from driftfit.smooth.parts.walk import COLLECTED, collect
@@ -63,7 +63,7 @@ class Outputs(JudgedMany):
         self._time, self._known, self._out, self._tile = time, known, out, tile
         self._starts, self.labels = starts, labels
         self.outputs = model.outputs
-        self.names = tuple(model.names_of(output) for output in model.outputs)
+        self.names = parameter_names(model, trackers)
 
     def __len__(self) -> int:
         return len(self.y)
@@ -142,11 +142,13 @@ class Outputs(JudgedMany):
         return tuple(self._track(lane) for lane in range(len(self.outputs)))
 
     def _track(self, lane: int) -> Track:
-        """One output as a regression."""
-        seen, tracker, alone = self._seen, self.trackers[lane], Regression(self.names[lane])
-        phi = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
-        known = self._known[..., lane].copy()
-        known[:, 0] = seen["dt"][:, lane]
+        """One output by itself, as a regression where the others are among its regressors."""
+        tracker, alone, u = self.trackers[lane], self.model.alone(self.outputs[lane]), self.u
+        known, names = self._known[..., lane].copy(), self.labels.u
+        if alone is None:
+            seen, names = self._seen, self.names[lane]
+            alone, known[:, 0] = Regression(names), seen["dt"][:, lane]
+            u = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
         tile = fresh_tile(alone, tracker)
         shapes = {name: tile[name].shape[:-1] for name in storage.fields(tile) if name != "u"}
         own = [name for name, shape in shapes.items() if shape == self._tile[name].shape[:-1]]
@@ -158,8 +160,8 @@ class Outputs(JudgedMany):
         start = {name: value for name, value in self._starts[lane].items() if name in own} if self._starts else None
         others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
         missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
-        labels = replace(self.labels, y=self.outputs[lane], u=self.names[lane], missing=missing)
-        return Track(alone, tracker, self.y[:, lane], phi, self._time, known, out, tile, 0, labels, start)
+        labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing)
+        return Track(alone, tracker, self.y[:, lane], u, self._time, known, out, tile, 0, labels, start)
 
     def __iter__(self) -> Iterator[Track]:
         return iter(self._tracks)

@@ -19,6 +19,7 @@ from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.result import Track
+from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval, fresh_tile
 from driftfit.trackers.base import Tracker
 
@@ -179,17 +180,21 @@ def track(
     bound.inspect(records.y, records.u)
     if by is None and isinstance(tracker, Tracker):
         records = with_drifts(bound, [_checked(tracker, keep)], records, prob)
-        return _one(bound, tracker, records, keep, warm_start)
+        one = _one(bound, tracker, records, keep, warm_start)
+        warn_unlearned(one)
+        return one
     if prob is not None:
         raise ValueError("track: prob= is for one series and one tracker.")
     if by is None and not isinstance(tracker, Tracker):
         names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
         records = records.repeated(names)
     trackers = _per_series(tracker, records.keys)
-    for one in set(trackers):
-        _checked(one, keep)
+    for each in set(trackers):
+        _checked(each, keep)
     records = with_drifts(bound, trackers, records)
-    return run_fleet(bound, trackers, records, keep, failed, warm_start)
+    fleet = run_fleet(bound, trackers, records, keep, failed, warm_start)
+    warn_unlearned(fleet)
+    return fleet
 
 
 def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Records, dict[Hashable, str]]:
@@ -251,9 +256,7 @@ def _one(model: Model, tracker: Tracker, records: Records, keep: str, before: Ru
         known[0, 0] *= first_interval(before, None if time is None else time[0], records.labels)
     tile = fresh_tile(model, tracker, start)
     out = drive(model, tracker, tile, y, u, known, keep)
-    run = Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)
-    tracker.inspect(run)
-    return run
+    return Track(model, tracker, y, u, time, known, out, tile, 0, records.labels_of(0), start)
 
 
 def drive(model: Model, tracker: Tracker, tile: Array, y: Array, u: Array, known: Array, keep: str = "std") -> Array:

@@ -120,6 +120,8 @@ def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run
     bound = model.bind(signals.labels.u or u.shape[1])
     trackers = trackers_of(bound, tracker)
     starts = taken_over(before, bound, trackers)
+    for lane, output in enumerate(bound.outputs):
+        (bound.alone(output) or bound).inspect(y[:, lane], u)
     known = known_of(bound, trackers, signals._replace(gaps=gaps))
     tile = joint_tile(bound, trackers, starts)
     out = np.empty(len(y), output_type(tile, trackers[0].outputs, keep_of(keep, trackers[0])))

@@ -26,7 +26,6 @@ levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -276,14 +275,6 @@ class AdaptiveKalman(Tracker):
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (*said, *proportion(lane), *resolution(lane))
 
-    def inspect(self, run: Any) -> None:
-        lane = run.end().state
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
-            warnings.warn(
-                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, because their "
-                "regressors never varied separately from the others: std is inf. The other parameters are not "
-                "affected; to avoid this warning leave out columns that are constant or repeat another.",
-                UserWarning,
-                stacklevel=4,
-            )
+        return never & bool(lane["settled"] and lane["seen_samples"] >= window(len(never)))

@@ -176,8 +176,9 @@ class Tracker(Settings, ABC):
         """What the summary of a run should say beside its numbers: a name and a sentence each."""
         return ()
 
-    def inspect(self, run: Any) -> None:
-        """Warn of what a record could not tell; `track` calls it with the run of a single series."""
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
+        """Which entries of theta a record should have told by now and has not, (n,) bool: `track` warns of them."""
+        return np.zeros(len(lane["theta"]), bool)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""

@@ -137,6 +137,10 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
     if live.awaits:
         live.apply(inputs[0])
         inputs = [*inputs[1:], None]
+    apart = () if model.shared else [model.alone(output) for output in model.outputs]
+    if apart and None not in apart:
+        rows = [np.full(model.m, np.nan) if row is None else live._inputs(row) for row in inputs]
+        return _each_alone(live, apart, np.array(rows))
     parts: list[tuple[Array, ...]] = []
     lagged = None if model.shared or not live.trackers[0].covariance else LagErrors.of(model, model.n)
     for row in inputs:
@@ -146,6 +150,14 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
         parts.append((live.theta, live.std, y_hat, s))
     theta, std, means, variances = (np.array(part) for part in zip(*parts, strict=True))
     return Forecast(theta, std, means, np.sqrt(variances))
+
+
+def _each_alone(live: LiveOutputs, models: list[Model], inputs: Array) -> Forecast:
+    """The forecast of outputs of which none is a regressor of another."""
+    found = []
+    for lane, (model, tracker) in enumerate(zip(models, live.trackers, strict=True)):
+        found.append(forecast_from(model, tracker, resting(model, tracker, live._tile, lane), inputs))
+    return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
 
 
 class LagErrors:

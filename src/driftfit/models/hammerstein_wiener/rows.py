@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, part
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.models.hammerstein_wiener.memory import (
     D_NOW,
     EACH,
@@ -63,7 +63,7 @@ def past(m: Array, p: Places, theta: Array) -> float:
     return one + other
 
 
-@core
+@shared
 def minimal_past(m: Array, p: Places, theta: Array) -> float:
     """The same where theta is xi."""
     na, more_out, now, at = p[NA], p[N_OUT] - 1, p[NOW], p[NA] + p[NB] + p[N_OUT] - 1
@@ -88,7 +88,7 @@ def minimal_past(m: Array, p: Places, theta: Array) -> float:
     return total
 
 
-@core
+@shared
 def noise_factor(m: Array, p: Places, theta: Array) -> float:
     """sigma^2 sum_i a_i^2 F'(y_(t-i))^2 + floor, a_0 = 1, from the estimates before the sample."""
     n_out, d = p[N_OUT], p[D_NOW]
@@ -103,7 +103,7 @@ def noise_factor(m: Array, p: Places, theta: Array) -> float:
     return factor if factor < LARGEST else 1.0
 
 
-@core
+@shared
 def forget(m: Array, p: Places) -> None:
     """All lags are missing."""
     for i in range(p[F_PAST], p[SPARE]):
@@ -134,7 +134,7 @@ def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
         m[i, 0] = 1.0
 
 
-@core
+@shared
 def complete(m: Array, p: Places) -> bool:
     """Whether all lags are there."""
     at_d = p[NA] + p[NB]

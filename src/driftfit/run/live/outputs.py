@@ -19,7 +19,7 @@ from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
-from driftfit.run.output_lanes import end_of, joint_tile, taken_over, trackers_of
+from driftfit.run.output_lanes import end_of, joint_tile, parameter_names, taken_over, trackers_of
 from driftfit.run.shared_outputs import row_model
 from driftfit.run.warm_start import End, Run
 from driftfit.smooth.fixed_lag import FixedLag, Window
@@ -201,7 +201,7 @@ class LiveOutputs(storage.Kept):
             )
         for name, rule in rules.items():
             lane = self.model.outputs.index(name)
-            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.model.names_of(name), wait)
+            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.names[lane], wait)
         return self.alarms
 
     @property
@@ -288,7 +288,7 @@ class LiveOutputs(storage.Kept):
     @property
     def names(self) -> tuple[Any, ...]:
         """Names of the parameters, of each output where they have one theta each."""
-        return self._rows.names if self.model.shared else tuple(map(self.model.names_of, self.model.outputs))
+        return self._rows.names if self.model.shared else parameter_names(self.model, self.trackers)
 
     @property
     def ignored(self) -> int:
@@ -343,7 +343,7 @@ class LiveOutputs(storage.Kept):
             from driftfit.run.live.alarm import LiveAlarm
 
             lane = model.outputs.index(name)
-            live._alarms[name] = LiveAlarm.of(state, trackers[lane], model.names_of(name))
+            live._alarms[name] = LiveAlarm.of(state, trackers[lane], live.names[lane])
         into = {name: live._tile[name][0] for name in storage.fields(live._tile)}
         storage.restore(source, trackers[0], arrays, "state_", into)
         return live

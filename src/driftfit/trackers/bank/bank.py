@@ -15,7 +15,10 @@ Jumps show only through the regressors: no excitation, no detection.
 left None) q and p0 are in units of it, unless a ``guess`` of it is given.
 
 A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
-Until the regressors have full rank (and, with unknown noise, four residuals are there) only the first change acts.
+Until there are four residuals (with known noise: full rank, or four samples that nothing new is in) only the first
+change acts. Then the tree grows in the directions that the regressors span, and a later one enters as the exact limit
+of a wide prior; a bank with changes that forget, with leaves that have output lags of their own or with form="sqrt"
+waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -54,7 +57,8 @@ from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.diffuse import ALMOST_ANY, knowing, knowing_nothing
+from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
+from driftfit.trackers.parts.excitation import window
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.resolution import resolution, unresolved
 
@@ -196,6 +200,11 @@ class Bank(Tracker):
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
         return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
+    def _frames(self, na: int) -> bool:
+        """Whether it may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
+        walks = not any(one.forgets for one in self.all_changes)
+        return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
+
     @property
     def change_names(self) -> tuple[str, ...]:
         """Names of the changes."""
@@ -270,7 +279,9 @@ class Bank(Tracker):
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
-            **(knowing_nothing(n, ALMOST_ANY) if self.p0 is None else knowing(n)),
+            **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
+            "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
@@ -303,22 +314,30 @@ class Bank(Tracker):
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        super().widen(lane, p)
-        n = len(p)
-        diagonal = np.array([i * (i + 3) // 2 for i in range(n)])
+        n, framed = len(p), bool(lane["framed"])
+        add = np.diag(p)
+        if framed:
+            np.einsum("ii->i", lane["P"])[:] += p
+            lane["var"][:] += p
+            add = (lane["S"] * p) @ lane["S"].T
+            lane["Pz"][:] += np.tril(add)
+        else:
+            super().widen(lane, p)
         B = self._leaves(lane)
         factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
-        more, C = p[:, None] / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
+        each, C = 1.0 / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
         if self.form == "sqrt":
-            widened(C, more)
+            widened(C, p[:, None] * each)
         else:
-            C[diagonal] += more
+            C += add[np.tril_indices(n)][:, None] * each
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved alike, so that the mixture stands where it is said to."""
-        B, at = self._leaves(lane), list(which)
-        B[FIRST + np.array(at)] += (values - lane["theta"][at])[:, None]
+        name = "d" if lane["framed"] else "theta"
+        before = lane[name].copy()
         super().place(lane, which, values)
+        B = self._leaves(lane)
+        B[FIRST : FIRST + len(before)] += (lane[name] - before)[:, None]
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
         """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
@@ -363,7 +382,18 @@ class Bank(Tracker):
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
         lane = run.end().state
+        if (never := np.isinf(lane["var"])).any():
+            names = ", ".join(np.array(run.names)[never])
+            said.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))
         return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+
+    def learning(self, lane: Mapping[str, Array]) -> Array:
+        """Which entries of theta the regressors have told apart so far, (n,) bool."""
+        return np.isfinite(lane["var"])
+
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
+        never = np.isinf(lane["var"])
+        return never & bool(lane["framed"] and lane["seen_samples"] >= window(len(never)))
 
     @property
     def steps(self) -> TrackerSteps:

@@ -4,9 +4,9 @@
 
 M is the square root of information S of the diffuse start (`driftfit.trackers.parts.diffuse`) as it was when the
 filters began, with a 1 on the diagonal of each column that was free. So z begins with the covariance r I, however far
-apart the units are and however large offsets beside an intercept. A covariance of theta has a condition of the square
-of such an offset, and loses as many digits; x has only the rounding of the readings themselves. A random walk of theta
-with covariance diag(q) is one of z with covariance M diag(q) M'.
+apart the units are and however large offsets beside an intercept. A covariance of theta has the square of such an
+offset for its condition, and loses as many digits; x has only the rounding of the readings themselves. A random walk
+of theta with covariance diag(q) is one of z with covariance M diag(q) M'.
 
 A free column has x_j = 0: what no sample has told apart takes no part. A regressor that leaves the span of those before
 it does so by its first free column j with a share rho_j that is not 0. Then row j of M becomes rho, the rest of phi,
@@ -26,8 +26,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, core, cubes, exp, floats, kernel
-from driftfit.engine.kernel import outside as machine
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, machine, shared
 from driftfit.trackers.parts.diffuse import (
     ENTERING,
     MACHINES,
@@ -47,7 +46,7 @@ OUTGROWN = 1e12
 dropped above it, which moves an estimate by less than a millionth of its standard deviation."""
 
 
-@core
+@shared
 def place(phi: Array, S: Array, work: Array, now: Array) -> None:
     """x in ``work[ROW]``, up to the column by which phi leaves the span, if it does."""
     entering, u, _ = outside(phi, S, work)

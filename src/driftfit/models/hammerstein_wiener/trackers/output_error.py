@@ -157,6 +157,8 @@ class OutputError(Tracker):
 
     def steps_for(self, model: Model) -> TrackerSteps:
         structure_of("OutputError", model)
+        if len(model.outputs) > 1:
+            raise ValueError("OutputError: follows one output at a time; track each by itself.")
         assert isinstance(model, HammersteinWiener)
         machine = output_error(model.out.kind, model.places)
         for one in (model.out.evaluate, machine):  # the machine calls the other

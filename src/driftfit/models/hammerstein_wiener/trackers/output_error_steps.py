@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, floats, outside, part
+from driftfit.engine.kernel import Array, floats, machine, part, shared
 from driftfit.models.hammerstein_wiener.memory import (
     CURVE,
     D_NOW,
@@ -45,6 +45,7 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
 from driftfit.models.hammerstein_wiener.values import Kind, level_of, output_values
+from driftfit.trackers.parts.diffuse import LEFT
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -72,7 +73,7 @@ def at_d(p: Places) -> int:
     return found
 
 
-@core
+@shared
 def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
     """w = F(y) at the last outputs, each of variance p_w and independent of xi."""
     na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_PAST]
@@ -101,7 +102,7 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
     return total
 
 
-@core
+@shared
 def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
     """The time update of w and of S."""
     n_w, N = len(w), len(S)
@@ -149,7 +150,7 @@ def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tup
     return total, n_w + c
 
 
-@core
+@shared
 def absorb(
     e: float, slope: float, m: Array, p: Places, r: float, ok: bool, theta: Array, w: Array, S: Array, row: Array,
     moved: Array,
@@ -170,12 +171,13 @@ def absorb(
                 w[x] += k * e
             else:
                 theta[x - n_w] += k * e
-            for z in range(x + 1):
+            for z in range(x):
                 S[x, z] -= k * moved[z]
+            S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
     return s
 
 
-@core
+@shared
 def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
     """The variance that missing inputs leave in w, sum b_j^2 times the usual power of v; 0 where all are there."""
     b, total = p[NA], 0.0
@@ -191,7 +193,7 @@ def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
     return total
 
 
-@core
+@shared
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     """The usual power of v, which stands for inputs that are missing."""
     c = p[NA] + p[NB]
@@ -204,7 +206,7 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
         c += more_in
 
 
-@core
+@shared
 def hold(m: Array, p: Places, w: Array) -> None:
     """Keep the present w within reach of the outputs seen, whatever the poles do."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
@@ -257,7 +259,7 @@ def _work(out: Kind) -> Any:
             for j in range(i + 1):
                 P[i, j] = S[n_w + i, n_w + j]
 
-    return core(output_error_work)
+    return shared(output_error_work)
 
 
 @lru_cache
@@ -276,4 +278,4 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
             floats(scratch, 2, N)[1],
         )  # fmt: skip
 
-    return outside(machine_output_error)
+    return machine(machine_output_error)

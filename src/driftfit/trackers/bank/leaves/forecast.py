@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.kernel import Array, kernel, part, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import WEIGHT, total
 
@@ -12,7 +12,7 @@ FACTOR, VALUE, FROZEN, STUCK, CLEANS = range(5)
 """Columns of the table of sensors."""
 
 
-@core
+@shared
 def expect(
     w: Array, L: int, y: Array, h: Array, factor: Array, prior: Array, sensors: Array, r: float, noise: float,
     last: float, X: Array,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, exp, part
+from driftfit.engine.kernel import Array, exp, part, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST, blur, spread
 
 KEEP, RESET, KIND, GAIN = range(4)
@@ -32,7 +32,7 @@ ANCHORS on n rows for every change: W, or in the first of them which parameters 
 """
 
 
-@core
+@shared
 def for_interval(settings: Array, dt: float, maps: Array) -> None:
     """The maps for an interval, of which the settings are those of the nominal one."""
     for i in range(len(settings)):
@@ -52,7 +52,7 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
             maps[i, GAIN] = 1.0 - 1.0 / maps[i, KEEP]
 
 
-@core
+@shared
 def apply(C: Array, m: Array, a: int, b: int, c: int, maps: Array, places: Array, Q: Array, g: Array, h: Array) -> None:
     """The rest of change c in the columns a .. b, which have taken in KEEP, RESET and Q."""
     kind, n = int(maps[c, KIND]), len(m)
@@ -67,7 +67,7 @@ def apply(C: Array, m: Array, a: int, b: int, c: int, maps: Array, places: Array
         renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], Q[c])
 
 
-@core
+@shared
 def guard(C: Array, n: int, a: int, b: int, keep: float, cap: float, q: Array, h: Array) -> None:
     """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
     for l in range(a, b):
@@ -83,7 +83,7 @@ def guard(C: Array, n: int, a: int, b: int, keep: float, cap: float, q: Array, h
             C[k, l] = (C[k, l] - q[k]) * h[l] + q[k] if h[l] != 1.0 else C[k, l]
 
 
-@core
+@shared
 def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> None:
     """g = C z, h = z' C z."""
     for l in range(a, b):
@@ -99,7 +99,7 @@ def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> Non
             h[l] += z[i] * g[i, l]
 
 
-@core
+@shared
 def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, g: Array, h: Array) -> None:
     """Directional forgetting; nothing where z or C z is zero."""
     along(C, n, a, b, z, g, h)
@@ -113,7 +113,7 @@ def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, g: Array, h:
             at += 1
 
 
-@core
+@shared
 def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, g: Array, h: Array) -> None:
     """A measurement of w' theta with noise r that says w' mean."""
     n = len(m)
@@ -136,7 +136,7 @@ def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float,
             m[i, l] += h[l] * g[i, l]
 
 
-@core
+@shared
 def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
     """Some parameters begin anew."""
     at = 0
@@ -151,7 +151,7 @@ def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Arra
             at += 1
 
 
-@core
+@shared
 def average(
     B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, X: Array
 ) -> None:  # fmt: skip

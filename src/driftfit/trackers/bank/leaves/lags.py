@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
@@ -32,13 +32,13 @@ def plausible(expected: Array, l: int, most: float, r: float) -> bool:
     return expected[1, l] * expected[1, l] <= most and expected[0, l] <= VAGUE * r  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def covariance_row(n: int, na: int) -> int:
     """The first row of V, whose lower triangle is the last thing in a leaf."""
     return FIRST + n + n * (n + 1) // 2 + na
 
 
-@core
+@shared
 def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array, most: float) -> None:
     """Output lags of leaves that took no sample in: y where it was seen, else what each expected, within bounds."""
     limit = math.sqrt(most)
@@ -51,7 +51,7 @@ def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array, 
             B[at, l] = y if seen else min(max(y_hat[l], -limit), limit)
 
 
-@core
+@shared
 def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
     at = covariance_row(n, na)
@@ -66,7 +66,7 @@ def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: 
             at += 1
 
 
-@core
+@shared
 def shift_covariance(
     A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, expected: Array, r: float,
     most: float, X: Array,
@@ -101,7 +101,7 @@ def shift_covariance(
         to[l] = expected[0, l] + r if own and plausible(expected, l, most, r) else 0.0
 
 
-@core
+@shared
 def merge_covariance(B: Array, members: Array, n: int, na: int, share: Array, A: Array, to: int) -> None:
     """Column ``to`` of A: the average of V and the spread of the lags, whose mean stands there already."""
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, log, part, sized
+from driftfit.engine.kernel import Array, kernel, log, part, shared
 from driftfit.engine.simd import (
     WIDTH,
     exp_of,
@@ -69,7 +69,7 @@ def largest(x: Array, count: int) -> float:
     return max(max(a, b), max(c, d))
 
 
-@core
+@shared
 def normalise(B: Array, L: int) -> float:
     """Weights from their logarithms, zeros beyond; returns log sum, or NaN where no leaf is possible."""
     top = largest(B[LOG], L)
@@ -92,7 +92,7 @@ def normalise(B: Array, L: int) -> float:
     return float(gone)
 
 
-@core
+@shared
 def variance_factor(B: Array, L: int, unknown: bool, X: Array, row: int) -> None:
     """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2)."""
     for l in range(0, L, WIDTH):
@@ -100,7 +100,7 @@ def variance_factor(B: Array, L: int, unknown: bool, X: Array, row: int) -> None
         store(X, row, l, only(ratio, load(B, WEIGHT, l)))
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
     """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
     variance_factor(B, L, unknown, X, n)
@@ -134,7 +134,7 @@ def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: 
             at += 1
 
 
-@core
+@shared
 def priors(
     T: Array, event: Array, expanded: bool, first: bool, same: bool, L: int, P: Array, row: Array, prior: Array
 ) -> None:
@@ -158,7 +158,7 @@ def priors(
                 prior[e, l] = P[event[l], e]
 
 
-@core
+@shared
 def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
     """Further steps of the chain of events; X has a row for each of them."""
     H = len(prior)
@@ -174,7 +174,7 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
                 prior[e, l] = X[e, l]
 
 
-@core
+@shared
 def standstill(prior: Array, L: int, Hm: int) -> None:
     """No time passes, so nothing changes: the sensors keep their shares, all changes but the first have none."""
     for l in range(L):
@@ -239,7 +239,7 @@ def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
         store(expected, 1, l, y)
 
 
-@core
+@shared
 def blur(B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, m: Array, chance: Array) -> None:
     """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
     at = FIRST + n

@@ -1,6 +1,6 @@
 """The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the machine of `driftfit.trackers.bank.machine.advance` with those parts exchanged that work on covariances, so
+It is the machine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
 that everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
 `driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
 are factorised once a sample.
@@ -14,8 +14,9 @@ from __future__ import annotations
 from functools import cache
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, Outside, core, exchanged, part
+from driftfit.engine.kernel import Array, Machine, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
+from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import average, blur, develop_eight, walked
@@ -32,7 +33,7 @@ def ready(Q: Array, n: int) -> None:
         factorise(Q[i], n, 0.0)
 
 
-@core
+@shared
 def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
     """`start.begin`, factorised."""
     covariance_begin(B, T, theta, P, nu, squares, many, H)
@@ -67,7 +68,7 @@ def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: 
             P[i, j] = sum_of(sums)
 
 
-@core
+@shared
 def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
     """`leaves.spread`, but with f = U'z in g."""
     for l in range(0, L, WIDTH):
@@ -116,7 +117,7 @@ def ahead(
     return int(columns)
 
 
-@core
+@shared
 def foresee(
     B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
     used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
@@ -138,7 +139,7 @@ def foresee(
             blur(B, l, n, prior, Hm, Q, C, V)
 
 
-@core
+@shared
 def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
     """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
     room = X.shape[0] * X.shape[1] // ((n + 2) * WIDTH) * WIDTH
@@ -157,7 +158,7 @@ def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array
     condense(W, count, n, A, to)
 
 
-@core
+@shared
 def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
     """The columns of a leaf's factor as columns of W, their D times ``share`` below them."""
     at = FIRST + n
@@ -171,7 +172,7 @@ def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
         at += j + 1
 
 
-@core
+@shared
 def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
     """`refilter.widen`."""
     V = X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
@@ -179,7 +180,7 @@ def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
         raised(root[FIRST + n :], n, 0, Q[e], fill(weight[e]), V)
 
 
-@core
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """`lookahead.width`."""
     lags, wide, at = FIRST + n + n * (n + 1) // 2, 0.0, 0
@@ -196,13 +197,13 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 
 
 @cache
-def made() -> tuple[Outside, TrackerSteps]:
+def made() -> tuple[Machine, TrackerSteps]:
     """The machine and the steps that run it."""
     others = {
         leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
         forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
         refilter.widen: widen, lookahead.width: width,
     }  # fmt: skip
-    (machine,) = exchanged([advance.bank], others)
-    correct_step, begin_step = exchanged([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
+    (machine,) = substituted([advance.bank], others)
+    correct_step, begin_step = substituted([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
     return machine, steps.STEPS._replace(correct=correct_step, begin=begin_step)

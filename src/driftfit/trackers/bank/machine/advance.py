@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from driftfit.engine.kernel import Array, core, floats, outside, part, wholes
+from driftfit.engine.kernel import Array, floats, machine, part, shared, wholes
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
@@ -374,7 +374,7 @@ def refused(now: Array, many: Array) -> bool:
     return False
 
 
-@core
+@shared
 def certain(prior: Array, L: int) -> None:
     """The first event, for sure."""
     for l in range(L):
@@ -388,7 +388,7 @@ def store(sample: Array, now: Array, phi: Array) -> None:
         sample[TIME + 1 + i] = phi[i]
 
 
-@core
+@shared
 def recover(A: Array, K: int, B: Array, rows: int) -> int:
     """The parents again, as if the sample had not come."""
     for row in range(rows):
@@ -407,7 +407,7 @@ def lone_density(now: Array) -> float:
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
     """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
     H = len(P)
@@ -433,7 +433,7 @@ def note(ring: Array, clock: int, window: float, now: Array, lag_prob: Array) ->
         ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
 
 
-@outside
+@machine
 def bank(table: int) -> None:
     """One sample, by the table of a bank. Only here, where Numba lets a function own memory, can arrays be made of
     addresses; so they are handed to `advance`, into which this writes them.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.kernel import Array, kernel, part, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import WEIGHT
 
@@ -41,14 +41,14 @@ def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, 
         store(T2, to, block + k, times(load(T, of, k), load(news, quiet, block + k)))
 
 
-@core
+@shared
 def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, news: Array, T2: Array) -> None:
     """The table of the children, from that of their parents."""
     for l in range(L):
         hand_on(T, parent[l], event[l], H, Hm, news, T2, l)
 
 
-@core
+@shared
 def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
     """One more floor of which nothing was seen: its events are as likely as before."""
     H = len(prior)
@@ -81,7 +81,7 @@ def pick(
             hand_on(T, parent[l], event[l], H, Hm, news, T2, k)
 
 
-@core
+@shared
 def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
     """Row ``to`` of T2: the average over the members."""
     for at in range(0, T.shape[1], WIDTH):
@@ -91,7 +91,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
         store(T2, to, at, total)
 
 
-@core
+@shared
 def summary(lags: Array, brief: Array) -> None:
     """The newest floors, and the oldest."""
     last = len(brief) - 1

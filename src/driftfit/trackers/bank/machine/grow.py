@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, log, part, sized
+from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KIND, apply
@@ -64,7 +64,7 @@ def develop(
     return K * len(Q)
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def ahead(
     n: int, A: Array, K: int, phi: Array, na: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array,
     m: Array, Z: Array, g: Array, expected: Array,
@@ -76,7 +76,7 @@ def ahead(
     return int(columns)
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def correct(
     n: int, B: Array, at: int, columns: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
     X: Array, row: int,
@@ -99,7 +99,7 @@ def correct(
             entry += 1
 
 
-@core
+@shared
 def leave(B: Array, at: int, columns: int, n: int, C: Array, m: Array) -> None:
     """A sensor that says nothing of theta."""
     for l in range(0, columns, WIDTH):
@@ -140,7 +140,7 @@ def student(B: Array, at: int, X: Array, out: int, columns: int, fade: float, le
         store(B, S, at + l, higher(plus(scale, far), times(fill(least), more)))
 
 
-@core
+@shared
 def frozen(
     B: Array, at: int, columns: int, y: float, last: float, width: float, r: float, unknown: bool, out: Array
 ) -> None:
@@ -153,7 +153,7 @@ def frozen(
         out[l] = -0.5 * (LOG_2PI + log(wide) + far * far / wide) if abs(last) < np.inf else -np.inf
 
 
-@core
+@shared
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
     least: float, most: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool,
@@ -194,7 +194,7 @@ def grow(
     return int(columns * Hm)
 
 
-@core
+@shared
 def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None:
     """A row of children as their parents have it."""
     for c in range(at, at + columns, K):
@@ -202,7 +202,7 @@ def inherit(A: Array, K: int, B: Array, row: int, at: int, columns: int) -> None
             B[row, np.uint64(c + l)] = A[row, l]
 
 
-@core
+@shared
 def remember(
     A: Array, K: int, B: Array, at: int, columns: int, n: int, na: int, y: float, expected: Array, own: bool,
     most: float, r: float,
@@ -250,7 +250,7 @@ def weigh(
             parents[np.uint64(to + l)], events[np.uint64(to + l)] = l, e
 
 
-@core
+@shared
 def encode(
     A: Array, K: int, B: Array, at: int, columns: int, j: int, Hd: int, Hm: int, bases: Array, events: Array
 ) -> None:

@@ -39,9 +39,9 @@ many nominal intervals had passed.
 TOLD = 8
 """Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
 PACKED = (
-    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
-    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "news", "gap", "moving", "lag_prob", "brief", "decided",
+    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "fixed", "sizes", "factors", "maps", "theta0",
+    "sensors", "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt",
+    "ring", "news", "gap", "moving", "lag_prob", "brief", "decided",
 )  # fmt: skip
 """Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
 shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.

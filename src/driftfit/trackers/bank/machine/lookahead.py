@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, exp
+from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
 
@@ -26,7 +26,7 @@ SMALL = 1e-9
 """Components of less weight than this are left out of the nodes, though not of the integral."""
 
 
-@core
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """z' (keep C + Q) z of a leaf."""
     lags, at, wide = FIRST + n + n * (n + 1) // 2, 0, 0.0
@@ -39,7 +39,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
     return wide
 
 
-@core
+@shared
 def density_parts(
     B: Array, L: int, top: float, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
     sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array,
@@ -75,7 +75,7 @@ def density_parts(
     return count
 
 
-@core
+@shared
 def sort(x: Array, count: int) -> None:
     """Ascending, in place, by Shell's method."""
     gap = count // 2
@@ -89,7 +89,7 @@ def sort(x: Array, count: int) -> None:
         gap = gap * 5 // 11 if gap != 2 else 1
 
 
-@core
+@shared
 def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> float:
     """int min_k sum_e L[e, k] f_e(y) dy over all components."""
     H = len(loss)
@@ -121,7 +121,7 @@ def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> 
     return total
 
 
-@core
+@shared
 def expected_risk(
     B: Array, L: int, top: float, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
     sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array, mass: float,

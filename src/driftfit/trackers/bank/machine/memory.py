@@ -37,6 +37,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     chain, initial = bank._events
     rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
     steps = [one.increments(n) for one in bank.all_changes]
+    Q = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
     scaled = any(sizes.any() for _, sizes in steps)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
@@ -54,7 +55,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
         "links": np.zeros((4, links), int), "group": np.zeros(K, int),
         "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, children)),
-        "Q": np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps]),
+        "Q": Q, "fixed": Q,
         "sizes": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]),
         "factors": np.ones(Hd), "theta0": places,
         "maps": np.array([change.mapping() for change in bank.all_changes] * 2),

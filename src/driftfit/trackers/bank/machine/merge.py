@@ -17,14 +17,14 @@ import math
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, part
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import WIDTH, gathered, store
 from driftfit.trackers.bank.leaves.lags import merge_covariance
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.trackers.bank.machine.ancestry import average
 
 
-@core
+@shared
 def digamma(x: float) -> float:
     total = 0.0
     while x < 8.0:
@@ -37,7 +37,7 @@ def digamma(x: float) -> float:
     )  # fmt: skip
 
 
-@core
+@shared
 def trigamma(x: float) -> float:
     total = 0.0
     while x < 8.0:
@@ -47,7 +47,7 @@ def trigamma(x: float) -> float:
     return total + (1.0 + 0.5 / x + f * (1.0 / 6.0 - f * (1.0 / 30.0 - f * (1.0 / 42.0 - f / 30.0)))) / x
 
 
-@core
+@shared
 def freedom(t: float, start: float) -> float:
     """nu with psi(nu/2) - log(nu/2) = t < 0, by Newton's method in log nu."""
     x = 0.5 * start
@@ -61,7 +61,7 @@ def freedom(t: float, start: float) -> float:
     return 2.0 * x
 
 
-@core
+@shared
 def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
     """The covariance of column ``to`` of A, whose mean stands there already; X is spare."""
     for k in range(len(members)):
@@ -75,7 +75,7 @@ def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array
                 at += 1
 
 
-@core
+@shared
 def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
     """Column ``to`` of A from the members, which have the given shares, summing to 1; X is spare."""
     C, tri = FIRST + n, n * (n + 1) // 2
@@ -106,7 +106,7 @@ def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array
         A[S, to] = A[NU, to] / g
 
 
-@core
+@shared
 def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
     """Members of group k are order[start[k] : start[k + 1]]; returns how many leaves are in some group."""
     for k in range(G + 1):
@@ -126,7 +126,7 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
     return int(start[G])
 
 
-@core
+@shared
 def combine(
     B: Array, group: Array, L: int, G: int, n: int, na: int, unknown: bool, A: Array, start: Array, order: Array,
     X: Array, T: Array, T2: Array,
@@ -173,7 +173,7 @@ def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array,
     return kept
 
 
-@core
+@shared
 def mix(
     B: Array, L: int, prior: Array, n: int, na: int, unknown: bool, A: Array, order: Array, X: Array, T: Array,
     T2: Array,

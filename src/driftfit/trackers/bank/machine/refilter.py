@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
 
@@ -19,7 +19,7 @@ Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""
 
 
-@core
+@shared
 def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
     """C + sum w_i Q_i of the root; X is spare."""
     for k in range(n * (n + 1) // 2):
@@ -27,7 +27,7 @@ def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
             root[FIRST + n + k, 0] += weight[e] * Q[e, k]
 
 
-@core
+@shared
 def refilter(
     root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
     r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
@@ -82,7 +82,7 @@ def refilter(
     return L
 
 
-@core
+@shared
 def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
     """The table of the past for the leaves of the new tree: what happened in the D - 1 floors that it has."""
     block, width = H + 1, T.shape[1]
@@ -97,7 +97,7 @@ def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
             T[l, k * block + e], T[l, k * block + H] = 1.0, quiet
 
 
-@core
+@shared
 def floor(
     A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, na: int, Q: Array,
     maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, part
+from driftfit.engine.kernel import Array, kernel, part, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.trackers.bank.machine.lookahead import expected_risk
@@ -32,7 +32,7 @@ def reached(V: Array, row: int, count: int, value: float) -> float:
     return float(sum_of(sums))
 
 
-@core
+@shared
 def bound(V: Array, row: int, count: int, M: int) -> float:
     """The M-th largest entry of a row, or any number between it and the next; 0 if no more than M are positive.
 
@@ -97,7 +97,7 @@ def beam(B: Array, L: int, knobs: Array, group: Array, order: Array, X: Array) -
     return int(heaviest(B, WEIGHT, L, int(knobs[LEAVES]), group, order, X[2:3]))
 
 
-@core
+@shared
 def merge(B: Array, L: int, group: Array, slots: Array) -> int:
     """Leaves of one code become one; codes are numbered as they come."""
     G = 0
@@ -114,7 +114,7 @@ def merge(B: Array, L: int, group: Array, slots: Array) -> int:
     return G
 
 
-@core
+@shared
 def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
     cap, size = knobs[CAP], len(slots)
@@ -149,7 +149,7 @@ def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Ar
     return G
 
 
-@core
+@shared
 def decide(
     B: Array, L: int, held: int, knobs: Array, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array,
     theta0: Array, sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array,
@@ -210,7 +210,7 @@ def decide(
     return held
 
 
-@core
+@shared
 def number(group: Array, L: int, order: Array) -> int:
     """Groups of single leaves in their order."""
     G = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.lags import push
 from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.layout import (
@@ -28,7 +28,7 @@ GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
 
 
-@core
+@shared
 def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lag_prob: Array, na: int) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
     n, H = len(theta), lag_prob.shape[1]
@@ -42,7 +42,7 @@ def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, la
         begin(B, T, theta, P, now[TIMES], max(now[SQUARES], now[LEAST] * now[TIMES]), many, H)
 
 
-@core
+@shared
 def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
     """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
     n = len(theta)
@@ -61,7 +61,7 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
     many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
 
 
-@core
+@shared
 def trace(P: Array) -> float:
     total = 0.0
     for i in range(len(P)):

@@ -8,7 +8,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.show.plots import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
-from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, WEIGHT
+from driftfit.trackers.bank.leaves.leaves import CODE, WEIGHT
+from driftfit.trackers.bank.results.mixture import mixture_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,6 +66,7 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)
     B = bank.array(live.model, lane, "B")[:, : lane["many"][LEAVES]]
+    means = mixture_of(bank, live, lane).means
     depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))
     axis = figure.subplots()
@@ -89,7 +91,7 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
         of = codes == code
         mass = float(weights[of].sum())
         if mass > 1e-4:
-            mean = (B[FIRST : FIRST + live.model.n, of] * weights[of]).sum(axis=1) / mass
+            mean = (means[of] * weights[of, None]).sum(axis=0) / mass
             text = f"{mass:.3f}  " + ", ".join(f"{value:.2f}" for value in mean)
             axis.annotate(text, (depth + 0.08, -code), fontsize=7, va="center", color=GREY)
     axis.set_xlim(-0.1, depth + 1.6)
