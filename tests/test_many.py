@@ -218,7 +218,7 @@ def test_without_faults_few_series_are_accused():
         ({"every": "ten"}, "every"),
         ({"every": np.inf}, "every"),
         ({}, "normal range of the parameters"),
-        ({"reference": {}}, "names"),
+        ({"reference": {}}, "maps parameters"),
         ({"reference": {"b1[u]": 1.0}}, "low <= high"),
         ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
         ({"reference": {"<1>": 140}}, "missing for <0>, <2>"),

@@ -2,8 +2,8 @@
 
     phi_t = [y1_{t-1} .. y1_{t-na}, y2_{t-1} .., u1_{t-nk} .., (1)],   yo_t = phi_t' theta_o,t + v_o,t
 
-The outputs are lanes of one tile, so every tracker runs unchanged. Each lane keeps a copy of the lags of all outputs,
-which ``push`` fills from ``y`` of the other lanes, or from their predictions where y is missing, by the rule of `ARX`.
+The outputs are lanes of one tile, so every tracker runs unchanged. Each lane keeps a copy of the lags of all outputs.
+``push`` fills them from ``y`` of the other lanes, or from their predictions if y is missing, by the rule of `ARX`.
 
 `ARX(.., ny=2)` turns into this model when it is bound. Cost per sample: O(ny (ny na + nb)) for the lags.
 """
@@ -91,7 +91,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int)
 
     @kernel
     def push(s: State, l: int) -> None:
-        for o in range(ny):  # lane o follows output o
+        for o in range(ny):  # lane o belongs to output o
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
             informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
