@@ -1,4 +1,4 @@
-"""Pictures of hypotheses: probabilities stacked under the parameters, events marked; the tree as it stands."""
+"""Plots of hypotheses: probabilities stacked below the parameters, with events marked; the present tree."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from driftfit.trackers.bank.results.results import Hypotheses
 
 COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8c6d46", "#5fb5c4")
-"""Of events, the ordinary course first."""
+"""Colours of events, the normal course first."""
 
 
 def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
-    """Parameters with bands; under them the probabilities of events; changes as lines, faults as shades."""
+    """Parameters with bands; below them the probabilities of events; changes as lines, faults as shades."""
     run, n = told.run, told.run.model.n
     figure = new_figure(9.0, 1.4 * n + 2.6)
     axes = figure.subplots(n + 1, 1, sharex=True, height_ratios=[*[1.4] * n, 1.6])
@@ -44,7 +44,7 @@ def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
 
 
 def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
-    """Probabilities of events, one upon the other; the ordinary course below."""
+    """Probabilities of events, stacked, with the normal course at the bottom."""
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
     axis.stackplot(time, p.T, labels=names, colors=colours, step="mid", linewidth=0)
     axis.set_ylim(0.0, 1.0)
@@ -55,7 +55,7 @@ def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
 def plot_tree(live: Live, floors: int = 3) -> Figure:
     """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
 
-    The newest floors are drawn, oldest to the left; each leaf is labelled with its weight and its mean.
+    The newest levels are drawn, with the oldest on the left; each leaf is labelled with its weight and its mean.
     """
     bank: Any = live.tracker
     lane = live.lane()
