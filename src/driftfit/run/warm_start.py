@@ -1,8 +1,8 @@
-"""Warm starts: a run that continues where another one ended.
+"""Warm starts: a run that begins where another one ended.
 
 Everything carries over: the parameters, their covariance, the lags of the model, and the time of the last sample, so
-a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
-value, for example a larger q.
+that a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
+value, a larger q for example.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
-"""Fields that are not carried over: an operator's settings of the stream, and the diffuse likelihood of that run."""
+"""Fields that stay behind: what an operator set for the stream, and the diffuse likelihood of the run before."""
 
 
 class End(NamedTuple):
-    """The end of a run: its model and tracker, the fields of its record, and the time of its last sample.
+    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample.
 
     ``awaits`` says whether a stream still expects the input of that sample (`driftfit.run.live.late_input`).
     """
@@ -37,10 +37,10 @@ class End(NamedTuple):
 
 
 class Run(Protocol):
-    """What a warm start can continue from: a `Track` or a `Live`."""
+    """What a warm start can begin from: a `Track` or a `Live`."""
 
     def end(self) -> End:
-        """The end of the run."""
+        """Where it ended."""
 
 
 def fresh_tile(model: Model, tracker: Tracker, state: Mapping[str, Array] | None = None) -> Array:
@@ -52,7 +52,7 @@ def fresh_tile(model: Model, tracker: Tracker, state: Mapping[str, Array] | None
 
 
 def carried(run: Run, model: Model, tracker: Tracker) -> dict[str, Array]:
-    """The fields that a run of ``tracker`` takes over from another run; ValueError if the two do not fit."""
+    """The fields that a run of ``tracker`` takes over from another run; ValueError where the two do not fit."""
     end = run.end()
     if type(tracker) is not type(end.tracker):
         raise ValueError(
@@ -71,7 +71,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def first_interval(run: Run, time: Any, labels: Labels) -> float:
-    """Nominal intervals from the end of a run to the first sample of the next; 1 if either has no time."""
+    """Nominal intervals from the end of a run to the first sample of the next; 1 where either knows no time."""
     last = run.end().last
     if last is None or time is None:
         return 1.0

@@ -1,10 +1,10 @@
-"""Live: one sample at a time, with the same compiled step as a record, bit for bit.
+"""Live: one sample at a time, the same compiled step as a record, bit for bit.
 
-In a control loop the input u_t is chosen after y_t has been read. With nk of at least 1 it is not needed before that:
+In a control loop the input u_t is chosen after y_t has been read. With nk of at least 1 it is not needed before:
 
     step = live.update(y_t)      u_t = control law(live.theta, live.cov, ...)      live.apply(u_t)
 
-gives the same bits as the record with u_t and y_t in one row.
+is, bit for bit, the record in which u_t stands beside y_t.
 """
 
 from __future__ import annotations
@@ -43,21 +43,20 @@ _FLOAT = np.dtype(np.float64)
 class Live(Operated, Asked, Kept):
     """Track a stream.
 
-    A stream can be copied, pickled and sent to another process, as well as saved: it continues as if never stopped.
+    A stream can be copied, pickled and sent to another process, as it is saved: it goes on as if never stopped.
 
     Parameters
     ----------
     model, tracker : Model, Tracker
-        As for `track`. A model with several inputs must declare them: ``ARX(2, [1, 1])``, ``inputs=["pressure",
-        "flow"]``.
+        As for `track`. A model with several inputs must say so: ``ARX(2, [1, 1])``, ``inputs=["pressure", "flow"]``.
     dt : number, duration, step of the calendar or "label"
-        Nominal interval between samples, as for `track`; with datetimes it is required.
+        Nominal interval between samples, as for `track`; with datetimes it must be given.
     lag : int
         Keep the last ``lag`` samples for `smooth`; 0 keeps none.
     warm_start : Track, Live or None
-        Continue where that run ended.
+        Begin where that run ended.
     limits : mapping from signals to (low, high)
-        Valid ranges as for `track`: a number outside its range is missing, and counted in ``outside``.
+        Valid ranges as for `track`: a number outside is missing, and counted in ``outside``.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
@@ -100,7 +99,7 @@ class Live(Operated, Asked, Kept):
         self._open(fresh_tile(self.model, tracker, start))
 
     def _open(self, tile: Array) -> None:
-        """Set a state and compile the step for it."""
+        """Take a state and compile the step for it."""
         self._tile = tile
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
@@ -115,7 +114,7 @@ class Live(Operated, Asked, Kept):
         self._be_careful()
 
     def _be_careful(self) -> None:
-        """Whether a sample needs more than a call of the compiled step."""
+        """Whether a sample is more than a call of the compiled step."""
         more = self._window, self._gate
         self._careful = more != (None, None) or bool(self._alarms) or self._awaits != NOTHING
 
@@ -128,15 +127,15 @@ class Live(Operated, Asked, Kept):
         drift: Any = 1.0,
         prob: Any = None,
     ) -> Step:
-        """Process one sample and return (y_hat, e, s, ok).
+        """Take one sample in and return (y_hat, e, s, ok).
 
-        ``y`` is a number; None, NaN or inf if it is missing. ``u`` is a number for one input, a sequence of m
-        otherwise, or a mapping from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
+        ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
+        otherwise, or a mapping from the names of the inputs; None where it is not known. Left out it comes with
         `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
         the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
-        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it),
-        ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change
-        (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
+        and leaves the state alone. ``weight`` divides the noise variance of this sample (0: do not use it), ``drift``
+        multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change (`Bank`).
+        A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
@@ -148,13 +147,13 @@ class Live(Operated, Asked, Kept):
             return self._update_one(self._tile, y, u)  # type: ignore[no-any-return]
         if u is LATER and self._m:
             return self._update_later(y)
-        # the compiled step reads m floats from any address, so they must exist
+        # the compiled step reads m floats wherever it is pointed, so they must be there
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
         return self._update(self._tile, y, u)  # type: ignore[no-any-return]
 
     def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
-        """A sample with more known factors than interval, noise and drift."""
+        """One sample of which more is known than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
             self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
@@ -196,14 +195,14 @@ class Live(Operated, Asked, Kept):
         return step
 
     def _update_later(self, y: float) -> Step:
-        """A sample without known factors, whose input comes with `apply`."""
+        """One sample of which nothing more is known, and whose input comes with `apply`."""
         self._placing()
         step: Step = self._update(self._tile, y, self._unknown)
         self._expect(INPUT)
         return step
 
     def _placing(self) -> Any:
-        """The routine that stores an input; ValueError for a model that needs it at once."""
+        """What puts an input in its place; ValueError for a model that needs it at once."""
         if self._place is None:
             self._place = applier(self.model, self.tracker, self._tile)
         return self._place
@@ -215,19 +214,19 @@ class Live(Operated, Asked, Kept):
     def apply(self, u: Any) -> None:
         """Give the input of the last sample, once it has been chosen: ``update(y)`` without u, then ``apply(u)``.
 
-        Together they leave the state that ``update(y, u)`` leaves. In between, `predict` and `forecast` show the effect
-        of an input; saving and copying keep the outstanding input. For models whose inputs act after one sample or
+        Together they leave the state that ``update(y, u)`` leaves. In between, `predict` and `forecast` say what an
+        input would do; saving and copying keep what is outstanding. For models whose inputs act after one sample or
         more (nk of at least 1).
 
         Parameters
         ----------
         u : number, sequence of m, or None
-            None: missing. After a sample that was ignored for its time the input is ignored too.
+            None: not known. After a sample that was ignored for its time the input is ignored too.
 
         Raises
         ------
         ValueError
-            If no sample is waiting for its input, or u does not have m numbers.
+            If no sample waits for its input, or u has not m numbers.
         """
         check_expected(self._awaits)
         given = self._inputs(u)
@@ -239,15 +238,15 @@ class Live(Operated, Asked, Kept):
 
     @property
     def awaits(self) -> bool:
-        """Whether the input of the last sample is outstanding; it comes with `apply`."""
+        """Whether the input of the last sample is outstanding: it comes with `apply`."""
         return self._awaits != NOTHING
 
     def predict(self, u: Any = None) -> tuple[float, float]:
-        """(y_hat, s): the prediction of the next output if its input is ``u``; the state stays unchanged.
+        """(y_hat, s): what the next output is expected to be if its input is ``u``; the state stays as it is.
 
-        While `apply` is outstanding ``u`` is the input that it would receive, so that candidates can be compared.
+        While `apply` is outstanding ``u`` stands for what it would bring, so that candidates can be compared.
         """
-        self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
+        self._scratch_bytes[:] = self._bytes  # a record copied field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         if self._awaits == INPUT:
             self._placing()(self._scratch, inputs)
@@ -255,9 +254,9 @@ class Live(Operated, Asked, Kept):
         return y_hat, s
 
     def smooth(self) -> FixedLag:
-        """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
+        """The last ``lag`` + 1 samples, oldest first, each from all samples so far: theta and std, (lag + 1, n).
 
-        Row 0 is what `Track.smooth` would give for that sample of a record that ends now.
+        Row 0 is what `Track.smooth` would say of that sample of a record that ends now.
         """
         if self._window is None:
             raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
@@ -268,7 +267,7 @@ class Live(Operated, Asked, Kept):
         return {name: self._tile[name][0, ..., :1][..., 0] for name in fields(self._tile)}
 
     def end(self) -> End:
-        """The present state of the stream, from which another run can continue (`warm_start`)."""
+        """Where the stream stands, for a run to begin (`warm_start`)."""
         state = {name: np.array(value) for name, value in self.lane().items()}
         return End(self.model, self.tracker, state, self._last, self._awaits)
 
@@ -291,7 +290,7 @@ class Live(Operated, Asked, Kept):
 
     @property
     def std(self) -> Array:
-        """Their standard deviations, (n,): inf for parameters that are not determined yet, NaN without a covariance."""
+        """Their standard deviations, (n,): inf for what has not been seen yet, NaN without a covariance."""
         std: Array = np.sqrt(np.diag(self.cov))
         return std
 
@@ -302,12 +301,12 @@ class Live(Operated, Asked, Kept):
 
     @property
     def learning(self) -> Array:
-        """Which parameters are being learned now, (n,) bool: False if recent inputs had too little excitation."""
+        """Which parameters are being learned now, (n,) bool: False where the recent inputs were too dull to tell."""
         return self.tracker.learning(self.lane())
 
     @property
     def ignored(self) -> int:
-        """Number of samples whose time was not after the last."""
+        """Samples that came with a time not after the last."""
         return self._ignored
 
     @property
@@ -316,7 +315,7 @@ class Live(Operated, Asked, Kept):
         return {} if self._gate is None else self._gate.counts
 
     def _plain(self) -> dict[str, Any]:
-        """The state besides the fields of the record, as plain data."""
+        """The state beside the fields of the record, as plain data."""
         return {
             "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
             "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,

@@ -1,4 +1,4 @@
-"""Interventions in a stream, and queries to it; `driftfit.run.live.live.Live` inherits both."""
+"""What an operator can tell a stream, and what can be asked of it; `driftfit.run.live.live.Live` inherits both."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 KNOWN = ("interval", "noise", "drift")
 ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
-"""Known factors of a sample by default, and of one while the stream is held."""
+"""What is known of a sample of which nothing is said, and of one while the stream is held."""
 
 
 class _OfStream:
@@ -43,12 +43,12 @@ class _OfStream:
 
 
 class Operated(_OfStream):
-    """Interventions: holding and resetting."""
+    """The operator's hand: a hold, resets."""
 
     def hold(self, on: bool = True) -> None:
-        """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, a sensor being cleaned.
+        """Stop learning, or (``hold(False)``) take it up again: for work on the plant, a test, a sensor being cleaned.
 
-        While held, samples enter the lags and are predicted, but are not used (``ok`` is False), and no time passes
+        While held, samples move the lags and are predicted, but are not used (``ok`` is False), and no time passes
         for the parameters and their covariance. Being held is part of the state that `save` writes.
         """
         self._rest(HELD if on else ORDINARY)
@@ -59,22 +59,22 @@ class Operated(_OfStream):
         return bool(self._tile["noise"][0, 0] == np.inf)
 
     def reset(self, which: str | int | Sequence[str | int] | None = None, p: Any = None, theta: Any = None) -> None:
-        """Tell the tracker what an operator knows: these parameters may have changed, or have new values.
+        """Tell the tracker what an operator knows: these parameters may have moved, or stand at other values now.
 
         Parameters
         ----------
         which : name, index, several of them, or None
             The parameters; None is all.
         p : number or one per parameter
-            Variance of the change, in squared units of theta; it is added to the present variance. After maintenance
+            Variance of the move, in squared units of theta; it is added to what is uncertain already. After maintenance
             a large value lets the next samples decide.
         theta : number or one per parameter
-            Their new values, if they are known.
+            Where they stand now, if that is known.
 
         Raises
         ------
         ValueError
-            For an unknown parameter, a negative or infinite p, or a tracker without a covariance to widen.
+            A parameter that is not there, a negative or infinite p, a tracker without a covariance to widen.
         """
         chosen = self._chosen(which)
         if p is None and theta is None:
@@ -104,13 +104,13 @@ class Operated(_OfStream):
         return chosen
 
     def _rest(self, known: tuple[float, float, float]) -> None:
-        """Set the known factors of every sample that gives none."""
+        """Set what holds for every sample that says nothing else."""
         for name, value in zip(KNOWN, known, strict=True):
             self._tile[name] = value
 
 
 class Asked(_OfStream):
-    """Queries to a stream; each is implemented in its own module, which is imported when it is called."""
+    """Questions to a stream; each is a module of its own, imported when it is asked."""
 
     _awaits: int
     _cold: bool
@@ -119,7 +119,7 @@ class Asked(_OfStream):
 
     @property
     def hypotheses(self) -> LiveHypotheses:
-        """The events of a `Bank` now: probabilities, events as they are decided, the mixture for control."""
+        """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
         if not self.tracker.weighs:
             raise ValueError(f"hypotheses: {type(self.tracker).__name__} has no hypotheses; track with a Bank.")
         from driftfit.trackers.bank.results.live_results import LiveHypotheses
@@ -127,7 +127,7 @@ class Asked(_OfStream):
         return LiveHypotheses(cast("Live", self))
 
     def blocks(self, method: str = "svd-joint") -> Groups:
-        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, except "gls"."""
+        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, but for "gls"."""
         if self._separator is None:
             from driftfit.models.hammerstein_wiener.separation.paths import Separator
 
@@ -136,9 +136,9 @@ class Asked(_OfStream):
         return groups
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
-        """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the future inputs.
+        """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the inputs then.
 
-        While `apply` is outstanding the first row of u is the input that it would receive.
+        While `apply` is outstanding the first row of u is what it would bring.
         """
         from driftfit.use.forecast import forecast_from, future, resting
 
@@ -150,7 +150,7 @@ class Asked(_OfStream):
 
     @property
     def system(self) -> LiveSystem:
-        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.run.live.system`."""
+        """The `ARX` system as it stands now: poles, gains, responses with bands; see `driftfit.run.live.system`."""
         from driftfit.run.live.system import LiveSystem
 
         return LiveSystem(cast("Live", self))
@@ -158,21 +158,21 @@ class Asked(_OfStream):
     def detect(self, rule: AlarmRule, wait: int | None = None) -> LiveAlarm:
         """Watch the stream from the next sample on by the rule of a reference run, ``run.detect(...).rule``.
 
-        After every update the alarm shows whether it is on, whether it has just begun, and its cause (`LiveAlarm`). It
-        is saved with the state; `alarms` returns all of them. Over the same samples it gives the alarms of
-        ``Track.detect(rule, start=...)`` on the record, bit for bit.
+        The alarm says after every update whether it is on, has just begun, and for what cause (`LiveAlarm`). It is
+        saved with the state; `alarms` gives all of them. Over the same samples it says what ``Track.detect(rule,
+        start=...)`` says of the record, bit for bit.
 
         Parameters
         ----------
         rule : AlarmRule
             Limits and settings. The tracker should be that of the reference run.
         wait : int or None
-            Number of samples that are not judged. None: those of the start, max(50, 5 n); 0 after a warm start.
+            Samples that are not judged. None: those of a start from nothing, max(50, 5 n); 0 after a warm start.
 
         Raises
         ------
         ValueError
-            If the tracker or model does not support the rule.
+            For a tracker or model that has not what the rule compares.
         """
         from driftfit.run.live.alarm import LiveAlarm, check_rule
 

@@ -1,8 +1,8 @@
 """The date of a jump from all samples around it: its posterior distribution, given that there was one jump.
 
-The leaves that a bank keeps are too few to measure the uncertainty of a date: their interval, with a nominal level of
-95 per cent, covered it in 77 for jumps of 1.5 standard deviations of the noise. Between an event and its neighbours, and
-for at most `REACH` samples to either side, let
+A bank keeps too few leaves to measure the uncertainty of a date: their interval with a nominal level of 95 per cent
+covered it in 77 for jumps of 1.5 standard deviations of the noise. Between an event and its neighbours, and for at most
+`REACH` samples to either side, let
 
     y_t = phi_t' theta + [t >= s] phi_t' delta + v_t,   v_t ~ N(0, w_t r),   delta ~ N(0, r Lambda^-1)
 
