@@ -1,4 +1,4 @@
-"""A control: the gas furnace of Box and Jenkins (series J), often shown as a record without drift.
+"""A control record: the gas furnace of Box and Jenkins (series J), often shown as a record without drift.
 
 Prints the verdict, its p-value for several orders, with the lags of correlation that were found and with none.
 Run: python examples/gas_furnace.py gas_furnace.csv (columns gas_rate and co2)
