@@ -28,14 +28,14 @@ def detect(
     reference: Annotated[
         list[str] | None,
         typer.Option(
-            help="What is normal: so many first samples, FROM..TO in times, or name=low:high; repeat the last."
+            help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."
         ),
     ] = None,
     window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50,
-    hold: Annotated[int, typer.Option(help="An alarm stays on for so many samples after its cause.")] = 0,
+    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False,
     labels: Annotated[
-        str | None, typer.Option(help="Column of labels, 0 or 1: where something was wrong; the alarms are scored.")
+        str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
     write_to: Annotated[Path | None, typer.Option("--out", help="Write the alarms to .csv or .parquet.")] = None,
     plot: Plot = None,

@@ -22,9 +22,9 @@ def tune(
     method: Annotated[str, typer.Option(help="ml, h-step, loo or gcv.")] = "ml",
     ahead: Annotated[int, typer.Option("--ahead", help="Samples ahead, for h-step.")] = 1,
     groups: Annotated[
-        str | None, typer.Option(help="each: a drift for each parameter; or a label for each, a,a,b.")
+        str | None, typer.Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
     ] = None,
-    level: Annotated[float, typer.Option(help="Of the intervals.")] = 0.95,
+    level: Annotated[float, typer.Option(help="Level of the intervals.")] = 0.95,
     plot: Plot = None,
 ) -> None:
     """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""

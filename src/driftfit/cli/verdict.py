@@ -15,9 +15,7 @@ from driftfit.cli.track import Report
 @reads
 def verdict(
     given: Given,
-    level: Annotated[
-        float, typer.Option(help="Error rate of what is said to move; of a fleet, false discoveries.")
-    ] = 0.05,
+    level: Annotated[float, typer.Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
     lags: Annotated[int | None, typer.Option(help="Lags of correlation of the noise to allow for.")] = None,
     report: Report = None,
 ) -> None:

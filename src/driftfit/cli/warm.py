@@ -21,13 +21,13 @@ SAMPLES = 300
 @app.command()
 def warm(
     model: Annotated[
-        list[str] | None, typer.Option(help="As of `driftfit track`; repeat it. Default: arx:2,2,intercept.")
+        list[str] | None, typer.Option(help="As in `driftfit track`; repeat it. Default: arx:2,2,intercept.")
     ] = None,
     tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
     p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
-    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own.")] = None,
-    inputs: Annotated[int, typer.Option(help="How many inputs the record has.")] = 1,
-    fleet: Annotated[bool, typer.Option("--fleet", help="For many series at once as well.")] = False,
+    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
+    inputs: Annotated[int, typer.Option(help="Number of inputs of the record.")] = 1,
+    fleet: Annotated[bool, typer.Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
     """Compile what models and a tracker need (record, stream, summary, verdict), and store it on disk for later."""
     from driftfit.run.live.live import Live

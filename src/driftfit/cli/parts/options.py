@@ -41,7 +41,7 @@ class Given:
     model: Annotated[
         Names,
         typer.Option(
-            help="Model and its settings by place or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
+            help="Model and its settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept. Default: arx:2,2,intercept, without inputs arx:2,0,intercept."
         ),
     ] = None
@@ -53,11 +53,12 @@ class Given:
     ] = None
     time: Annotated[str | None, typer.Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
-        Names, typer.Option(help="Column that tells the series of a fleet apart, or `file`; repeat it for several.")
+        Names, typer.Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
     unit: Annotated[Names, typer.Option(help="Unit of a column: flow=l/min; repeat it.")] = None
     own: Annotated[
-        str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own, from a module here.")
+        str | None,
+        typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder."),
     ] = None
     dt: Annotated[
         str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
@@ -69,17 +70,18 @@ class Given:
         typer.Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500."),
     ] = None
     separator: Annotated[
-        str | None, typer.Option(help="What separates cells: , ; tab or another sign; found from the header otherwise.")
+        str | None,
+        typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
     decimal: Annotated[str, typer.Option(help="Decimal sign of the numbers: . or ,")] = "."
     limits: Annotated[
         Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
-        Names, typer.Option(help="Stretch to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+        Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
     start: Annotated[
-        Path | None, typer.Option(help="Begin where a saved run (.npz) or live state ended; its model and tracker.")
+        Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
 
     @property

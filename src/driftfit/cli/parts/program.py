@@ -16,7 +16,7 @@ from driftfit import __version__
 from driftfit.show.summary import WIDTH
 
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, help="Follow the parameters of a system while they change.",
+    no_args_is_help=True, add_completion=False, help="Track the parameters of a system while they change.",
     rich_markup_mode=None,
 )  # fmt: skip
 progress = Console(stderr=True)
@@ -57,7 +57,7 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(help="Follow the parameters of a system while they change.")
+@app.callback(help="Track the parameters of a system while they change.")
 def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")
