@@ -41,7 +41,7 @@ class Given:
     model: Annotated[
         Names,
         typer.Option(
-            help="Model and its settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
+            help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept. Default: arx:2,2,intercept, without inputs arx:2,0,intercept."
         ),
     ] = None
