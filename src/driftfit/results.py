@@ -179,7 +179,7 @@ class Judged:
     def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
         """Alarms at a set rate of false alarms, one in ``every`` samples; see `driftfit.judge.alarms.detect`.
 
-        ``kind`` may also be the rule of another run, ``said.rule``.
+        ``kind`` may also be the rule of another run, ``alarms.rule``.
         """
         from driftfit.judge.alarms.detect import detect
 

@@ -17,8 +17,8 @@
   inputs, its parameters at ``at``, its innovations redrawn) and tracked; onsets exceed the limit at the given rate. Any
   kind can be calibrated in this way, with ``calibrate=True``: it is slower, and does not rely on the std.
 
-The result is stored in ``said.rule`` (`driftfit.judge.alarms.rule.AlarmRule`), a small frozen object: `Live.detect`
-applies it to a stream, and ``other.detect(said.rule)`` to another record.
+The result is stored in ``alarms.rule`` (`driftfit.judge.alarms.rule.AlarmRule`), a small frozen object: `Live.detect`
+applies it to a stream, and ``other.detect(alarms.rule)`` to another record.
 
 docs/alarms.md says which kind to use. A tracker that estimates its own drift mistakes a fault for drift and follows it:
 its innovations are soon normal again, so "innovation" gives an alarm, if at all, in the first samples of the fault.
@@ -192,7 +192,7 @@ def detect(
     ----------
         The run to be watched.
     kind : "band", "innovation" or "probability", or an AlarmRule
-        See the module. A rule, ``said.rule`` of another run, contains its limits and settings.
+        See the module. A rule, ``alarms.rule`` of another run, contains its limits and settings.
     every : number
         Samples in which one false alarm may begin.
     reference : mapping from names to (low, high), a number of samples, or (from, to)
