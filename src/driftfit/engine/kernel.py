@@ -56,7 +56,10 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
         function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
     dispatcher = internals.under_ieee(function, **options)
     if cache:
-        file = lambda sig: disk_cache.name_of(function.__name__, name, sig)  # noqa: E731
+
+        def file(signature: Any) -> str:
+            return disk_cache.name_of(function.__name__, name, signature)
+
         internals.store_by(
             dispatcher, lambda sig: disk_cache.read(file(sig)), lambda sig, data: disk_cache.write(file(sig), data)
         )

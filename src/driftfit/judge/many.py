@@ -27,7 +27,7 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.verdict import Verdict, p_text, verdict
-from driftfit.show.summary import Printed, key_text, table_of
+from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -241,7 +241,7 @@ def verdicts(
     """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
     said = _each(runs, lambda run: verdict(run, level, lags, burn), "verdict")
     q, q_pays = (
-        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.rivals[1].p for v in said.values()])
+        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.constants.p for v in said.values()])
     )
     rows = [
         Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))

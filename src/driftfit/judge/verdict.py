@@ -8,18 +8,19 @@ The verdict answers two questions whose answers may differ:
   changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
   do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does tracking them pay?* The one-step errors of the run are compared with those of persistence, constant least
-  squares on the past and a constant ARX model, on the same samples, with paired tests
-  (`driftfit.judge.statistics.paired`).
+* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
+  same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
+  (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, which a drifting parameter does as well: so
+  following pays where the run beats the better of constants without lags and with them.
 
-The first sentence combines both answers. A parameter is named as moving if the joint test rejects, its own test still
-rejects after the changes of the parameters named before it are taken into account
-(`driftfit.judge.statistics.attribution`), and its values before and after differ significantly.
+The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
+rejects, its own still does when what was named before it is taken into account
+(`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance.
 
-A model with too few lags has correlated noise, which is hard to distinguish from a drifting intercept. The order of an
-autoregression of the noise is estimated from the record, or set by ``lags=``, and the verdict reports it. A parameter
-that varies as fast as the noise is mistaken for such noise. Do not use the verdict for smooth fast oscillations: they
-leave little trace in a cumulative score. Cost: three constant fits, O(T n^2).
+A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
+autoregression of the noise is found from the record, ``lags=`` sets it, and the verdict says so. A parameter that
+wanders as fast as the noise itself passes for such noise. Not for smooth fast oscillations: a parameter that swings
+many times within the record leaves little trace in a cumulated score. Cost: three constant fits, O(T n^2).
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import whole
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.attribution import Attribution, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, facts, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, facts, table_of
 
-RIVALS = ("persistence", "constant LS", "constant ARX")
+RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
@@ -79,8 +80,8 @@ class Verdict(Printed):
     drifts : bool or None
         Whether the parameters move: ``p`` is below ``level``. None if the record does not determine it.
     pays : bool or None
-        Whether the run predicts better than constant least squares on the past: its paired p-value is below ``level``.
-        None if there are too few samples to compare.
+        The run predicts better than constant least squares on the past, without lags or with them, whichever is the
+        better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
         p-value of the joint test of all parameters; NaN if the record does not determine it.
     statistic : float
@@ -91,7 +92,7 @@ class Verdict(Printed):
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
-        The same for persistence, constant LS and constant ARX, with paired tests.
+        The same of persistence, constant LS, LS with lags and constant ARX, with paired tests.
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
@@ -115,6 +116,11 @@ class Verdict(Printed):
     correlated: bool
     lags: int
     burn: int
+
+    @property
+    def constants(self) -> Paired:
+        """The rival that decides whether following pays: constant least squares, or with lags where that is better."""
+        return better_constants(self.rivals)
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -158,18 +164,25 @@ class Verdict(Printed):
         return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
-        steady = self.rivals[1]
+        steady = self.constants
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
         change = 100.0 * (self.rms / steady.rms - 1.0)
+        who = "constants" if steady is self.rivals[1] else "constants with lags"
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            return f"Tracking them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
+        if self.rivals[1].p < self.level:
+            return (
+                "Tracking them predicts better than constants, but not than constants with two more lags of "
+                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). "
+                "Lags may be all that is missing."
+            )
         return (
-            f"Tracking them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"Tracking them does not clearly pay here: the one-step error is {size} than that of {who} "
             f"({p_equals(steady.p)})."
         )
 
@@ -199,6 +212,11 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def better_constants(rivals: tuple[Paired, ...]) -> Paired:
+    """Of constant least squares without lags and with them, the one with the smaller error."""
+    return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
 def _told(moved: Moved) -> str:
@@ -254,7 +272,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
-        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
+        pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
         p=test.p_joint,
         statistic=test.joint,
         level=level,

@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.data.signals import as_output
 from driftfit.engine.kernel import Array
-from driftfit.show.plots import BLUE, GREY, RED, frame, named, new_figure, settled
+from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, new_figure, settled
 from driftfit.use.simulate import fit, simulate
 from driftfit.use.system import arx_of, dc_gain, frequency_response, input_of, largest_pole, poles, step_response
 
@@ -137,7 +137,7 @@ def _plane(axis: Axes, run: Track, first: int) -> None:
 
 
 def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
-    from driftfit.show.plots import date_axis, time_label
+    from driftfit.show.parts.axes import date_axis, time_label
 
     gain, pole = dc_gain(run), largest_pole(run)
     low, high = (part[:, j] for part in gain.band(level))
@@ -169,11 +169,11 @@ def _titled(axis: Axes, title: str) -> None:
 def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95) -> Figure:
     """Free simulation of the model at one sample on data that it has not used, with the measured outputs.
 
-    The simulation is given the first outputs, as many as the model has lags. The fit, in per cent, is that of
-    `driftfit.use.simulate.fit`.
+    The first outputs, as many as its regressors reach back, are given to the simulation. The fit, in per cent,
+    is that of `driftfit.use.simulate.fit`.
     """
     output = as_output(y)
-    lags = int(getattr(run.model, "na", 0))
+    lags = run.model.reach
     said = simulate(run, u, at, np.nan_to_num(output[:lags]))
     low, high = said.band(level)
     time = np.arange(len(output))

@@ -132,7 +132,7 @@ class Given:
 
     def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
         """Run what the options describe: a Track, an Outputs or a fleet."""
-        from driftfit.run.track import track
+        from driftfit.tracking import track
 
         model, chosen, before = self._begun()
         signals: Any = self.signals(rows)
@@ -173,8 +173,8 @@ class Given:
 
 def saved(path: Path) -> Any:
     """Load a run, or the state of a stream, from a file."""
-    from driftfit.run.live.live import Live
-    from driftfit.run.result import Track
+    from driftfit.results import Track
+    from driftfit.streams import Live
 
     try:
         return Track.load(path)

@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from driftfit.engine.settings import whole
+from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -19,7 +20,7 @@ LEAST = 20
 
 def burn(run: Track) -> int:
     """Number of samples at the beginning of a run that are not judged, because its estimate has just started."""
-    return max(50, 5 * run.model.n)
+    return burn_in(run.model.n)
 
 
 def in_samples(run: Track, reference: Any) -> Any:

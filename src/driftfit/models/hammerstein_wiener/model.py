@@ -36,7 +36,6 @@ the input have a minus sign, without which the regression gives -b. Cost per sam
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -46,7 +45,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import numbers, output_names, whole
+from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.memory import memory, places_of
@@ -286,6 +285,17 @@ class HammersteinWiener(Model):
         ends = [nb + nk for nb, nk in zip(self.structure.nb, self.delays, strict=True)]
         return range(t + min(self.delays), t + max(ends))
 
+    @property
+    def implicit(self) -> bool:
+        return True
+
+    def expand(self, theta: Array) -> Array | None:
+        return self.structure.products(theta) if theta.shape[-1] == self.structure.n_x else None
+
+    @property
+    def noise_varies(self) -> bool:
+        return self.output_noise is not None
+
     def output_weights(self, theta: Array) -> Array:
         """d (..., n_out) with d_1 = 1 from theta (..., n), or from the minimal xi (..., n_x)."""
         at = self.structure.starts[0]
@@ -346,22 +356,20 @@ class HammersteinWiener(Model):
             outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
-                warnings.warn(
+                warn(
                     f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
                     f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
                     UserWarning,
-                    stacklevel=4,
                 )
             size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
                 powers = np.abs(seen[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
                 said = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
-                warnings.warn(
+                warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
                     f"scaled{said}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
                     UserWarning,
-                    stacklevel=4,
                 )
 
 

@@ -11,17 +11,13 @@ distances from the mean. Until the tree starts, the single filter keeps a covari
 
 from __future__ import annotations
 
-from functools import cache
-
-from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, Machine, part, shared
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
-from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import average, blur, develop_eight, walked
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import advance, grow, lookahead, merge, refilter, start, steps
+from driftfit.trackers.bank.machine import chain_gap, grow, lookahead, merge, refilter, start
 
 covariance_begin = start.begin
 
@@ -181,6 +177,18 @@ def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
 
 
 @shared
+def widen_leaf(A: Array, n: int, k: int, q: Array, X: Array) -> None:
+    """`chain_gap.widen_leaf`; q is factorised."""
+    tri, W = n * (n + 1) // 2, X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
+    factorise(q, n, 0.0)
+    for i in range(tri):
+        store(W, i, 0, fill(A[FIRST + n + i, k]))
+    raised(W, n, 0, q, fill(1.0), W[tri:])
+    for i in range(tri):
+        A[FIRST + n + i, k] = W[i, 0]
+
+
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """`lookahead.width`."""
     lags, wide, at = FIRST + n + n * (n + 1) // 2, 0.0, 0
@@ -196,14 +204,9 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
     return wide
 
 
-@cache
-def made() -> tuple[Machine, TrackerSteps]:
-    """The machine and the steps that run it."""
-    others = {
-        leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
-        forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
-        refilter.widen: widen, lookahead.width: width,
-    }  # fmt: skip
-    (machine,) = substituted([advance.bank], others)
-    correct_step, begin_step = substituted([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
-    return machine, steps.STEPS._replace(correct=correct_step, begin=begin_step)
+PARTS = {
+    leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
+    forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
+    refilter.widen: widen, chain_gap.widen_leaf: widen_leaf, lookahead.width: width,
+}  # fmt: skip
+"""What takes whose place."""

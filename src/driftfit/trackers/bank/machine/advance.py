@@ -27,6 +27,7 @@ from driftfit.trackers.bank.leaves.leaves import (
     variance_factor,
 )
 from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
+from driftfit.trackers.bank.machine.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.layout import (
@@ -63,6 +64,7 @@ from driftfit.trackers.bank.machine.layout import (
     MOST,
     NOW,
     OPEN,
+    OWNERS,
     PARENTS,
     PHI,
     PLAIN,
@@ -74,6 +76,7 @@ from driftfit.trackers.bank.machine.layout import (
     SETTLED,
     SIZE,
     STORED,
+    TAKEN,
     THETA,
     WINDOW,
     Y_HAT,
@@ -104,8 +107,6 @@ from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
 
 FAULTS_IN_A_ROW = 3
 """As many samples in a row may be taken for fault codes."""
-MOST_STEPS = 1000
-"""Steps of a chain of events that an interval may have."""
 
 
 @part
@@ -189,13 +190,13 @@ def advance(
     now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
     sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
     decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, gap: Array, moving: Array,
-    lag_prob: Array, theta: Array, cov: Array, na: int, unknown: bool, same: bool, plain: bool, walks: bool,
-    apart: bool,
+    path: Array, lag_prob: Array, theta: Array, cov: Array, judges: int, na: int, unknown: bool, same: bool,
+    plain: bool, walks: bool, apart: bool,
 ) -> None:  # fmt: skip
     """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite, or
     the chain of the changes.
     The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`. Where
-    changes are independent events (``apart``) a gap is one floor, of which ``gap`` tells.
+    changes are independent events (``apart``) a gap is one floor, of which ``gap`` tells; ``path`` is that of a chain.
     """
     n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
     tri = n * (n + 1) // 2
@@ -208,7 +209,10 @@ def advance(
         chained(given[H:], P, Hm, moving)
         P, same = moving, False
     wide = apart and (many[OPEN] > 0 or dt != 1.0 or not used)
-    plain = plain and many[OPEN] == 0  # the covariance of the mixture then has more in it than that of the leaves
+    expanded = many[EXPANDED] > 0
+    parted = len(path) > 0 and not first and (many[OPEN] + many[TAKEN] > 0 or not expanded)
+    parted = parted and (many[OPEN] > 0 or not used or further(dt) > 0)
+    plain = plain and many[OPEN] == 0 and not parted  # the mixture's covariance then has more in it than the leaves'
     row = given[:H] if told else initial if first else P[0]
     alike = same or told or first
     now[EVIDENCE] = 0.0
@@ -218,6 +222,8 @@ def advance(
     increments(Q, sizes, c, now[R], unknown, now[IN_TIME], each, factors, Qt)
     settings, maps = maps[: len(Q)], maps[len(Q) :]
     with_mean, Qt = Qt, Qt[: len(Q)]
+    if parted:
+        go_on(path, many, P, row, alike, Hm, dt, used, Qt, X)
     if wide:
         odds(gap, row, Hm, dt, told)
         covariances(gap, dt, used, Qt)
@@ -230,7 +236,6 @@ def advance(
     expected, factor = X[tri + 3 * n : tri + 3 * n + 2], tri + 3 * n + 2
     h, y_hat = expected[0], expected[1]
     scratch = X[tri + 3 * n + 3 :]
-    expanded = many[EXPANDED] > 0
     asked = 1 if plain and alike and kind != INTERACT and used else L  # one stands for all
     outlook(T, event, expanded, first, alike, asked, P, row, prior, dt, Hm, apart, wide, True, gap, scratch)
     variance_factor(B, L, unknown, X, factor)
@@ -242,6 +247,8 @@ def advance(
         regressors(phi, B, L, min(L, 1), n, na, Z)
         foresee(B, L, n, na, prior, Hm, Qt, maps, theta0, walks, used, C, m, Z, g, expected, scratch)
         widen_by_lags(B, L, L, n, na, m, h)
+        if parted:
+            add_variance(h, L, n, na, Z, path, H, H // Hm, event)
     if not plain:
         now[Y_HAT], now[S2] = expect(
             B[WEIGHT], L, y_hat, h, X[factor], prior, sensors, now[R], noise, now[LAST], scratch
@@ -268,13 +275,16 @@ def advance(
             for e in range(H):
                 for l in range(K):
                     prior[e, l] = 1.0 if e == l else 0.0
+        elif parted:
+            origins(B, L, group, K, event, prior)
+            K = split(A, K, T, many[OPEN], n, Hm, path, P, row, alike, dt == 0.0, prior, X)
         elif not alike or kind == REFILTER:
             outlook(T, event, True, first, alike, K, P, row, prior, dt, Hm, apart, wide, True, gap, X)
-        if many[OPEN] > 0:
+        if many[OPEN] > 0 and apart:
             take_back(T, K, many[OPEN], gap, H, Hm)
         L = grow(
             A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], now[MOST], na, Qt, maps,
-            theta0, sensors, prior, own, alike, bases, parent, event, X,
+            theta0, sensors, prior, own, alike, bases, parent, event, judges, X,
         )  # fmt: skip
         gone = normalise(B, L)
         many[PARENTS], many[LEAVES] = K, L
@@ -288,8 +298,10 @@ def advance(
             if many[OPEN] > 0:
                 many[OPEN] = 0
                 close(gap)
+            many[TAKEN] = 0
         else:  # no leaf allows what was seen: go on as if it had not been
             many[IMPOSSIBLE] += 1
+            many[OPEN], many[TAKEN] = many[OPEN] if apart else 0, 0
             L = recover(A, K, B, len(A))
             many[LEAVES], many[EXPANDED] = L, 1
             shift_covariance(B, L, B, slice(0, L), n, na, False, m, expected, now[R], now[MOST], X[len(X) - na :])
@@ -317,6 +329,9 @@ def advance(
             if apart:
                 outlook(T, event, True, first, alike, L, P, row, prior, dt, Hm, apart, wide, False, gap, scratch)
             shift(T, L, prior, Hm)
+            if parted:
+                many[OPEN] += 1
+                many[TAKEN] = 0
             if apart:  # leaves take in the ordinary course only
                 certain(prior, L)
                 foresee(
@@ -328,13 +343,15 @@ def advance(
                 theta0[BEFORE, k] = 0.0
                 for l in range(L):
                     B[FIRST + k, l] = m[k, l]
-            for k in range(tri):
+            for k in range(0 if parted else tri):
                 for l in range(L):
                     B[FIRST + n + k, l] = C[k, l]
             many[FLOORS] += 1
     many[CLOCK] += 1
     mixture(n, B, L, unknown, X, theta, cov)
-    if many[OPEN] > 0:
+    if many[OPEN] > 0 and parted:
+        add_covariance(cov, B, L, unknown, path, H, H // Hm, event, X)
+    elif many[OPEN] > 0:
         variance_factor(B, L, unknown, X, 0)
         widen(gap, weighted(B, L, X, 0), cov)
     now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, event, scratch, many[PARENTS], lag_prob)
@@ -352,7 +369,7 @@ def outlook(
     if dt == 0.0:
         standstill(prior, L, Hm)
     elif dt > 1.0 and not apart and not alike:
-        later(prior, L, P, int(min(dt, MOST_STEPS) - 0.5), X)
+        later(prior, L, P, further(dt), X)
     if wide:
         chances(prior, L, Hm, gap, whole)
 
@@ -456,8 +473,8 @@ def bank(table: int) -> None:
             packed(t, AT.chain), packed(t, AT.initial)[0], packed(t, AT.given)[0], packed(t, AT.loss),
             packed(t, AT.knobs)[0], packed(t, AT.bases)[0], packed(t, AT.stamps)[0], packed(t, AT.decided),
             packed(t, AT.parts), root, packed(t, AT.samples), packed(t, AT.Qt), packed(t, AT.news), packed(t, AT.gap),
-            packed(t, AT.moving), lag_prob, theta, cov, t[FLAGS, 0], t[FLAGS, 1] > 0, t[FLAGS, 2] > 0,
-            t[PLAIN, 0] > 0, t[PLAIN, 1] > 0, t[PLAIN, 2] > 0,
+            packed(t, AT.moving), packed(t, AT.path), lag_prob, theta, cov, t[OWNERS, 0], t[FLAGS, 0], t[FLAGS, 1] > 0,
+            t[FLAGS, 2] > 0, t[PLAIN, 0] > 0, t[PLAIN, 1] > 0, t[PLAIN, 2] > 0,
         )  # fmt: skip
         head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
     if not begun:

@@ -79,6 +79,9 @@ def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unkn
     gap, columns = table[3 * AT.gap] // 8, table[3 * AT.gap + 2]
     for i in range(1, table[3 * AT.gap + 1]):
         enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
+    path, columns, H = table[3 * AT.path] // 8, table[3 * AT.path + 2], table[3 * AT.prior + 1]
+    for i in range(2 * H, table[3 * AT.path + 1] - 1):
+        enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
     return mean
 
 

@@ -21,10 +21,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
-from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KIND, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
 from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
@@ -157,10 +158,10 @@ def frozen(
 def grow(
     A: Array, K: int, B: Array, phi: Array, y: float, last: float, noise: float, r: float, unknown: bool, fade: float,
     least: float, most: float, na: int, Q: Array, maps: Array, places: Array, sensors: Array, prior: Array, own: bool,
-    alike: bool, bases: Array, parent: Array, event: Array, X: Array,
+    alike: bool, bases: Array, parent: Array, event: Array, judges: int, X: Array,
 ) -> int:  # fmt: skip
     """The children of K leaves, with their weights not normalised; returns how many there are. ``alike`` says that the
-    prior is the same for all leaves.
+    prior is the same for all leaves; ``judges`` is where likelihoods of the user's own are.
     """
     n, Hd, Hm = len(phi), len(Q), len(sensors)
     tri = n * (n + 1) // 2
@@ -177,6 +178,11 @@ def grow(
         if sensors[j, FROZEN] > 0.0:
             leave(B, at, columns, n, C, m)
             frozen(B, at, columns, y, last, sensors[j, STUCK], r, unknown, X[likely])
+        elif sensors[j, OWN] > 0.0:
+            which, said, noisy = sensors[j, OWN], X[len(X) - 1], r * noise
+            judge_all(judges, which, B, at, columns, expected, y, noisy, unknown, last, X, likely, said)
+            correct(n, B, at, columns, C, m, g, expected, y, 0.0, X, likely + 1)
+            weigh_all(judges, which, B, at, columns, expected, y, noisy, unknown, last, X, likely, said)
         else:
             noise_j = sensors[j, FACTOR] * r * noise
             correct(n, B, at, columns, C, m, g, expected, y - sensors[j, VALUE], noise_j, X, likely + 1)
@@ -187,6 +193,9 @@ def grow(
         if na > 0:
             own_lags = sensors[j, CLEANS] > 0.0
             remember(A, K, B, at, columns, n, na, y - sensors[j, VALUE], expected, own_lags, most, r)
+            if own_lags and sensors[j, OWN] > 0.0:
+                which, said, noisy = sensors[j, OWN], X[len(X) - 1], r * noise
+                clean_all(judges, which, B, at, columns, n, expected, y, noisy, unknown, last, said)
             block, spare = slice(at, at + columns), X[len(X) - na :]
             shift_covariance(A, K, B, block, n, na, own_lags, m, expected, r, most, spare)
         weigh(A, K, B, at, columns, j, Hm, own, alike, prior, X, likely, parent, event)

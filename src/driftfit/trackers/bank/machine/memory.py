@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
@@ -17,9 +18,8 @@ from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.machine.layout import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
 from driftfit.trackers.bank.machine.lookahead import NODES
-
-if TYPE_CHECKING:
-    from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.reduction import Reduction
+from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -27,14 +27,34 @@ RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
 
-def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+class Settings(Protocol):
+    """The settings of a `Bank`, as far as its memory depends on them."""
+
+    @property
+    def all_changes(self) -> tuple[Change, ...]: ...
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]: ...
+    @property
+    def reduction(self) -> Reduction: ...
+    @property
+    def event_probabilities(self) -> tuple[Array, Array]: ...
+    @property
+    def chained(self) -> bool: ...
+    @property
+    def lag_variance(self) -> bool: ...
+    @property
+    def form(self) -> str: ...
+
+
+def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
     """What `driftfit.trackers.bank.machine.advance` works on, before the first sample; covariances are multiplied by
     ``unit``.
     """
-    shape, Hd, Hm, H = bank._shape, len(bank.all_changes), len(bank.all_sensors), bank._count
-    tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
+    Hd, Hm, chained = len(bank.all_changes), len(bank.all_sensors), bank.chained
+    shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
+    tri, K, W = n * (n + 1) // 2, shape.children * (2 if chained else 1), shape.floors
     wide, links = _eights(tri), _eights(K + 1)
-    chain, initial = bank._events
+    chain, initial = bank.event_probabilities
     rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
     steps = [one.increments(n) for one in bank.all_changes]
     Q = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
@@ -45,7 +65,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     places[forget.MEAN], places[forget.CAP] = theta0, np.inf
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
-    parents, children = _room(max(shape.parents, K // H), Hd, Hm)
+    parents, children = _room(most := max(shape.parents * (2 if chained else 1), K // H), Hd, Hm)
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     past = _eights(W * (H + 1))
@@ -59,13 +79,14 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
         "sizes": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]),
         "factors": np.ones(Hd), "theta0": places,
         "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
-        "sensors": np.array([sensor.row() for sensor in bank.all_sensors]),
+        "sensors": table_of(bank.all_sensors),
         "chain": chain, "initial": initial, "given": np.full(H + Hd * Hd, np.nan),
         "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
         "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
         "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, BESIDE + H)), "Qt": np.zeros((Hd + 1, wide)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "news": news_of(H, Hm, past), "gap": _closed(Hd, wide),
+        "path": path_of(H, Hd, wide, most if chained else 0),
         "lag_prob": np.zeros((W, H)),
         "brief": np.zeros((min(W, TOLD), H)), "moving": np.zeros((H, H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
@@ -94,6 +115,13 @@ def packed(
     table[PLAIN] = na == 0 and walks and noises and not factored, walks, apart
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+
+
+def path_of(H: int, Hd: int, wide: int, room: int) -> Array:
+    """The table of `driftfit.trackers.bank.machine.chain_gap`, with room for so many leaves; empty for none."""
+    table = np.zeros((3 * H + Hd + 1 if room else 0, max(H, wide) + 1))
+    table[-1:, -1] = room
+    return table
 
 
 def _closed(Hd: int, wide: int) -> Array:

@@ -106,6 +106,6 @@ def floor(
     return int(
         grow(
             A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, math.inf, na, Q,
-            maps, places, sensors, prior, own, not own, bases, parent, event, X,
+            maps, places, sensors, prior, own, not own, bases, parent, event, 0, X,
         )
     )  # fmt: skip

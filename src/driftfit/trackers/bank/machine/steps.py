@@ -8,6 +8,7 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
+from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
@@ -28,6 +29,7 @@ from driftfit.trackers.bank.machine.layout import (
     MANY,
     MOST,
     NOW,
+    OWNERS,
     PHI,
     PLACES,
     POWERS,
@@ -95,6 +97,7 @@ def point(s: State) -> None:
     s.table[COV, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
     s.table[MANY, 0, 0] = s.many.ctypes.data
     s.table[NOW, 0, 0] = s.now.ctypes.data
+    s.table[OWNERS, 0, 0] = own_address(s)
 
 
 @kernel
@@ -125,6 +128,7 @@ def among(s: State, l: int) -> None:
             table[k, i] = s.table[k, i, l]
     table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[POWERS, 0] = memory, report, vectors, vectors + 8 * n
     table[THETA, 0], table[COV, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
+    table[OWNERS, 0] = own_address(s)
     for k in range(N):
         floats(memory, 1, N)[0, k] = s.memory[k, l]
     for i in range(n):

@@ -10,14 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 
-if TYPE_CHECKING:
-    from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+class Shifts(Protocol):
+    """What says how far parameters moved: a smoothed path."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def increment(self, t: int) -> tuple[Array, Array]: ...
+
 
 FAINT = 0.02
 """Probability below which a sample does not belong to a cluster."""
@@ -97,7 +104,7 @@ class Event:
         """The same event with times from sample numbers."""
         return replace(self, times=tuple(time(sample) for sample in self.span))
 
-    def measured(self, smoothed: EventSmoothed) -> Event:
+    def measured(self, smoothed: Shifts) -> Event:
         """The same event with the change of each parameter."""
         mean, cov = smoothed.increment(self.span.date)
         std = np.sqrt(np.maximum(np.diag(cov), 0.0))
@@ -178,7 +185,7 @@ def densest(mass: Array) -> tuple[int, int]:
     """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
     wanted = LEVEL * total[-1] * (1.0 - 1e-12)
-    ends = np.searchsorted(total, total[:-1] + wanted)  # of the interval that begins at each sample
+    ends = np.searchsorted(total, total[:-1] + wanted)  # of the interval that begins at each sample sample
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1
 

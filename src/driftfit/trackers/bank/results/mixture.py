@@ -12,7 +12,7 @@ from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gap import SINCE
-from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, SETTLED
+from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 
 if TYPE_CHECKING:
     from driftfit.trackers.bank.bank import Bank
@@ -60,6 +60,12 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     if since.any():  # further events that are possible since the last used sample
         more = np.zeros((n, n))
         more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
+        covs = covs + more
+    path = tracker.array(place.model, lane, "path")
+    if len(path) and lane["many"][OPEN] > 0:
+        last = tracker.array(place.model, lane, "links")[1, : B.shape[1]]  # events before the gap
+        more = np.zeros((B.shape[1], n, n))
+        more[:, i, j] = more[:, j, i] = path[-1 - tracker._count :][last, : len(i)]
         covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
