@@ -25,7 +25,7 @@ STILL = Kalman(q=0.0, r=1.0)
 
 
 class TunedOutputs(Mapping[str, Tuned]):
-    """The result of `tune` for a model with several outputs: one `driftfit.tune.Tuned` for each."""
+    """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
         self._each = dict(each)
