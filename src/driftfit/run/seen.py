@@ -1,4 +1,4 @@
-"""What a tracker saw of every sample, after the model and the missing-data rule have spoken."""
+"""Samples as a tracker receives them, after the model and the missing-data rule."""
 
 from __future__ import annotations
 
