@@ -30,7 +30,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import special
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
@@ -300,6 +300,8 @@ def penalty(N: int, n: int, least: int, quiet: float) -> float:
 
 
 def _exceeded(excess: Any) -> float:
+    from scipy import optimize  # with ndimage a quarter of the time of importing the package
+
     return float(optimize.brentq(excess, 4.0, 1000.0))
 
 
@@ -313,6 +315,8 @@ def _spans(N: int, n: int) -> tuple[Array, Array]:
 
 def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
     """c (N,) from the levels of windows (W,): medians of five, at least a twentieth of the median of all."""
+    from scipy import ndimage
+
     smooth = ndimage.median_filter(level, 5, mode="nearest") if len(level) > 2 else level
     positive = smooth[smooth > 0.0]
     floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
