@@ -81,7 +81,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
     instead of raising, the GIL is released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
 
 
@@ -91,7 +91,8 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that.
     """
-    return _again(internals.as_part(_compiled(function, cache=True, **internals.LINKED)), shared)
+    compiled = _compiled(function, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)  # it may own arrays
+    return _again(internals.as_part(compiled), shared)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
@@ -168,7 +169,7 @@ def _machine(symbol: str) -> Machine:
 def machine(function: Callable[..., Any]) -> Machine:
     """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
-    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True, _nrt=False)
+    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
