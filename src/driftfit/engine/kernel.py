@@ -136,9 +136,11 @@ def core(function: Callable[..., Any]) -> Any:
     """Compile a part of a machine that works on plain arrays with run-time bounds, once for all sizes.
 
     As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
-    and wrappers took nine tenths of the time of compiling a large machine. It may not allocate.
+    and wrappers took nine tenths of the time of compiling a large machine. It may not allocate. It is called, and not
+    inlined also where what calls it is: a large machine would become one function, on which LLVM spends seven times as
+    long.
     """
-    made = only_linked(_compiled(function, cache=True, **_PLAIN))
+    made = only_linked(_compiled(function, cache=True, **_PLAIN, forceinline=False))
     made.again = core
     return made
 

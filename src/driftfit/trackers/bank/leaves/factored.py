@@ -78,21 +78,21 @@ def along(C: Array, n: int, l: int, Z: Array, zl: int, F: Array, fl: int) -> Any
 
 
 @kernel
-def absorb(C: Array, l: int, n: int, F: Array, fl: int, a: Any, b: Array, B: Array, row: int, to: int) -> Any:
-    """A measurement: from C, column l, and f to the rows of B from ``row``, column ``to``; b takes the gain times a,
-    which is returned. a is an eight, b has n narrow rows; B may be C.
+def absorb(C: Array, l: int, n: int, b: Array, a: Any, B: Array, to: int) -> Any:
+    """A measurement: from C, column l, to B, column ``to``; the n narrow rows of b hold f = U'z and take the gain times
+    a, which is returned. a is an eight; B may be C.
     """
     at = 0
     for j in range(n):
-        f, d = load(F, j, fl), load(C, at + j, l)
+        f, d = load(b, j, 0), load(C, at + j, l)
         v, p = times(d, f), over(f, a)
         more = plus(a, times(f, v))
         for i in range(j):
             u, gain = load(C, at + i, l), load(b, i, 0)
-            store(B, row + at + i, to, minus(u, times(gain, p)))
+            store(B, at + i, to, minus(u, times(gain, p)))
             store(b, i, 0, plus(gain, times(u, v)))
         store(b, j, 0, v)
-        store(B, row + at + j, to, times(d, over(a, more)))
+        store(B, at + j, to, times(d, over(a, more)))
         a = more
         at += j + 1
     return a

@@ -1,24 +1,56 @@
 """The table of a bank: where its arrays lie, and what its counters and the numbers of a sample are called.
 
-A machine behind a symbol takes addresses only. This one takes the address of a table, whose rows say where everything
-else is; every part of the machine asks it for what it needs.
+Every part of the compiled routine is given the table alone (`driftfit.engine.table`), and asks it for what it needs.
+Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaves`. With n
+parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
+
+    parents, leaves         the leaves before and after the tree has grown, one a column
+    history, history_2      what leaves remember of their events, one a row (`machine.ancestry`); the counter FLIPPED
+                            says which of the two is valid
+    parent, event           of every leaf: the column it came from, and the joint event that made it
+    group, start, order     which leaves become one: a number for every leaf, members in the order of their groups
+    slots                   a table of hashes for numbering groups
+    prior                   p(next joint event | leaf), (H, leaves)
+    walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
+    drift                   factors of the drift of every change at this sample
+    Q                       covariances that changes add in this interval, and a spare row
+    maps, maps_nominal      changes that forget (`leaves.forget`), for this interval and for a nominal one
+    places                  theta0 and what else changes need to know (`leaves.forget`)
+    sensors                 the columns of `leaves.forecast`, a row for every sensor
+    transition, initial     the Markov chain of joint events, from a row to a column; the distribution of the first
+    given, given_chain      what the user says of this sample: prior of the joint events; chain of the changes
+    chain, row              of this sample: the chain, and the prior of the events that all leaves have in common
+    loss, reduction, bases  losses of decisions; settings of the reduction; limits of the codes of leaves
+    stamps, decided         when the undecided events were; what was decided at this sample
+    components              of the predictive density (`machine.lookahead`)
+    root, samples           for growing the tree again (`machine.refilter`)
+    ring                    recent samples for events of a stream
+    new_events              what an event adds to a history
+    gap                     what may have happened since the last used sample (`machine.gap`)
+    lag_prob, newest        marginals of the events of all floors; of those that are reported
+    C, m, z, g              of the columns that a sample meets: covariance, mean, regressor, C z
+    expected                their z'C z and z'm
+    scores                  their unit of covariance or log density; then two rows to spare
+    scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
+    spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
 from __future__ import annotations
 
-from collections import namedtuple
 from typing import Any
 
-from driftfit.engine.kernel import Array, floats, kernel, wholes
+from driftfit.engine.kernel import kernel
+from driftfit.engine.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
     LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, OPEN,
-    REFUSED, FAULTS, AGAIN, COUNT,
-) = range(17)  # fmt: skip
+    REFUSED, FAULTS, AGAIN, CHAINED, ALIKE, WIDE, COUNT,
+) = range(20)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample. OPEN floors have passed since the last used sample
 (`driftfit.trackers.bank.machine.gap`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
-AGAIN says that the present one was just refused.
+AGAIN says that the present one was just refused. Of the present sample: CHAINED that the user gave a chain of changes,
+ALIKE that all leaves have one prior, WIDE that its floor is another than that of one nominal interval.
 """
 WAITING, READY = 0, -1
 (
@@ -26,7 +58,7 @@ WAITING, READY = 0, -1
     SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
 ) = range(21)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.hypotheses.lags`).
+prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`).
 """
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
@@ -38,33 +70,56 @@ many nominal intervals had passed.
 """
 TOLD = 8
 """Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
-PACKED = (
-    "A", "B", "T", "T2", "X", "links", "group", "slots", "prior", "Q", "sizes", "factors", "maps", "theta0", "sensors",
-    "chain", "initial", "given", "loss", "knobs", "bases", "stamps", "parts", "root", "samples", "Qt", "ring",
-    "news", "gap", "moving", "lag_prob", "brief", "decided",
+
+MATRICES = (
+    "parents", "leaves", "history", "history_2", "prior", "walks", "relative_walks", "maps", "maps_nominal", "places",
+    "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring", "new_events", "gap",
+    "chain", "lag_prob", "scratch",
 )  # fmt: skip
-"""Arrays of a bank that lie one after the other in the field `memory`, the last two in `report`, so that banks of many
-shapes have one type of record and one driver. Row k of the table says where, in bytes, and rows and columns.
+VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
+WHOLE = ("parent", "event", "start", "order", "group", "slots")
+"""Arrays of whole numbers."""
+REPORTED = ("newest", "decided")
+"""Arrays that lie in the report."""
+WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow")
+"""Rows of the scratch that have names."""
+OUTSIDE = {
+    "report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX, "counters": COUNTS,
+    "sample": VECTOR,
+}  # fmt: skip
+"""Arrays that are fields of the state themselves."""
+NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart")
+"""n; how many output lags of their own leaves have; whether the noise is unknown, events are independent; whether all
+leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all changes are
+walks; and whether what may have happened since the last used sample is one floor.
 """
-AT: Any = namedtuple("AT", PACKED)(*range(len(PACKED)))
-"""Rows of the table by the names of the arrays, for the machine."""
-GIVEN, FACTORS = AT.given, AT.factors
-PLACES, ADDRESSES, REPORTED = len(PACKED), 8, PACKED[-2:]
-BASE, REPORT, PHI, POWERS, THETA, COV, MANY, NOW, FLAGS, PLAIN, ROWS = range(PLACES, PLACES + 11)
-"""Further rows of the table, whose first entry is an address; of FLAGS the output lags that leaves have of their own,
-and whether the noise is unknown and events are independent; of PLAIN whether all leaves have one regressor, all changes
-are walks and all sensors differ in their noise alone, whether all changes are walks, and whether what may have happened
-since the last used sample is one floor; and how many rows there are.
+BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
+"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of many
+shapes have one type of record and one driver; and of the other arrays.
 """
+PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
+TABLE = Table(
+    "bank",
+    {name: MATRIX for name in (*MATRICES, *REPORTED, *WINDOWS)}
+    | {name: VECTOR for name in VECTORS} | {name: COUNTS for name in WHOLE} | OUTSIDE
+    | {name: NUMBER for name in NUMBERS},
+    BASES,
+    {name: f"{name}_at" for name in OUTSIDE} | {name: "report_at" for name in REPORTED},
+)  # fmt: skip
+ROW, ROWS = TABLE.row, len(TABLE.row)
+"""Rows of the table by the names of fields and bases, and how many there are."""
+MEMORY_AT, REPORT_AT, PHI_AT, POWERS_AT, THETA_AT, COV_AT, COUNTERS_AT, SAMPLE_AT = (ROW[name] for name in BASES)
+table_at = TABLE.at
+"""The table at an address, for compiled code."""
 
 
 @kernel
-def packed(t: Array, k: int) -> Any:
-    """One of the packed arrays, of floats."""
-    return floats(t[BASE if k < PLACES - 2 else REPORT, 0] + t[k, 0], t[k, 1], t[k, 2])
+def first(t: Any) -> bool:
+    """Whether this is the first floor of the tree."""
+    return t.counters[FLOORS] == 0  # type: ignore[no-any-return]
 
 
 @kernel
-def whole(t: Array, k: int) -> Any:
-    """One of the packed arrays, of whole numbers."""
-    return wholes(t[BASE, 0] + t[k, 0], t[k, 1], t[k, 2])
+def flip(t: Any) -> None:
+    """The two tables of histories change places."""
+    t.counters[FLIPPED] = 1 - t.counters[FLIPPED]

@@ -9,69 +9,62 @@ Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered 
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 from driftfit.engine.kernel import Array, core
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
+from driftfit.trackers.bank.machine.layout import FLIPPED
+from driftfit.trackers.bank.machine.selection import DEPTH, PRIOR
 
 Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""
 
 
 @core
-def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
+def widen(t: Any, weight: Array, X: Array) -> None:
     """C + sum w_i Q_i of the root; X is spare."""
+    root, n, Q = t.root, t.n, t.Q
     for k in range(n * (n + 1) // 2):
-        for e in range(len(Q)):
+        for e in range(len(t.walks)):
             root[FIRST + n + k, 0] += weight[e] * Q[e, k]
 
 
 @core
-def refilter(
-    root: Array, samples: Array, D: int, B: Array, L: int, A: Array, by_prior: bool, Q: Array, sizes: Array, c: Array,
-    r: float, unknown: bool, fade: float, least: float, factors: Array, maps: Array, places: Array, sensors: Array,
-    row: Array, bases: Array, parent: Array, event: Array, prior: Array, na: int, own: bool, Qt: Array, X: Array,
-) -> int:  # fmt: skip
-    """Take the oldest of D samples into the root, and grow the tree of the others; returns its leaves, in A."""
-    H, n = len(row), places.shape[1]
-    tri = n * (n + 1) // 2
-    weight = X[0]
-    top = float(H) ** (D - 1)
+def refilter(t: Any, L: int) -> int:
+    """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
+    among the parents.
+    """
+    A, B, Q, root, samples, prior, row = t.parents, t.leaves, t.Q, t.root, t.samples, t.prior, t.row
+    H, D, weight = len(row), int(t.reduction[DEPTH]), t.scratch[0]
+    top, by_prior = float(H) ** (D - 1), t.reduction[PRIOR] > 0.0
     for e in range(H):
         weight[e] = row[e] if by_prior else 0.0
     if not by_prior:
         for l in range(L):
             weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
-    increments(Q, sizes, c, r, unknown, samples[0, TIME], samples[0, TIME], factors, Qt)
-    ready(Qt, n)
-    widen(root, n, weight, Qt, X[1:])
-    for e in range(H):
+    increments(t, samples[0, TIME], samples[0, TIME])
+    ready(t)
+    widen(t, weight, t.scratch[1:])
+    for e in range(H):  # the change is in the root: the oldest sample is one of no change and no increment
         prior[e, 0] = 0.0
+        for k in range(Q.shape[1]):
+            Q[e, k] = 0.0
     prior[0, 0] = 1.0
-    for e in range(H):
-        for k in range(tri):
-            Qt[e, k] = 0.0
-    root[LOG, 0] = 0.0
-    L = min(D, 1)
-    floor(
-        root, L, B, samples[0], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
-        event, X,
-    )  # fmt: skip
     for k in range(len(root)):
-        root[k, 0] = B[k, 0]
-        A[k, 0] = B[k, 0]
-    root[LOG, 0], A[LOG, 0], A[CODE, 0] = 0.0, 0.0, 0.0
+        A[k, 0] = root[k, 0]
+    A[LOG, 0] = 0.0
+    L = floor(t, min(D, 1), samples[0])
+    for k in range(len(root)):
+        root[k, 0] = A[k, 0] = B[k, 0]
+    root[LOG, 0] = A[LOG, 0] = A[CODE, 0] = 0.0
     for at in range(1, D):
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
-        increments(Q, sizes, c, r, unknown, samples[at, TIME], samples[at, TIME], factors, Qt)
-        ready(Qt, n)
-        L = floor(
-            A, L, B, samples[at], r, unknown, fade, least, na, Qt, maps, places, sensors, prior, own, bases, parent,
-            event, X,
-        )  # fmt: skip
+        increments(t, samples[at, TIME], samples[at, TIME])
+        ready(t)
+        L = floor(t, L, samples[at])
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):
@@ -83,8 +76,10 @@ def refilter(
 
 
 @core
-def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
-    """The table of the past for the leaves of the new tree: what happened in the D - 1 floors that it has."""
+def histories(t: Any, L: int) -> None:
+    """The histories of the new tree: what happened in the D - 1 floors that it has."""
+    A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
+    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
     block, width = H + 1, T.shape[1]
     for l in range(L):
         for at in range(width):
@@ -98,14 +93,6 @@ def histories(A: Array, L: int, D: int, H: int, Hm: int, T: Array) -> None:
 
 
 @core
-def floor(
-    A: Array, K: int, B: Array, sample: Array, r: float, unknown: bool, fade: float, least: float, na: int, Q: Array,
-    maps: Array, places: Array, sensors: Array, prior: Array, own: bool, bases: Array, parent: Array, event: Array,
-    X: Array,
-) -> int:  # fmt: skip
-    return int(
-        grow(
-            A, K, B, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE], r, unknown, fade, least, math.inf, na, Q,
-            maps, places, sensors, prior, own, not own, bases, parent, event, X,
-        )
-    )  # fmt: skip
+def floor(t: Any, K: int, sample: Array) -> int:
+    """One floor of the new tree, with a stored sample."""
+    return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))

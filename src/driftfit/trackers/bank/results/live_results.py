@@ -33,7 +33,7 @@ class LiveHypotheses:
         told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
         self.lag_prob: Array = told["lag_prob"].copy()
         self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
-        self.impossible = int(self._lane["many"][IMPOSSIBLE])
+        self.impossible = int(self._lane["counters"][IMPOSSIBLE])
 
     def mixture(self) -> Mixture:
         """The leaves now: what control works with."""
@@ -44,7 +44,7 @@ class LiveHypotheses:
 
         A stream remembers the last 256 samples, so ask more often than that.
         """
-        many, bank = self._lane["many"], self.tracker
+        many, bank = self._lane["counters"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
         now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
@@ -65,6 +65,6 @@ class LiveHypotheses:
         last, lane = self._live._last, self._lane
         if last is None:
             return sample
-        back = float(lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        back = float(lane["sample"][ELAPSED] - ring[sample % len(ring), 2])
         time = self._live._clock.moved(last, np.array([-back]))
         return sample if time is None else time[0]

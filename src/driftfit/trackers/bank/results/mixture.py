@@ -44,9 +44,9 @@ class Mixture(NamedTuple):
 def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     """The leaves in the fields of one lane; before the bank has begun, its one filter."""
     n = len(lane["theta"])
-    if lane["many"][SETTLED] != 1:
+    if lane["counters"][SETTLED] != 1:
         return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
-    B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
+    B = tracker.array(place.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     i, j = np.tril_indices(n)
     C = B[FIRST + n : FIRST + n + len(i)]
     if tracker.form == "sqrt":
@@ -68,11 +68,11 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
 
 def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:
     """(sample, event, probability) of the events held, decided one after the other from the leaves at the end."""
-    held, H = int(lane["many"][HELD]), len(loss)
-    if lane["many"][SETTLED] != 1 or held == 0:
+    held, H = int(lane["counters"][HELD]), len(loss)
+    if lane["counters"][SETTLED] != 1 or held == 0:
         return []
-    L = int(lane["many"][LEAVES])
-    B, group, stamps = (tracker.array(place.model, lane, name) for name in ("B", "group", "stamps"))
+    L = int(lane["counters"][LEAVES])
+    B, group, stamps = (tracker.array(place.model, lane, name) for name in ("leaves", "group", "stamps"))
     here = group[0, :L] >= 0
     codes, w = B[CODE, :L][here].astype(int), B[WEIGHT, :L][here]
     found = []

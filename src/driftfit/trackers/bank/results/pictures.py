@@ -64,7 +64,7 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)
-    B = bank.array(live.model, lane, "B")[:, : lane["many"][LEAVES]]
+    B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))
     axis = figure.subplots()

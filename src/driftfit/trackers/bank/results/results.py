@@ -152,7 +152,7 @@ class Hypotheses:
         """Samples that no leaf allowed; they were not used."""
         from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
 
-        return int(self.run._tile["many"][0, IMPOSSIBLE, self.run._lane])
+        return int(self.run._tile["counters"][0, IMPOSSIBLE, self.run._lane])
 
     @cached_property
     def decisions(self) -> list[Decision]:
