@@ -1,6 +1,6 @@
 """Writes the record that `driftfit demo` tracks, from the data set `macrodata` of statsmodels (public domain).
 
-Needs `pip install statsmodels`. Run: python examples/make_us_money_demand.py src/driftfit/data/us_money_demand.csv
+Needs `pip install statsmodels`. Run: python examples/make_us_money_demand.py src/driftfit/demo/us_money_demand.csv
 """
 
 import sys

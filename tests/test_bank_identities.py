@@ -141,7 +141,7 @@ def test_weights_sum_to_one_for_a_long_time():
     rng = np.random.default_rng(6)
     u = rng.standard_normal((20_000, N))
     run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=GPB(2), p0=1e10), u @ [1.0, 2.0], u)
-    w = state(run, "B")[WEIGHT, :9]
+    w = state(run, "leaves")[WEIGHT, :9]
     assert w.sum() == pytest.approx(1.0, abs=1e-12)
     assert np.isfinite(run.theta).all()
 

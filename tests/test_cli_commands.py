@@ -126,7 +126,7 @@ def test_valid_ranges_and_stretches_left_out(table):
     said = run("track", *SIGNALS, "--limits", "flow=-2:2", "--exclude", "101..121")
     assert "21 excluded" in " ".join(said.split())
     run("tune", *SIGNALS[:-2], "--limits", "flow=-2:2", "--exclude", "101..121")
-    assert "given in rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
+    assert "an interval of rows" in fails("track", *SIGNALS, "--exclude", "2024-03-01..2024-03-02")
     assert "column=low:high" in fails("track", *SIGNALS, "--limits", "flow=2")
     assert "did you mean flow" in fails("track", *SIGNALS, "--limits", "flo=1:2")
     assert "FROM..TO" in fails("track", *SIGNALS, "--exclude", "4")
@@ -142,7 +142,7 @@ def test_a_saved_run_or_stream_goes_on(table):
     rest = ["pump.csv", "--y", "flow", "--u", "valve", "--rows", "201:", "--start"]
     for state in ("first.npz", "live.npz"):
         assert np.array_equal(theta(*rest, state), expected().theta[200:, 1])
-    assert "those of the file" in fails("track", *rest, "first.npz", "--model", "arx:1,1")
+    assert "come from the file" in fails("track", *rest, "first.npz", "--model", "arx:1,1")
     (table.head(3)).write_csv("no.npz")
     assert "no.npz is not a driftfit file" in fails("track", *rest, "no.npz")
 
@@ -171,7 +171,7 @@ def test_detect_scores_labels_and_writes_alarms(table):
     page = Path("page.html").read_text()
     assert "Faults and alarms" in page
     assert "2024-03-01 11:20:00" in page  # the label begins
-    assert "1 of 1 labelled stretches found" in page
+    assert "1 of 1 labelled intervals found" in page
     said = run("detect", *DATED, "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
     assert "b1[valve]" in said
     assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
@@ -229,7 +229,7 @@ def test_page_of_a_fleet_marks_labels(table):
     fleet = track(ARX(1, 1), K, np.stack([y, y]), np.stack([u, u])[..., None], by="row")
     fleet.report("page.html", labels={0: wrong})
     page = Path("page.html").read_text()
-    assert "Stretches labelled as wrong" in page
+    assert "Intervals labelled as wrong" in page
     assert ">200<" in page
     with pytest.raises(ValueError, match="which has no result"):
         fleet.report("page.html", labels={7: wrong})

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
-from driftfit.run.outputs import Outputs
+from driftfit.fleets import Outputs
 
 OWN = '''
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ def test_what_is_wrong_is_said_in_one_line(folder):
     for arguments, said in (
         (["a.csv", "--y", "flo"], "has no column 'flo': did you mean flow?"),
         (["z*.csv", "--y", "flow"], "no file matches z*.csv"),
-        (["a.csv", "--y", "flow", "--unit", "flow"], "a unit is given as column=unit"),
+        (["a.csv", "--y", "flow", "--unit", "flow"], "give a unit as column=unit"),
     ):
         result = CliRunner().invoke(
             app, ["track", *arguments, "--model", "arx:1,0", "--tracker", "kalman", "-p", "q=0", "-p", "r=1"]
@@ -172,12 +172,12 @@ def test_a_fleet_of_several_outputs(tanks):
     [
         (("--model", "hammerstein-wiener:1,1", "--y", "level,flow"), "has one output, but --y names level, flow"),
         (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but --y names level, flow"),
-        (("--y", "level,flow", "--by", "tank", "--plot", "x.png"), "no picture of many records"),
+        (("--y", "level,flow", "--by", "tank", "--plot", "x.png"), "many records with several outputs cannot be drawn"),
         (("--y", "level,flow", "--by", "tank", "--out", "x.npz"), "one run"),
-        (("--y", "level,flow", "--unit", "flow=l"), "several outputs carry none"),
+        (("--y", "level,flow", "--unit", "flow=l"), "not supported for several outputs"),
         (("--y", ","), "names no column"),
-        (("--y", "level", "--y", "level"), "--y level,level: an output is named once"),
-        (("--y", "level,flow", "--u", "valve"), "inputs must be names, each once"),
+        (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
+        (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),
     ],
 )
 def test_what_several_outputs_cannot_have(tanks, arguments, said):

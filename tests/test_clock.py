@@ -76,9 +76,9 @@ def test_an_interval_of_the_wrong_kind_is_named():
     days = np.arange(T).astype("datetime64[D]")
     with pytest.raises(ValueError, match=r"dt=2 has no unit.*dt='2s'"):
         track(MODEL, TRACKER, y, u, time=days, dt=2)
-    with pytest.raises(ValueError, match="dt='1h' is for dates, but time is numbers"):
+    with pytest.raises(ValueError, match="dt='1h' is for dates, but time is numeric"):
         track(MODEL, TRACKER, y, u, time=np.arange(T), dt="1h")
-    with pytest.raises(ValueError, match="or 'label' where samples"):
+    with pytest.raises(ValueError, match="or 'label' if samples"):
         track(MODEL, TRACKER, y, u, time=days)
 
 

@@ -70,12 +70,12 @@ def test_times_windows_and_warm_starts_go_along():
 
 def test_the_order_is_enforced():
     live = Live(ARX(2, 2), K)
-    with pytest.raises(ValueError, match=r"no sample waits.*update\(y\) without u, then apply"):
+    with pytest.raises(ValueError, match=r"no sample is waiting.*update\(y\) without u, then apply"):
         live.apply(1.0)
     live.update(1.0)
     before = live.to_bytes()
     for late in (lambda: live.update(1.0), lambda: live.update(1.0, 2.0), lambda: live.update(1.0, 1.0, time=3.0)):
-        with pytest.raises(ValueError, match="input of the last sample has not come yet"):
+        with pytest.raises(ValueError, match="input of the last sample has not been given yet"):
             late()
     with pytest.raises(ValueError, match="1 inputs, but u has shape"):
         live.apply([1.0, 2.0])
@@ -84,7 +84,7 @@ def test_the_order_is_enforced():
     assert live.update(1.0, None)[3] is False
     two = Live(ARX(1, 1, ny=2), K)
     two.update([1.0, 2.0])
-    with pytest.raises(ValueError, match="has not come yet"):
+    with pytest.raises(ValueError, match="has not been given yet"):
         two.update([1.0, 2.0], 1.0)
     with pytest.raises(ValueError, match=r"must have shape \(1,\)"):
         two.apply([1.0, 2.0])

@@ -126,7 +126,7 @@ def test_the_output_passes_as_its_forecast_says():
         (TRACKER, {"what": "gains", "below": 1.0}, "there is no 'gains'; did you mean gain"),
         (TRACKER, {"what": "gain"}, "give one limit"),
         (TRACKER, {"what": "gain", "below": 1.0, "above": 2.0}, "give one limit"),
-        (TRACKER, {"what": "gain", "below": np.nan}, "no finite number"),
+        (TRACKER, {"what": "gain", "below": np.nan}, "is not finite"),
         (TRACKER, {"what": "gain", "below": 1.0, "level": 2.0}, "level must be"),
         (AugmentedFLS(10.0), {"what": "gain", "below": 1.0}, "AugmentedFLS carries no covariance"),
     ],
@@ -139,7 +139,7 @@ def test_what_cannot_be_asked(tracker, arguments, says):
 
 def test_what_is_not_known_yet():
     y, u = record()
-    with pytest.raises(ValueError, match="nothing is known yet"):
+    with pytest.raises(ValueError, match="is not determined yet"):
         track(Regression(["gain", "other"]), TRACKER, y[:1], u[:1]).crossing("gain", below=1.0)
 
 

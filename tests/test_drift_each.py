@@ -155,7 +155,7 @@ def test_what_does_not_fit_is_named():
         track(TWO, FLS(1.0), y, phi, drift=-of(mu))
     with pytest.raises(ValueError, match="a drift for each parameter is for FLS and Kalman"):
         track(TWO, RLS(0.9), y, phi, drift=of(mu))
-    with pytest.raises(ValueError, match="A mu for every step goes with the record"):
+    with pytest.raises(ValueError, match="Pass a mu for every step with the record"):
         FLS(mu)
     live = Live(ARX(1, 1), FLS(1.0))
     with pytest.raises(ValueError, match=r"must be \(1, 2\)"):

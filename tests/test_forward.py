@@ -120,7 +120,7 @@ def test_regressions_are_played_without_memory():
 
 
 def test_a_model_that_cannot_be_run_forward_says_so():
-    with pytest.raises(ValueError, match="Regression does not say how"):
+    with pytest.raises(ValueError, match="Regression cannot be run forward"):
         Model.play(Regression(1), np.zeros((1, 1)), np.zeros((1, 0)), np.zeros((1, 3, 1)), np.zeros((1, 3)), (0.0, 1.0))
     y, u = arx_record(200, 3)
     joint = track(ARX(1, 1, ny=2), Kalman(q=0.0, r=0.01), np.column_stack([y, y]), u)

@@ -11,8 +11,8 @@ from test_bank import record as jumping
 
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
 from driftfit.judge.alarms.calibration import null_records
-from driftfit.judge.alarms.rule import AlarmRule
 from driftfit.run.live.alarm import LiveAlarm
+from driftfit.run.live.rule import AlarmRule
 
 K = Kalman(q=1e-4, r=0.01)
 T, CUT, FAULT = 900, 500, 700
@@ -118,7 +118,7 @@ def test_alarms_of_several_outputs(record):
     assert all(len(one.onsets) for one in said.values())
     ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
     assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
-    with pytest.raises(ValueError, match=r"theta of their own; got \['speed'\]"):
+    with pytest.raises(ValueError, match=r"separate theta; got \['speed'\]"):
         live.detect({"speed": rules["flow"]})
 
 
@@ -172,10 +172,10 @@ def test_references_in_times():
     assert seconds.detect("band", reference=(960.0, 2400.0)).rule == expected.rule
     assert plain.detect("innovation", reference=400).start == 400  # a rule may be made of the whole record
     for wrong, match in (
-        (("2024-03-05", "2024-03-05 04:00"), "too little"),
-        (("2025-03-05", "2025-04-05"), "too little"),
-        (("in March", "2024-03-05"), "'in March' is no date"),
-        ((1, 2, 3), "from when to when"),
+        (("2024-03-05", "2024-03-05 04:00"), "too short"),
+        (("2025-03-05", "2025-04-05"), "too short"),
+        (("in March", "2024-03-05"), "'in March' is not a date"),
+        ((1, 2, 3), "or an interval"),
     ):
         with pytest.raises(ValueError, match=match):
             dated.detect("band", reference=wrong)
@@ -200,7 +200,7 @@ def test_a_reference_in_local_time():
 def test_a_tracker_that_adapts_is_warned_of():
     y, u = arx_record(200, 3)
     run = track(ARX(2, 2), AdaptiveKalman(), y, u)
-    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault away.*\"band\".*tune"):
+    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"band\".*tune"):
         run.detect("innovation")
     run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
 

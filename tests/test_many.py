@@ -1,5 +1,7 @@
 """Many runs judged at once: false discovery control, the table, the page; outputs of one record."""
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -7,7 +9,8 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.judge.many import discoveries
+from driftfit.judge import many
+from driftfit.judge.many import discoveries, verdicts
 
 K = Kalman(q=1e-4, r=0.01)
 MOVED = (1, 4)
@@ -42,7 +45,7 @@ def test_those_that_move_are_found_and_named(fleet):
     assert said["<1>"].said == fleet["<1>"].verdict()
     assert said["<1>"].pays
     assert said.rows[-1].key == "<6>"
-    assert "In 2 of 6" in said.sentences[0]
+    assert "move in 2 of 6" in said.sentences[0]
     assert "1 cannot be tested" in said.sentences[-1]
     table = said.table
     assert table["key"][0] in said.drifting
@@ -61,6 +64,39 @@ def test_a_level_is_the_false_discovery_rate(fleet):
     assert set(strict.drifting) <= {f"<{k}>" for k in MOVED}
     for row in fleet.verdict().rows:
         assert np.isnan(row.q) or row.q >= row.said.p
+
+
+def test_ranked_by_change_puts_the_largest_share_first(fleet):
+    """b1 from 1 to 2 doubles; b2 from 0.4 to 1.2 is less in numbers and in p, and more as a share."""
+    T = 300
+    path = np.tile(THETA, (T, 1))
+    path[150:, 3] += 0.8
+    y, u = arx_record(T, 24, theta=path)
+    said = verdicts({**fleet._runs(), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
+    rows = said.ranked("change").rows
+    assert [row.key for row in rows[:2]] == ["<4>", "<1>"]
+    assert rows[0].relative == pytest.approx(2.0, abs=0.5)
+    assert rows[1].relative == pytest.approx(1.0, abs=0.3)
+    assert all(row.relative == 0.0 for row in rows[2:])
+    assert {row.key for row in rows} == {f"<{k}>" for k in range(7)}
+    assert said.ranked("change").ranked("clearest").rows == said.rows
+    with pytest.raises(ValueError, match="'change'"):
+        said.ranked("size")
+
+
+def test_a_share_of_almost_nothing_is_one_of_its_error(fleet):
+    row = fleet.verdict()["<1>"]
+    parts = tuple(replace(m, before=1e-9, after=0.5, std=0.1) if m.moves else m for m in row.said.parameters)
+    assert replace(row, said=replace(row.said, parameters=parts)).relative == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(("patience", "shown"), [(0.0, 1), (1e9, 0)])
+def test_progress_is_shown_where_it_takes_long(fleet, monkeypatch, patience, shown):
+    started = []
+    monkeypatch.setattr(many.Progress, "start", lambda bar: started.append(bar))
+    monkeypatch.setattr(many, "PATIENCE", patience)
+    assert len(fleet.verdict()) == 7
+    assert len(started) == shown
 
 
 def test_diagnoses_are_counted(fleet):
@@ -104,7 +140,7 @@ def test_outputs_of_one_record(tmp_path):
     run.report(tmp_path / "outputs.html")
     page = (tmp_path / "outputs.html").read_text()
     assert "<h1>level, flow</h1>" in page
-    assert "Those that move most clearly" in page
+    assert "The series that move most clearly" in page
     rows = np.stack([u, u[:, ::-1]], axis=1)
     theta = np.column_stack([np.ones(T), gain])
     y = np.einsum("toi,ti->to", rows, theta) + 0.1 * rng.normal(size=(T, 2))
@@ -136,9 +172,9 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
         judged = [str(len(row.alarms.onsets)), *row.first.split()]
         told = next(line for line in printed if line[0] == row.key)
         assert told[1 : 1 + len(judged)] == judged
-        assert (told[-1] == "something") == row.faulty
+        assert (told[-1] == "fault") == row.faulty
     assert ["not", "judged,", "<6>:"] in [line[:3] for line in printed]
-    with pytest.raises(KeyError, match="too little"):
+    with pytest.raises(KeyError, match="too short"):
         said["<6>"]
 
 
@@ -181,11 +217,11 @@ def test_without_faults_few_series_are_accused():
         ({"every": 0.5}, "every"),
         ({"every": "ten"}, "every"),
         ({"every": np.inf}, "every"),
-        ({}, "where the parameters"),
+        ({}, "normal range of the parameters"),
         ({"reference": {}}, "names"),
         ({"reference": {"b1[u]": 1.0}}, "low <= high"),
         ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
-        ({"reference": {"<1>": 140}}, "nothing for <0>, <2>"),
+        ({"reference": {"<1>": 140}}, "missing for <0>, <2>"),
     ],
 )
 def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
@@ -199,5 +235,5 @@ def test_a_page_about_nothing_says_so(tmp_path):
     run.report(tmp_path / "nothing.html")
     page = (tmp_path / "nothing.html").read_text()
     assert "2 cannot be tested" in page
-    assert "No diagnostic can be told" in page
-    assert not any(claim in page for claim in ("In none of", "within limits", "move most clearly"))
+    assert "No diagnostic can be computed" in page
+    assert not any(claim in page for claim in ("No drift is found in any of", "within limits", "move most clearly"))

@@ -73,11 +73,121 @@ def test_the_extended_filter_is_its_naive_twin(inflation):
     assert_allclose(found.std.c[:, 1], run.std[:, 3])
 
 
+TWO = HammersteinWiener(
+    1, [2, 1], nk=[1, 2], input=[Polynomial(2), Polynomial(3)], output=Polynomial(2), intercept=True
+)
+"""xi = (a1, b1, b2, b1[u2], c2, c2[u2], c3[u2], d2, l)."""
+TRUTH = np.array([-0.5, 0.5, -0.3, 0.4, 0.3, 0.2, -0.1, 0.1, 0.05])
+
+
+def two_inputs(T=200, seed=4, noise=0.0):
+    """y, u (T, 2) of `TWO` with the coefficients `TRUTH`, written out."""
+    rng = np.random.default_rng(seed)
+    u, w = rng.uniform(-1.0, 1.0, (T, 2)), np.zeros(T)
+    v = u[:, 0] + 0.3 * u[:, 0] ** 2, u[:, 1] + 0.2 * u[:, 1] ** 2 - 0.1 * u[:, 1] ** 3
+    for t in range(2, T):
+        w[t] = 0.5 * w[t - 1] + 0.5 * v[0][t - 1] - 0.3 * v[0][t - 2] + 0.4 * v[1][t - 2] - 0.05
+    y = (np.sqrt(1.0 + 0.4 * w) - 1.0) / 0.2
+    return y + noise * rng.normal(size=T), u
+
+
+def test_the_extended_filter_of_several_inputs_is_its_naive_twin():
+    y, u = two_inputs()
+    ekf = ExtendedKalman(q=1e-5, r=1e-4, p0=0.1, theta0=TRUTH + 0.1)
+    run = track(TWO, ekf, y, u)
+    phi, (x, z) = np.full((200, TWO.n), np.nan), u.T
+    for t in range(2, 200):
+        first = [y[t - 1], -x[t - 1], -x[t - 2], -z[t - 2], y[t] ** 2]
+        phi[t] = [*first, -(x[t - 1] ** 2), -(x[t - 2] ** 2), -(z[t - 2] ** 2), -(z[t - 2] ** 3), y[t - 1] ** 2, 1.0]
+    path, P = naive_ekf(TWO, phi, -y, 1e-5, 1e-4, 0.1, TRUTH + 0.1, 0.0)
+    assert_allclose(run.theta, path, rtol=1e-8, atol=1e-10)
+    assert_allclose(run.cov(-1), P, rtol=1e-6, atol=1e-12)
+    assert run.names == ("a1", "b1[u1]", "b2[u1]", "b1[u2]", "c2[u1]", "c2[u2]", "c3[u2]", "d2", "intercept")
+    assert_allclose(run.theta[-1], TRUTH, atol=0.02)
+    root, xi = run.prediction[100], run.theta[99]
+    right = -np.delete(phi[100] * TWO.structure.products(xi), 4).sum()
+    assert root + xi[7] * root**2 == pytest.approx(right, abs=1e-9)
+    found = run.blocks()
+    assert same(found.xi, run.theta)
+    assert_allclose(found.std.c[:, [1, 3, 4]], run.std[:, 4:7])
+
+
+def naive_output_error(y, u, q, r, p0, xi, q_w=1e-6, p_w=0.5):
+    """The output-error filter of `TWO` as its equations say, with full matrices; state (w, xi).
+
+    The first ten outputs are not used."""
+    x, P = np.r_[0.0, xi], np.diag(np.r_[p_w, np.full(9, p0)])
+    path, said = [], []
+    for t in range(len(y)):
+        y_hat = np.nan
+        if t >= 2:
+            a, b, b2, bz, c, cz, cz3, d, l = x[1:]
+            if t == 2:
+                x[0] = y[1] + d * y[1] ** 2
+            one, two, other = u[t - 1, 0], u[t - 2, 0], u[t - 2, 1]
+            v, v2, vz = one + c * one**2, two + c * two**2, other + cz * other**2 + cz3 * other**3
+            slopes = [-x[0], v, v2, vz, b * one**2 + b2 * two**2, bz * other**2, bz * other**3, 0.0, -1.0]
+            F = np.eye(10)
+            F[0] = np.r_[-a, slopes]
+            P = F @ (P + np.diag(np.r_[0.0, np.full(9, q)])) @ F.T
+            P[0, 0] += q_w
+            x[0] = -a * x[0] + b * v + b2 * v2 + bz * vz - l
+            y_hat = (np.sqrt(1.0 + 4.0 * d * x[0]) - 1.0) / (2.0 * d)
+            H = np.zeros(10)
+            H[0], H[8] = 1.0, -(y_hat**2)
+            H /= 1.0 + 2.0 * d * y_hat
+            if np.isfinite(y[t]) and t >= 10:
+                k = P @ H / (H @ P @ H + r)
+                x = x + k * (y[t] - y_hat)
+                left = np.eye(10) - np.outer(k, H)
+                P = left @ P @ left.T + r * np.outer(k, k)
+        path.append(x[1:].copy())
+        said.append(y_hat)
+    return np.array(path), np.array(said), P[1:, 1:]
+
+
+def test_the_output_error_filter_of_several_inputs_is_its_naive_twin():
+    y, u = two_inputs(noise=SIGMA)
+    y[:10] = np.resize([1.2, 1.2, -1.2, -1.2], 10)  # so that the grid spans all later outputs
+    y[[60, 61, 120]] = np.nan
+    late = np.r_[np.zeros(10), np.ones(190)]
+    run = track(TWO, OutputError(q=1e-6, r=SIGMA**2, p0=0.01, theta0=TRUTH + 0.05), y, u, weights=late)
+    path, said, P = naive_output_error(y, u, 1e-6, SIGMA**2, 0.01, TRUTH + 0.05)
+    assert_allclose(run.theta[2:], path[2:], rtol=1e-7, atol=1e-9)
+    assert_allclose(run.prediction[10:], said[10:], atol=1e-7)
+    assert_allclose(run.cov(-1), P, rtol=1e-5, atol=1e-10)
+    assert np.abs(run.theta[-1] - TRUTH).max() < 3.0 * run.std[-1].max()
+
+
+@pytest.mark.parametrize("kind", [ExtendedKalman, OutputError])
+def test_an_idle_second_input_changes_nothing(kind):
+    """Its b and c keep their prior, all others are those of the model with one input; a missing one is marked."""
+    s = record(150, noise=SIGMA)
+    one, two = SMALL, HammersteinWiener(1, [2, 1], input=[Polynomial(2), Polynomial(2)], output=Polynomial(2))
+    alone = track(one, kind(q=1e-6, r=1e-3, p0=0.05, theta0=0.1), s.y, s.u)
+    idle = np.zeros(150)
+    both = track(two, kind(q=1e-6, r=1e-3, p0=0.05, theta0=0.1), s.y, np.column_stack([s.u, idle]))
+    assert_allclose(both.theta[:, [0, 1, 2, 4, 6]], alone.theta, rtol=1e-9, atol=1e-12)
+    assert same(both.theta[:, [3, 5]], np.full((150, 2), 0.1))
+    idle[[80, 81]] = np.nan
+    holes = track(two, kind(q=1e-6, r=1e-3, p0=0.05, theta0=0.1), s.y, np.column_stack([s.u, idle]))
+    assert np.flatnonzero(~holes.ok[2:]).tolist() == [79, 80]
+    assert np.isfinite(holes.theta).all()
+
+
+def test_a_hand_off_with_several_inputs():
+    y, u = two_inputs(400)
+    for then in (ExtendedKalman(q=1e-6, r=1e-6), OutputError(q=1e-6, r=1e-6)):
+        found = hand_off(TWO, K, then, y, u, at=150)
+        assert found.then.ok.all()
+        assert_allclose(found.then.theta[-1], TRUTH, atol=0.02)
+
+
 def test_minimal_filters_want_their_model():
     for tracker in (ExtendedKalman(q=1e-5, r=1e-4), OutputError(q=1e-5, r=1e-4)):
         with pytest.raises(ValueError, match="HammersteinWiener"):
             track(Regression(1), tracker, [1.0, 2.0], [1.0, 1.0])
-        with pytest.raises(ValueError, match="cannot be told apart"):
+        with pytest.raises(ValueError, match="two cannot be distinguished"):
             track(HammersteinWiener(0, 1, input=Polynomial(2)), tracker, [1.0, 2.0], [1.0, 1.0])
 
 
@@ -156,7 +266,7 @@ def test_diagnostics_tell_good_from_bad():
     assert {"b1", "b2"} <= set(dull.dull())
     bent = run.theta[-1].copy()
     bent[3] = -9.0
-    run._out["theta"][-1, :, 0] = bent
+    run.theta[-1] = bent
     assert diagnose_blocks(run, every=300).slope[0] < 0.0
     with pytest.raises(ValueError, match="at least 21"):
         diagnose_blocks(run, window=5)
@@ -172,7 +282,7 @@ def test_an_estimate_that_does_not_increase_is_flagged_and_predicted_with_its_en
     y_hat, _ = live.predict(0.3)
     assert np.isfinite(y_hat)
     assert s.y.min() - np.ptp(s.y) < y_hat < s.y.max() + np.ptp(s.y)
-    run._out["theta"][:, 3, 0] = -5.0
+    run.theta[:, 3] = -5.0
     assert not free_run(run).rising[60:].any()
 
 

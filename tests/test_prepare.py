@@ -136,7 +136,7 @@ def test_a_closed_loop_is_warned_of_and_an_open_one_is_not():
 
 
 def test_what_cannot_be_prepared():
-    with pytest.raises(ValueError, match="the first 2 samples hold no value"):
+    with pytest.raises(ValueError, match="the first 2 samples contain no value"):
         prepare.remove_level([np.nan, np.nan, 1.0], first=2)
     with pytest.raises(ValueError, match="a scale must be positive; got 0"):
         prepare.scale(np.ones(5), first=5)

@@ -171,10 +171,10 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
 @pytest.mark.parametrize(
     ("call", "says"),
     [
-        (lambda: track(ARX, K, Y, U), "track: model is the class ARX itself; make one of it: ARX(na=...)."),
-        (lambda: track(ARX(2, 2), Kalman, Y, U), "class Kalman itself; make one of it: Kalman(q=..., r=...)."),
+        (lambda: track(ARX, K, Y, U), "track: model is the class ARX itself; create an instance: ARX(na=...)."),
+        (lambda: track(ARX(2, 2), Kalman, Y, U), "class Kalman itself; create an instance: Kalman(q=..., r=...)."),
         (lambda: track(ARX, Kalman, Y, U), "model is the class ARX itself"),
-        (lambda: track(K, ARX(2, 2), Y, U), f"changed places; the model comes first: track({MODEL}, {TRACKER}, ...)."),
+        (lambda: track(K, ARX(2, 2), Y, U), f"wrong order; the model comes first: track({MODEL}, {TRACKER}, ...)."),
         (lambda: track(Kalman, ARX, Y, U), "the model comes first: track(ARX(na=...), Kalman(q=..., r=...), ...)."),
         (lambda: track(ARX(2, 2), Y, U), "must be a tracker, such as AdaptiveKalman(); got an array of shape (200,)."),
         (lambda: track(ARX(2, 2), [K, Kalman], Y, U), "tracker is the class Kalman"),
@@ -189,7 +189,7 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
         (lambda: select(ARX, Y, U), "select: model is the class ARX itself"),
         (lambda: select([ARX(2, 2), K], Y, U), "model must be a model, such as ARX(2, 2) or Regression(3); got Kalman"),
         (lambda: select(ARX(2, 2), Y, U, tracker=RLS), "select: tracker is the class RLS itself"),
-        (lambda: grid(ARX(2, 2), na=[1, 2]), "grid: it makes the models, so give their class"),
+        (lambda: grid(ARX(2, 2), na=[1, 2]), "grid: give the class of the models"),
         (lambda: frontier(ARX, Y, U), "frontier: model is the class ARX itself"),
         (lambda: detect("band", Y), "detect: the run comes first, as in detect(run, 'band'); got 'band'."),
     ],

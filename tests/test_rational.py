@@ -42,5 +42,5 @@ def test_missing_samples_and_refusals():
     )
     with pytest.raises(ValueError, match="phi is y itself"):
         rational_model(y[:9], np.column_stack([y, phi[:, 1]])[:9], psi[:9])
-    with pytest.raises(ValueError, match="4 usable samples cannot tell 4"):
+    with pytest.raises(ValueError, match="4 usable samples cannot determine 4"):
         rational_model(y[:4], phi[:4], psi[:4])

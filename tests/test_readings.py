@@ -4,7 +4,20 @@ import pytest
 from contract_table import model_of, ready
 from readings import failures
 
-from driftfit import ARX, RLS, AdaptiveKalman, AugmentedFLS, Bank, Change, Kalman, Sensor
+from driftfit import (
+    ARX,
+    RLS,
+    AdaptiveKalman,
+    AugmentedFLS,
+    Bank,
+    Change,
+    ExtendedKalman,
+    HammersteinWiener,
+    Kalman,
+    OutputError,
+    Sensor,
+)
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 
 SENSORS = [Sensor.nominal(0.1), Sensor.outlier(kind="additive"), Sensor.frozen(0.01)]
 """Leaves that put their own predictions into their lags: an unstable one would run away."""
@@ -14,6 +27,7 @@ TRACKERS = {
     "AdaptiveKalman": AdaptiveKalman(), "AugmentedFLS": ready(AugmentedFLS), "Bank": Bank(),
     "Bank, sensors": Bank([Change(1e-4), Change(1.0, prob=0.01)], SENSORS, (None, LASTING)),
 }  # fmt: skip
+CUBIC = HammersteinWiener(1, 2, 1, input=Polynomial(3), output=Polynomial(3)).bind(1)
 
 
 @pytest.mark.parametrize("tracker", TRACKERS.values(), ids=TRACKERS)
@@ -21,4 +35,14 @@ def test_no_reading_leaves_a_trace_that_is_not_a_number(tracker):
     model = model_of(tracker, ARX(2, 2).bind(1))
     found, count = failures(model, tracker, [0, 1, 2, 3, 4, 5, 7, 20], 130)
     assert count == 432
+    assert not found
+
+
+@pytest.mark.filterwarnings("ignore:.*root mean square:UserWarning")
+@pytest.mark.parametrize("tracker", [ready(Kalman), RLS(0.98), ready(ExtendedKalman), ready(OutputError)], ids=repr)
+def test_no_power_of_a_reading_leaves_one_either(tracker):
+    """Cubes: what is read as 1e8 stands beside 1e24 in one regressor."""
+    values = (-1e-320, 1e-100, 1e-20, 3e4, -3e6, 1e7, 1e8, -1e10, 1e13, 1e37, -1e80, 1e308, float("nan"), float("inf"))
+    found, count = failures(CUBIC, tracker, [0, 1, 2, 3, 4, 5, 7, 20], 130, values)
+    assert count == 224
     assert not found

@@ -160,7 +160,7 @@ def test_page_shows_faults_and_alarms(run):
     read(text)
     plain = " ".join(" ".join(read(text).text).split())
     score = alarms.score(labels)
-    assert f"{score.found} of 2 labelled stretches found, {score.false} false alarms" in plain
+    assert f"{score.found} of 2 labelled intervals found, {score.false} false alarms" in plain
     assert plain.index("Faults and alarms") < plain.index("Parameters over time")
     for t in (250, 299, 390, 394, *alarms.onsets):
         assert run.time_text(int(t)) in plain

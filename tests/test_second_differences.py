@@ -212,11 +212,11 @@ def test_a_long_record_without_excitation_stays_finite():
 def test_settings():
     with pytest.raises(ValueError, match="differences must be 1 or 2"):
         FLS(1.0, differences=3)
-    with pytest.raises(ValueError, match="p0 says nothing of the slope"):
+    with pytest.raises(ValueError, match="p0 does not describe the slope"):
         FLS(1.0, p0=1.0, differences=2)
     phi, y = record()
     bent_run = track(TWO, FLS(1.0, differences=2), y, phi)
-    with pytest.raises(ValueError, match=r"run\.forecast follows it"):
+    with pytest.raises(ValueError, match=r"use run\.forecast"):
         bent_run.ahead(2)
-    with pytest.raises(ValueError, match="theta itself walks at random here"):
+    with pytest.raises(ValueError, match="theta is a plain random walk here"):
         _ = track(TWO, FLS(1.0), y, phi).smooth().slope

@@ -68,7 +68,7 @@ def test_subsets_are_all_up_to_five_and_a_search_beyond():
     few = select(Regression(["a", "b", "c"]), y, u[:, :3], tracker=calm)
     assert len(few.rows) == 7
     assert set(few.regressors(few.simplest)) == {"b", "c"}
-    with pytest.raises(ValueError, match="no model by itself"):
+    with pytest.raises(ValueError, match="not a model by itself"):
         few.model()
     kept = select(Regression(["a", "b", "c"]), y, u[:, :3], tracker=calm, keep=["a"], most=2)
     assert {row.name for row in kept.rows} == {"a", "a b", "a c"}

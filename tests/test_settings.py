@@ -49,7 +49,7 @@ ONES = np.ones(10)
         (lambda: ARX(0, 0), ["nothing to estimate", "na=0", "nb=0"]),
         (lambda: Regression(0), ["Regression", "nothing to estimate"]),
         (lambda: Regression(-2), ["regressors", "at least 0", "-2"]),
-        (lambda: Live(Regression(), RLS(0.9)), ["how many regressors", "Regression(3)"]),
+        (lambda: Live(Regression(), RLS(0.9)), ["the number of regressors", "Regression(3)"]),
     ],
 )
 def test_wrong_settings_are_named(build, says):

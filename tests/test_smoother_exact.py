@@ -317,7 +317,7 @@ def test_undetermined_parameters_have_infinite_bands_and_no_noise_estimate_is_a_
     smoothed = track(Regression(2), Kalman(q=0.1, r=1.0), y, phi).smooth()
     assert np.isinf(smoothed.std[:, 1]).all()
     assert np.isfinite(smoothed.std[:, 0]).all()
-    with pytest.warns(RuntimeWarning, match="no residual to estimate the noise"):
+    with pytest.warns(RuntimeWarning, match="no residual from which to estimate"):
         short = track(Regression(2), FLS(1.0), y[:1], phi[:1]).smooth()
     assert np.isnan(short.r)
     assert np.isfinite(short.theta).all()

@@ -245,7 +245,7 @@ class TestFixedLag:
         with pytest.raises(ValueError, match="no samples are kept"):
             Live(Regression(2), FLS(1.0)).smooth()
         noisy = HammersteinWiener(1, 1, output=Polynomial(2), output_noise=0.1)
-        with pytest.raises(ValueError, match="what the measurement noise of the model adds"):
+        with pytest.raises(ValueError, match="does not support the output_noise"):
             Live(noisy, Kalman(0.1, 0.4, p0=1.0), lag=3)
         with pytest.raises(ValueError, match="lag must be a whole number"):
             Live(Regression(2), FLS(1.0), lag=-1)
@@ -268,7 +268,7 @@ class TestForecast:
     def test_fls_takes_its_estimated_scale(self):
         phi, y = record()
         run = track(Regression(2), FLS(10.0), y, phi)
-        scale = run._tile["scale"][0, 0]
+        scale = run.state["scale"]
         P = run.cov(-1) + 2 * scale / 10.0 * np.eye(2)
         assert run.forecast(2, phi[:2]).y_std[1] ** 2 == pytest.approx(phi[1] @ P @ phi[1] + scale)
 

@@ -9,13 +9,14 @@ import pytest
 from numpy.testing import assert_allclose
 from support import same
 
-from driftfit import ExtendedKalman, Kalman, Live, track
+from driftfit import Kalman, Live, track
 from driftfit.models.hammerstein_wiener.curves.basis import DeadZone, PiecewiseLinear, Polynomial, Saturation
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.constant_system import fit_constant
 from driftfit.models.hammerstein_wiener.results.free_run import free_run
 from driftfit.models.hammerstein_wiener.separation.least_squares import refine
 from driftfit.models.hammerstein_wiener.separation.paths import split
+from driftfit.systems.arc_furnace import THRESHOLDS, valve
 
 VALVES = HammersteinWiener(1, [2, 1], nk=[1, 2], input=[PiecewiseLinear((-0.5, 0.5)), Saturation(3.0, start=1.0)])
 K = Kalman(q=0.0, r=4e-4, p0=1e2)
@@ -102,6 +103,28 @@ def test_thresholds_are_found_from_a_wrong_start():
         assert_allclose(found[-1], [1.0, 1.4, -0.7], atol=0.02)
 
 
+def test_a_valve_ends_where_it_is_fully_open():
+    """Equation (61) has limits of the input; a dead zone without them learns wrong thresholds."""
+    rng = np.random.default_rng(2)
+    u, y = rng.uniform(-15.0, 15.0, 2000), np.zeros(2000)
+    v = valve(u)
+    assert_allclose([v.max(), v.min()], [9.0, -9.0])
+    for t in range(2, 2000):
+        y[t] = 0.7 * y[t - 1] + 0.2 * v[t - 1] + 0.1 * v[t - 2] + 0.01 * rng.normal()
+    found = {}
+    for limit in (10.0, None):
+        zone = DeadZone(15.0, limit=limit)
+        run = track(HammersteinWiener(1, 2, input=zone), Kalman(q=1e-8, r=1e-4, p0=1e2), y, u)
+        found[limit] = run.blocks(input="c1").c[-1, 1:]
+        x = np.array([-20.0, -3.0, 0.5, 3.0, 20.0])
+        assert_allclose(zone.known(1.0, -1.0).value(x) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
+        assert_allclose(zone.split(x, x >= 1.0, x <= -1.0) @ [1.0, 1.0, -1.0], valve(x, limit=limit or np.inf))
+    assert_allclose(found[10.0], THRESHOLDS, atol=0.01)
+    assert np.abs(found[None] - THRESHOLDS).min() > 0.5
+    with pytest.raises(ValueError, match="limit"):
+        DeadZone(15.0, limit=0.0)
+
+
 def test_several_inputs_are_the_regression_they_are_written_as():
     y, u, _ = record(T=200)
     run = track(VALVES, K, y, u)
@@ -151,8 +174,6 @@ def test_what_several_inputs_cannot_have_is_said():
         track(VALVES, K, y, u[:, :1])
     with pytest.raises(ValueError, match="one entry for each input"):
         HammersteinWiener(1, [2, 1], input=[None, None, None])
-    with pytest.raises(ValueError, match="takes a model with one input"):
-        track(VALVES, ExtendedKalman(q=0.0, r=1.0), y, u)
     with pytest.raises(ValueError, match="one input"):
         fit_constant(VALVES, y, u)
     for basis in (Saturation(1.0), DeadZone(1.0)):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.show.plots import BLUE, GREY, RED, new_figure
+from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems import scenarios
 from lab.bench.accuracy import HINDSIGHT, ORACLE, TUNING_SEED, Cell, Size
 from lab.bench.causes import CAUSES, REAL_CAUSES
@@ -157,26 +157,29 @@ def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], si
     return "\n\n".join([*parts, REAL_CAUSES]) + "\n"
 
 
-INTRODUCTION = """Written by `python -m lab bench accuracy --out docs`; every figure is its output.
+INTRODUCTION = """\
+Written by `python -m lab bench accuracy --out docs`, which prints every figure.
 
-*RMSE* is that of the parameters after 200 samples, the median over runs. *Oracle* is the Kalman filter that knows the
-drift covariance and noise variance of every sample; ratios to it are taken run by run, with quartiles. On *ramp* and
-*sinusoid* it knows only the size of the steps, not that they go on. *One-step* is the error of predictions, over the
-oracle's. *In band* are shares within 95 % bands; simulated outliers are not counted for y. *Default* is a package as it
-comes, *tuned* takes the setting of a grid with the least parameter error on other runs of the same scenario, and
-*Kalman, hindsight* is the best setting on the scored runs themselves. A tracker without a default has no such row.
+*RMSE* is the error of the parameters after 200 samples, the median over runs. *Oracle* is the Kalman filter that
+knows the drift covariance and the noise variance of every sample; ratios to it are computed for each run and given
+with quartiles. In *ramp* and *sinusoid* the oracle knows only the size of the steps, not that they persist. *One-
+step* is the error of predictions, divided by the oracle's. *In band* gives shares within 95 % bands; simulated
+outliers of y are not counted. *Default* is a package with its default settings, *tuned* uses the setting of a grid
+with the least parameter error on other runs of the same scenario, and *Kalman, hindsight* is the best setting on
+the scored runs themselves. A tracker without default settings has no such row.
 
-All start from zero. Peers get the regressors, since they know no lags, and skip samples with a missing lag; `track`
-fills the lag of a missing output. For jumps, every contestant's innovations go through one detector, at the threshold
-that gives one alarm in 1000 samples without drift."""
+All methods start from zero. Peers receive the regressors, since they do not handle lags, and skip samples with a
+missing lag; `track` fills the lag of a missing output. For jumps, the innovations of every method are passed to the
+same detector, at the threshold that gives one alarm in 1000 samples without drift."""
 
 SAME = """\
-pykalman, simdkalman and dynamax run the filter of `Kalman` when given its numbers; that they give the same estimates is
-checked by `python -m lab bench speed`, and their rows would be those of `Kalman` again, as filterpy's is."""
+pykalman, simdkalman and dynamax run the filter of `Kalman` when given its settings. `python -m lab bench speed`
+checks that they give the same estimates; their rows would repeat that of `Kalman`, as filterpy's does."""
 
-REAL = """The first half chooses settings by one-step error, the second half is scored. *t* is the paired t statistic of
-the differences of squared errors to `AdaptiveKalman`'s: negative is a smaller error than its, and below 2 in size is
-within chance."""
+REAL = """\
+The first half determines the settings by one-step error, and the second half is scored. *t* is the paired t
+statistic of the differences of squared errors to those of `AdaptiveKalman`: a negative value is a smaller error
+than its own, and values below 2 in size are insignificant."""
 
 
 def draw(name: str, cells: Sequence[Cell], T: int) -> Figure:

@@ -16,8 +16,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
-from driftfit.run.live.live import Live
-from driftfit.run.track import track
+from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
@@ -27,6 +26,7 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
+from driftfit.tracking import track
 from lab.bench import speed_peers as peers
 from lab.bench.contest import Contest, Finish, Job, hold
 from lab.bench.machine import times
@@ -89,7 +89,7 @@ def live_rls(T: int) -> Contest:
     ours = stream("driftfit Live, RLS", RLS(FORGETTING, p0=P0), data)
     others = peers.on(data, (lambda d: peers.live_padasip_rls(d, FORGETTING),))
     return Contest(
-        "Live update, RLS", "prediction and adaption from Python; ours also carries the noise variance", ours, others
+        "Live update, RLS", "prediction and adaptation from Python; ours also carries the noise variance", ours, others
     )
 
 
@@ -109,7 +109,7 @@ def live_free(T: int) -> Contest:
     others = (lambda: stream("driftfit Live, Kalman", kalman(), data),)
     return Contest(
         "Live update, AdaptiveKalman",
-        "no peer chooses its own numbers",
+        "no peer chooses its own settings",
         stream("driftfit Live, AdaptiveKalman", AdaptiveKalman(), data),
         others,
     )
@@ -133,7 +133,7 @@ def record_rls(T: int) -> Contest:
     others = (lambda d: peers.polars_rls(d, FORGETTING), lambda d: peers.padasip_rls(d, FORGETTING))
     return Contest(
         "Record, RLS",
-        "coefficients of every sample",
+        "coefficients at every sample",
         record("driftfit track, RLS", RLS(FORGETTING, p0=P0), data),
         peers.on(data, others),
     )
@@ -159,7 +159,7 @@ def smoother(T: int) -> Contest:
 
     ours = Job("driftfit track(...).smooth()", both, T, lambda: np.asarray(both().theta))
     others = (peers.statsmodels_smoother, peers.dynamax_smoother, peers.pykalman_smoother)
-    return Contest("Filter and smoother", "means and variances of every sample", ours, peers.on(data, others))
+    return Contest("Filter and smoother", "means and variances at every sample", ours, peers.on(data, others))
 
 
 def fleet(T: int) -> Contest:
@@ -201,7 +201,7 @@ def hammerstein_wiener(T: int) -> Contest:
 
     name = f"driftfit Live, Kalman on {live.theta.size} products"
     others = (lambda: Job("driftfit track, the same", lambda: track(model, Kalman(q=Q, r=R, p0=P0), y, u), T),)
-    return Contest("Hammerstein-Wiener step", "no peer has the model", Job(name, run, T), others)
+    return Contest("Hammerstein-Wiener step", "no peer has this model", Job(name, run, T), others)
 
 
 FLOORS = ((2, 1), (4, 1), (6, 1), (10, 1), (4, 32))

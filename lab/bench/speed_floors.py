@@ -47,7 +47,7 @@ def floor(n: int, lanes: int, T: int) -> Contest:
         others.insert(0, partial(c_loop, module, tile, T))
     return Contest(
         f"Floors, n = {n}, {lanes} lane{'s' * (lanes > 1)}",
-        "the compiled loop alone, ARX memory included",
+        "the compiled loop alone, including the ARX memory",
         ours,
         others,
     )

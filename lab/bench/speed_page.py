@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.show.plots import BLUE, GREY, new_figure
+from driftfit.show.parts.axes import BLUE, GREY, new_figure
 from lab.bench.causes import SPEED_CAUSES
 from lab.bench.contest import SAME, Finish, Line
 from lab.bench.machine import machine, markdown, versions
@@ -21,14 +21,16 @@ if TYPE_CHECKING:
 
 Slopes = dict[str, tuple[Array, Array, str]]
 
-INTRODUCTION = f"""Written by `python -m lab bench speed --out docs`; every figure is its output. One thread for linear
-algebra. What is compared takes turns within one process, and figures are medians, so that a busy machine slows all of
-them. *Times ours* above 1 is slower than driftfit, below 1 faster. *Same numbers* is the largest difference of the
-estimates relative to the largest estimate; above {SAME:g} it is said to differ. "Other" is another algorithm, shown for
-its cost only."""
+INTRODUCTION = f"""\
+Written by `python -m lab bench speed --out docs`, which prints every figure. Linear algebra uses one thread. The
+compared programs take turns within one process, and figures are medians, so that a busy machine slows all of them.
+*Times ours* above 1 is slower than driftfit, below 1 faster. *Same numbers* is the largest difference of the
+estimates relative to the largest estimate; above {SAME:g} the numbers count as different. "Other" is a different
+algorithm, shown only for its cost."""
 
-FACTORS = """Seconds of a fresh process, medians, numpy being imported; MB of files, numpy not counted. The first result
-is that of a thousand samples."""
+FACTORS = """\
+Seconds are medians over fresh processes in which numpy is already imported; MB are sizes of files without numpy.
+The first result is that of a thousand samples."""
 
 
 def duration(ns: float) -> str:

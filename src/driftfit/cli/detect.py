@@ -15,7 +15,7 @@ from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import moment, stretch
 from driftfit.cli.track import Plot, Report
 from driftfit.judge.alarms.detect import Alarms
-from driftfit.run.result import Track
+from driftfit.results import Track
 from driftfit.show.report import check_path
 
 
@@ -77,7 +77,7 @@ def parse_reference(given: list[str] | None, run: Any) -> Any:
     if all("=" in entry for entry in given):
         return dict(_band(entry) for entry in given)
     if len(given) > 1:
-        raise ValueError("--reference: several are only for bands, such as --reference gain=0.9:1.1.")
+        raise ValueError("--reference: several references are only for bands, such as --reference gain=0.9:1.1.")
     if given[0].strip().isdigit():
         return int(given[0])
     first, last = stretch(given[0], "--reference")
@@ -91,7 +91,7 @@ def _band(entry: str) -> tuple[str, tuple[float, float]]:
     try:
         return name.strip(), (float(low or "-inf"), float(high or "inf"))
     except ValueError:
-        raise ValueError(f"--reference {entry}: a band is given as name=low:high.") from None
+        raise ValueError(f"--reference {entry}: give a band as name=low:high.") from None
 
 
 def _write(said: Any, path: Path) -> None:

@@ -9,8 +9,8 @@ import typer
 
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
-from driftfit.data.export import check_ending, write
-from driftfit.run.result import Track
+from driftfit.results import Track
+from driftfit.show.export import check_ending, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +39,7 @@ def track(
 
         check_path(report)
     if plot is not None and given.by and len(given.outputs) > 1:
-        raise ValueError("--plot: there is no picture of many records with several outputs; --report has some.")
+        raise ValueError("--plot: many records with several outputs cannot be drawn; use --report.")
     run = given.run()
     say(run.summary())
     if write_to is not None:
@@ -55,5 +55,5 @@ def track(
 def plot_system(run: Any) -> Figure:
     """The picture of the system, of runs that have one."""
     if not isinstance(run, Track):
-        raise ValueError("--system: the picture is of one series with one output; leave out --by and further --y.")
+        raise ValueError("--system: this draws one series with one output; leave out --by and further --y.")
     return run.plot_system()

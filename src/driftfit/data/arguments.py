@@ -22,7 +22,7 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
     """
     if _is(model, Tracker) and _is(tracker, Model):
         raise TypeError(
-            f"{owner}: model and tracker have changed places; the model comes first: "
+            f"{owner}: model and tracker are in the wrong order; the model comes first: "
             f"{owner}({_called(tracker)}, {_called(model)}, ...)."
         )
     check_role(owner, "model", model, Model)
@@ -37,7 +37,7 @@ def check_role(owner: str, name: str, value: Any, kind: type[Settings]) -> None:
     if isinstance(value, kind):
         return
     if isinstance(value, type) and issubclass(value, kind):
-        raise TypeError(f"{owner}: {name} is the class {value.__name__} itself; make one of it: {_called(value)}.")
+        raise TypeError(f"{owner}: {name} is the class {value.__name__} itself; create an instance: {_called(value)}.")
     raise TypeError(f"{owner}: {name} must be {ARTICLE[kind]}; got {_shown(value)}.")
 
 

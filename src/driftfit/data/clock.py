@@ -127,14 +127,14 @@ class Clock:
         if self.kind == "unset" and dates:
             raise ValueError(
                 "with datetimes dt must be given: the nominal interval, such as dt=timedelta(hours=1), '1h', 'month', "
-                "or 'label' where samples are one step apart whatever their dates say."
+                "or 'label' if samples are one step apart regardless of their dates."
             )
         if self.kind == "number" and dates:
             raise ValueError(
-                f"dt={self.count:g} has no unit, and time is dates; say which, as in dt='{self.count:g}s'."
+                f"dt={self.count:g} has no unit, but time consists of dates; give one, as in dt='{self.count:g}s'."
             )
         if self.kind not in ("number", "unset", LABEL) and not dates:
-            raise ValueError(f"dt={self.plain!r} is for dates, but time is numbers: give dt in the unit of time.")
+            raise ValueError(f"dt={self.plain!r} is for dates, but time is numeric: give dt in the unit of time.")
 
     def at(self, time: Any) -> Clock:
         """This clock, its days and months those of the zone of a time that has one."""
@@ -290,7 +290,7 @@ def _of_text(text: str) -> Clock:
     scale, size = (1, str(known)) if known in ("ns", "us", "ms") else (10**9, "ns")
     ticks = count * DURATIONS[known] * scale
     if ticks != round(ticks):
-        raise ValueError(f"dt={text!r} is no whole number of nanoseconds.")
+        raise ValueError(f"dt={text!r} is not a whole number of nanoseconds.")
     if scale > 1 and round(ticks) % 1000 == 0:  # dates of the far past or future do not fit nanoseconds
         ticks, size = ticks / 1000, "us"
     return Clock("duration", duration=_delta(round(ticks), size))
@@ -303,7 +303,7 @@ def _delta(count: int, unit: str) -> np.timedelta64:
 
 def _whole(text: str, count: float) -> float:
     if count != int(count):
-        raise ValueError(f"dt={text!r}: steps of the calendar come in whole numbers.")
+        raise ValueError(f"dt={text!r}: calendar steps must be whole numbers.")
     return count
 
 
@@ -326,9 +326,9 @@ def _of_offset(offset: Any) -> Clock:
 
 def _refuse(given: Any) -> NoReturn:
     raise ValueError(
-        f"dt={given!r} is no interval; give a number in the unit of time, a duration ('10ms', '1s', '15min', '1h', "
+        f"dt={given!r} is not an interval; give a number in the unit of time, a duration ('10ms', '1s', '15min', '1h', "
         "'30d', '2w', a timedelta), a step of the calendar ('business day', 'month', 'quarter', 'year', '3 months'; "
-        "'m' could be minutes or months, so write 'min' or 'month'), or 'label' where times are only labels."
+        "'m' could be minutes or months, so write 'min' or 'month'), or 'label' if times are only labels."
     )
 
 
@@ -377,7 +377,7 @@ def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: in
         warn(
             f"{lost} of {N} samples cannot be used: the median interval is {middle}, dt is "
             f"{1 if clock.plain is None else clock.plain}, and lags do not reach across gaps above {GAP} dt. "
-            f"Give {better}, or dt='label' where samples are one step apart whatever their times say."
+            f"Give {better}, or dt='label' if samples are one step apart regardless of their times."
         )
 
 
@@ -398,5 +398,5 @@ class Pace:
             warn(
                 f"{self._gaps} of the first {LOOK} samples came after a gap: the last interval is {interval:g} times "
                 f"dt={1 if self._clock.plain is None else self._clock.plain}, and lags do not reach across gaps above "
-                f"{GAP} dt. Give dt= the interval between samples, or dt='label' where times are only labels."
+                f"{GAP} dt. Give dt= the interval between samples, or dt='label' if times are only labels."
             )

@@ -39,7 +39,7 @@ def held(what: str, given: Any) -> Held:
     try:
         frame = nw.from_native(given, pass_through=True, allow_series=True)
     except nw.exceptions.DuplicateError as error:
-        raise ValueError(f"{what}: columns are told apart by their names. {error}") from None
+        raise ValueError(f"{what}: column names must be different. {error}") from None
     if isinstance(frame, nw.LazyFrame):
         frame = frame.collect()
     if not isinstance(frame, nw.Series | nw.DataFrame):
@@ -69,8 +69,8 @@ def together(**parts: Held) -> None:
         same = part.index.sort_values().equals(other.index.sort_values())
         way = f"{name} = {name}.loc[{first}.index]" if same else f"{first}, {name} = {first}.align({name}, 'inner', 0)"
         raise ValueError(
-            f"the rows of {first} and {name} do not belong together: their indices differ, at row {row} "
-            f"{other.index[row]} beside {part.index[row]}. Put them together by label with {way}, or by place with "
+            f"the rows of {first} and {name} do not match: in row {row} their indices are "
+            f"{other.index[row]} and {part.index[row]}. Align them by label with {way}, or by position with "
             f"{name}.to_numpy()."
         )
 
@@ -130,8 +130,8 @@ def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str 
     said += [f"{more[0]!r} is none of them"] if more else []
     raise ValueError(
         f"{owner} has the {what} {', '.join(wanted)}, but {letter} has the columns {', '.join(given)}; "
-        f"{'; '.join(said)}. Signals with names are matched by them: rename or choose columns, or give {letter} as an "
-        "array, by place."
+        f"{'; '.join(said)}. Named signals are matched by name: rename or select columns, or give {letter} as an "
+        "array to match by position."
     )
 
 

@@ -97,10 +97,10 @@ def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
     try:
         low, high = (end if end is None else float(end) for end in bounds)
     except (TypeError, ValueError):
-        raise ValueError(f"limits: {key!r} takes (low, high), None where there is no limit; got {bounds!r}.") from None
+        raise ValueError(f"limits: {key!r} must be (low, high), with None for no limit; got {bounds!r}.") from None
     found = (-np.inf if low is None else low, np.inf if high is None else high)
     if not found[0] < found[1]:
-        raise ValueError(f"limits: of {key!r} the low end must be below the high one; got {bounds!r}.")
+        raise ValueError(f"limits: the lower limit of {key!r} must be below the upper one; got {bounds!r}.")
     return found
 
 
@@ -110,10 +110,10 @@ def within(stretches: Any, time: Array | None, number: Array, zone: str | None =
     axis = number if time is None else time
     for stretch in stretches:
         if isinstance(stretch, str) or not isinstance(stretch, Sequence | np.ndarray) or len(stretch) != 2:
-            raise ValueError(f"exclude: a stretch is (from, to), in a list of them; got {stretch!r}.")
+            raise ValueError(f"exclude: each interval must be (from, to), in a list; got {stretch!r}.")
         low, high = (_end(one, axis, zone, upper) for upper, one in enumerate(stretch))
         if low is not None and high is not None and not low <= high:
-            raise ValueError(f"exclude: a stretch ends at or after its beginning; got {stretch!r}.")
+            raise ValueError(f"exclude: an interval must not end before it begins; got {stretch!r}.")
         inside |= (True if low is None else axis >= low) & (True if high is None else axis <= high)
     return inside
 
@@ -148,7 +148,9 @@ def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
         return moment - np.timedelta64(1, "us") if coarse and upper else moment
     except (TypeError, ValueError):
         kind = "a date or a datetime" if axis.dtype.kind == "M" else "a number"
-        raise ValueError(f"exclude: with this record an end of a stretch is {kind}, or None; got {given!r}.") from None
+        raise ValueError(
+            f"exclude: for this record an end of an interval must be {kind}, or None; got {given!r}."
+        ) from None
 
 
 def _stamp(given: Any) -> Any:

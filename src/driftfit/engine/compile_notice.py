@@ -5,6 +5,7 @@ Only where somebody looks: on a terminal, or in a notebook. What goes to a file 
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 import time
@@ -34,10 +35,13 @@ def compiling() -> Iterator[None]:
             timer = threading.Timer(max(PATIENCE - _spent, 0.0), say)
             timer.daemon = True
             timer.start()
-    start = time.perf_counter()
+    start, collecting = time.perf_counter(), gc.isenabled()
+    gc.disable()  # it takes 6 per cent of the time, and a compiler leaves little behind
     try:
         yield
     finally:
+        if collecting:
+            gc.enable()
         if timer is not None:
             timer.cancel()
         with _lock:

@@ -18,7 +18,6 @@ import hashlib
 import os
 import pickle
 import platform
-import sys
 import tempfile
 import time
 import warnings
@@ -26,16 +25,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import llvmlite
 import numba
-from numba.core.caching import _Cache
-from numba.core.compiler import CompileResult
-from numba.core.registry import cpu_target
-from numba.core.serialize import dumps
+
+from driftfit.engine.numba_internals import dumps, processor, versions
 
 PACKAGE = Path(__file__).parent
 ENDING = ".compiled"
-MAKERS = ("kernel.py", "linking.py", "machine_code.py", "simd.py")
+MAKERS = ("kernel.py", "numba_internals.py", "simd.py")
 """Files that decide what becomes of a function, beside its own code."""
 
 
@@ -69,8 +65,7 @@ def makers() -> str:
     build = hashlib.sha256()
     for name in MAKERS:
         build.update((PACKAGE / name).read_bytes())
-    versions = platform.python_version(), numba.__version__, llvmlite.__version__
-    return f"{versions}{sys.byteorder}{cpu_target.target_context.codegen().magic_tuple()}{build.hexdigest()}"
+    return f"{platform.python_version()}{versions()}{processor()}{build.hexdigest()}"
 
 
 def name_of(function: str, identity: str, signature: Any) -> str:
@@ -111,13 +106,14 @@ def write(name: str, content: Any) -> None:
         return
     data = dumps(content)
     try:
-        with tempfile.NamedTemporaryFile(dir=place, prefix=f"{name}.", suffix=".tmp", delete=False) as file:
-            file.write(hashlib.sha256(data).digest() + data)
+        handle, unfinished = tempfile.mkstemp(dir=place, prefix=f"{name}.", suffix=".tmp")
         try:
-            os.chmod(file.name, 0o644)
-            os.replace(file.name, place / name)
-        except OSError:
-            os.unlink(file.name)
+            with open(handle, "wb") as file:
+                file.write(hashlib.sha256(data).digest() + data)
+            os.chmod(unfinished, 0o644)
+            os.replace(unfinished, place / name)
+        except BaseException:  # also where the user interrupts it
+            os.unlink(unfinished)
             raise
     except OSError:  # a full disk, or a folder that was taken away
         _say_nothing_is_kept()
@@ -131,35 +127,6 @@ def _say_nothing_is_kept() -> None:
         "compiled anew in every process. Set NUMBA_CACHE_DIR to a folder that can be written.",
         stacklevel=2,
     )
-
-
-class Kept(_Cache):
-    """The cache that a dispatcher of Numba asks, for functions that are kept by themselves."""
-
-    def __init__(self, function: str, identity: str) -> None:
-        self._function, self._identity = function, identity
-
-    @property
-    def cache_path(self) -> str:
-        return str(folder())
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        target_context.refresh()
-        found = read(name_of(self._function, self._identity, sig))
-        return None if found is None else CompileResult._rebuild(target_context, *found)
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        if not data.lifted and not data.library.has_dynamic_globals:
-            write(name_of(self._function, self._identity, sig), data._reduce())
-
-    def enable(self) -> None:
-        """Always."""
-
-    def disable(self) -> None:
-        """Never."""
-
-    def flush(self) -> None:
-        """Nothing is held back."""
 
 
 class Contents(NamedTuple):

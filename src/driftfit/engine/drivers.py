@@ -25,7 +25,7 @@ import numba
 import numpy as np
 from numba import types
 
-from driftfit.engine.kernel import Array, Driver, State, Step, kernel, routine
+from driftfit.engine.kernel import Array, Driver, State, Step, kernel
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
@@ -134,11 +134,6 @@ def _common(n: int, m: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def known_factors(dt: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Array:
-    """What is known beside the signals, (T, 3) or (1, 3): interval, factors of the noise variance and of the drift."""
-    return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, float)) for v in (dt, noise, drift))), axis=1)
-
-
 def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:
     """A tile of ``len(trackers)`` lanes: an array of one record, its fields set to the given starts.
 
@@ -223,7 +218,6 @@ def _advance(tracker: TrackerSteps) -> Any:
     if begin is None:
         return advance
 
-    @routine
     def start(s: State) -> None:
         for l in range(s.theta.shape[1]):
             if s.root[l] > 0:
@@ -233,13 +227,15 @@ def _advance(tracker: TrackerSteps) -> Any:
                 correct(s, l)
                 report(s, l)
 
+    started = kernel(start, inline=False)  # seldom run: the lane loop is better without it
+
     @kernel
     def advance_or_start(s: State) -> None:
         some = 0
         for l in range(s.theta.shape[1]):
             some = max(some, s.root[l])
         if some > 0:
-            start(s)
+            started(s)
         else:
             advance(s)
 

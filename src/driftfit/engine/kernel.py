@@ -1,40 +1,41 @@
-"""Lanes: the record that holds a state, the decorator that compiles a step, and the drivers that run steps.
+"""Lanes: the record that holds a state, and the decorators that compile what works on it.
 
 The state of one tile is one NumPy record. Every field has a fixed shape with a trailing lane axis of length L, so that
 for n parameters ``theta`` is (n, L) and ``P`` is (n, n, L). A *step* is a function ``step(s, l)`` that works on lane
 ``l`` of the record ``s`` and returns nothing; L = 1 is a stream or a record, L = 32 is thirty-two series side by side.
 Shapes belong to the type of the record, so loops over parameters have bounds that the compiler knows.
 
-Nothing here uses fast-math, so a step gives the same bits at every width. `driftfit.engine.drivers` holds the loop
-that runs the steps.
+    kernel    a step, or a function that steps call: inlined into its caller, compiled for every size of the record
+    shared    a function of plain arrays with run-time bounds: compiled once for all sizes and kept on disk, called
+    part      the same, but inlined into the compiled routine that calls it
+    machine   a routine that steps call by its symbol, with addresses and numbers: compiled apart, once for all drivers
+    Driver    what Python calls, with arrays and numbers
+
+None of them may allocate but a `Driver`. Nothing here uses fast-math, so a step gives the same bits at every width.
+`driftfit.engine.drivers` holds the loop that runs the steps.
 """
 
 from __future__ import annotations
 
-import dis
 import hashlib
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from operator import attrgetter
-from threading import Lock, RLock
-from types import CellType, CodeType, FunctionType
+from collections.abc import Callable
+from threading import Lock
+from types import FunctionType
 from typing import Any
 from weakref import ref
 
 import numba
 import numpy as np
 import numpy.typing as npt
-from llvmlite.binding import add_symbol
-from numba import carray, njit, types
-from numba.core import cgutils
-from numba.core.datamodel import models, register_default
-from numba.extending import intrinsic
+from numba import types
+from numba.extending import models, register_model
 
 from driftfit.engine import disk_cache
+from driftfit.engine import numba_internals as internals
 from driftfit.engine.compile_notice import compiling
-from driftfit.engine.linking import StepDispatcher, only_linked
-from driftfit.engine.machine_code import Code, compiled, loaded
+from driftfit.engine.identity import identity
 
 Array = npt.NDArray[Any]
 State = Any
@@ -42,55 +43,6 @@ State = Any
 
 Step = Callable[[State, int], None]
 """A compiled step, called with the record and a lane."""
-
-
-def identity(function: FunctionType) -> str:
-    """A name for a function that changes when its code, or anything that it uses, changes.
-
-    Numba's cache looks at the time stamp of the one file that holds the driver; steps live in other files. Giving every
-    step an identity made of its code and the identities of what it refers to lets drivers that are closures over steps
-    be found on disk by a second process, and recompiles them when a step was edited. The code is what was compiled, not
-    its text: the file may have been edited since it was imported, and at a prompt there is none.
-    """
-    names = _globals(function.__code__) & function.__globals__.keys()
-    used = {name: function.__globals__[name] for name in names}
-    used |= dict(zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True))
-    used |= {"defaults": (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items())}
-    parts = [function.__module__, function.__qualname__, _code(function.__code__)]
-    parts += [f"{name}={_identity_of(value, function, name)}" for name, value in sorted(used.items())]
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _globals(code: CodeType) -> set[str]:
-    """Global names that code reads, also in the functions and comprehensions inside it; not those of attributes."""
-    names = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
-    return names.union(*(_globals(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
-
-
-def _code(code: CodeType) -> str:
-    """What code does, without the places where its text stands."""
-    constants = [_code(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
-    return repr((code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
-
-
-def _identity_of(value: Any, function: FunctionType, name: str) -> str:
-    if isinstance(value, tuple):
-        return f"({', '.join(_identity_of(v, function, name) for v in value)})"
-    if value is carray:
-        return "carray"
-    if value is np or value is math:  # what hangs on any other module may be edited unseen
-        return str(value.__name__)
-    if isinstance(value, bool | int | float | str | type(None) | np.generic):
-        return repr(value)
-    if isinstance(value, np.ndarray):  # a constant to the compiler
-        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
-    if hasattr(value, "identity"):
-        return str(value.identity)
-    raise TypeError(
-        f"the kernel {function.__qualname__} uses {name!r}, a {type(value).__name__}; a kernel may use numpy, math, "
-        "numbers, strings, tuples of these, and other kernels, each imported by its own name. Pass anything else "
-        "through a field of the record."
-    )
 
 
 def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
@@ -102,80 +54,73 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
         defaults, closure = source.__defaults__, source.__closure__
         function = FunctionType(source.__code__, source.__globals__, source.__name__, defaults, closure)
         function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
-    dispatcher = njit(error_model="numpy", nogil=True, **options)(function)
+    dispatcher = internals.under_ieee(function, **options)
     if cache:
-        dispatcher._cache = disk_cache.Kept(function.__name__, name)
-    dispatcher.identity = name
-    dispatcher._set_uuid(name)
-    dispatcher.again = lambda other: _compiled(other, cache, **options)
+        file = lambda sig: disk_cache.name_of(function.__name__, name, sig)  # noqa: E731
+        internals.store_by(
+            dispatcher, lambda sig: disk_cache.read(file(sig)), lambda sig, data: disk_cache.write(file(sig), data)
+        )
+    internals.name_for_pickle(dispatcher, name)
     return dispatcher
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
+    """Note how a function like this one is made of another source; see `driftfit.engine.substitute`."""
+    dispatcher.again = again
+    return dispatcher
+
+
+def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     """Compile a step, or a function that steps call.
 
-    Always inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at
-    n = 4). Division follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
+    Inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at n = 4).
+    With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
+    instead of raising, the GIL is released, and there is no fast-math.
     """
-    return only_linked(_compiled(function, forceinline=True, no_cfunc_wrapper=True), StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
+    return _again(made, lambda other: kernel(other, inline))
 
 
 def shared(function: Callable[..., Any]) -> Any:
-    """Compile a function of one lane's arrays once for all sizes, for what runs seldom.
+    """Compile a function of arrays once for all sizes, to be called.
 
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
-    is compiled once and found on disk after that.
+    or arrays at addresses, is compiled once and found on disk after that. Unless it is told otherwise, Numba inlines
+    what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
+    times as long.
     """
-    return _compiled(function, cache=True, no_cfunc_wrapper=True)
+    return _again(internals.as_part(_compiled(function, cache=True, forceinline=False, **internals.LINKED)), shared)
 
 
-_PLAIN = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False}
+def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
+    """Compile a function of arrays to be inlined into compiled routines, which know constants and strides.
 
-
-def core(function: Callable[..., Any]) -> Any:
-    """Compile a part of a machine that works on plain arrays with run-time bounds, once for all sizes.
-
-    As `shared`, without what compiled code needs to be called from Python or to own memory: reference counts of slices
-    and wrappers took nine tenths of the time of compiling a large machine. It may not allocate. It is called, and not
-    inlined also where what calls it is: a large machine would become one function, on which LLVM spends seven times as
-    long.
+    Passing a few dozen arrays may cost more than the work on them. With ``sizes`` the first argument is a number of
+    parameters, and the work is compiled once for each of these sizes, which the compiler then knows, so that it unrolls
+    loops and keeps what they work on in registers; and once for all others.
     """
-    made = only_linked(_compiled(function, cache=True, **_PLAIN, forceinline=False))
-    made.again = core
-    return made
+    if function is None:
+        return lambda source: _for_sizes(part(source), sizes)
+    return _again(internals.as_part(_compiled(function, cache=True, forceinline=True, **internals.LINKED)), part)
 
 
-def part(function: Callable[..., Any]) -> Any:
-    """Compile a part of a machine, as `core`, to be inlined into what calls it, which knows constants and strides.
-
-    Passing a few dozen arrays may cost more than the work on them.
-    """
-    made = only_linked(_compiled(function, cache=True, forceinline=True, **_PLAIN))
-    made.again = part
-    return made
-
-
-def sized(function: Callable[..., Any]) -> Any:
-    """Compile a part of a machine whose first argument is a number of parameters: once for each of two, three and four,
-    which the compiler then knows, so that it unrolls loops and keeps what they work on in registers; and once for all.
-    """
-    work = part(function)
+def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
+    """``work`` with a constant for its first argument where that is one of the sizes."""
+    if not sizes:
+        return work
+    size, others = sizes[0], _for_sizes(work, sizes[1:])
 
     @part
     def chosen(n: int, *rest: Any) -> Any:
-        if n == 2:
-            return work(2, *rest)
-        if n == 3:
-            return work(3, *rest)
-        if n == 4:
-            return work(4, *rest)
-        return work(n, *rest)
+        if n == size:
+            return work(size, *rest)
+        return others(n, *rest)
 
     return chosen
 
 
-class Outside(types.ExternalFunction):
-    """A machine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
+class Machine(types.ExternalFunction):
+    """A routine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
     What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
     compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
@@ -184,9 +129,14 @@ class Outside(types.ExternalFunction):
     identity: str
 
     @property
+    def dispatcher(self) -> Any:
+        """The compiled function behind it."""
+        return _DISPATCHERS[self.symbol]
+
+    @property
     def py_func(self) -> Any:
         """The Python function that it was made of."""
-        return _OUTSIDE[self.symbol].py_func
+        return self.dispatcher.py_func
 
     def __reduce__(self) -> Any:
         """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
@@ -195,99 +145,36 @@ class Outside(types.ExternalFunction):
     def load(self) -> None:
         """Compile the machine, or find it on disk, and let drivers find it."""
         if self.symbol not in _LOADED:
-            dispatcher = _OUTSIDE[self.symbol]
-            with compiling():
-                dispatcher.compile(self.sig.args)
-            owner, described = attrgetter("library", "fndesc")(next(iter(dispatcher.overloads.values())))
-            _LOADED[self.symbol] = owner  # of the code, which would go with it
-            add_symbol(self.symbol, owner.get_pointer_to_function(described.llvm_cfunc_wrapper_name))
+            with internals.compiler_lock:  # of two threads that need it one compiles
+                if self.symbol not in _LOADED:
+                    with compiling():
+                        _LOADED[self.symbol] = internals.publish(self.dispatcher, self.sig.args, self.symbol)
+                    internals.forget(KEPT)
 
 
-register_default(Outside)(models.OpaqueModel)
-_MACHINES: dict[str, Outside] = {}
-_OUTSIDE: dict[str, Any] = {}
+register_model(Machine)(models.OpaqueModel)
+_MACHINES: dict[str, Machine] = {}
+_DISPATCHERS: dict[str, Any] = {}
 _LOADED: dict[str, Any] = {}
+"""The owner of the code, which would go with it."""
 
 
-def _machine(symbol: str) -> Outside:
+def _machine(symbol: str) -> Machine:
     return _MACHINES[symbol]
 
 
-def outside(function: Callable[..., Any]) -> Outside:
+def machine(function: Callable[..., Any]) -> Machine:
     """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
     dispatcher = _compiled(function, cache=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
-    machine = Outside(symbol, types.void(*kinds))
-    machine.identity = dispatcher.identity
-    _OUTSIDE[symbol] = dispatcher
-    _MACHINES[symbol] = machine
-    return machine
-
-
-def exchanged(functions: Sequence[Any], others: Mapping[Any, Any]) -> tuple[Any, ...]:
-    """Compiled functions, or machines, made anew with other functions in the place of some that they call.
-
-    ``others`` says what takes whose place, also where it is called through others. So a second form of a machine is the
-    first with some parts exchanged, and is compiled only where it is asked for.
-
-    Raises
-    ------
-    ValueError
-        If something whose place is taken is called nowhere.
-    """
-    found = {id(old): (old, new, new is old) for old, new in others.items()}
-    made = tuple(_again(function, found) for function in functions)
-    unused = [old.__name__ for old, new, asked in (found[id(old)] for old in others) if not asked]
-    if unused:
-        raise ValueError(f"exchanged: nothing calls {', '.join(unused)}.")
+    made = Machine(symbol, types.void(*kinds))
+    made.identity = dispatcher.identity
+    _DISPATCHERS[symbol] = dispatcher
+    _MACHINES[symbol] = made
     return made
-
-
-def _again(value: Any, found: dict[int, tuple[Any, Any, bool]]) -> Any:
-    if id(value) not in found:
-        found[id(value)] = value, _rebuilt(value, found), True
-    old, new, _ = found[id(value)]
-    found[id(value)] = old, new, True
-    return new
-
-
-def _rebuilt(value: Any, found: dict[int, tuple[Any, Any, bool]]) -> Any:
-    """The function itself where nothing in it is exchanged."""
-    inner = _OUTSIDE[value.symbol] if isinstance(value, Outside) else value
-    if not hasattr(inner, "again"):
-        return value
-    source = inner.py_func
-    used = {name: source.__globals__[name] for name in _globals(source.__code__) & source.__globals__.keys()}
-    new = {name: _again(one, found) for name, one in used.items()}
-    held = [cell.cell_contents for cell in source.__closure__ or ()]
-    hold = [_again(one, found) for one in held]
-    if all(new[name] is one for name, one in used.items()) and all(a is b for a, b in zip(held, hold, strict=True)):
-        return value
-    names, closure = source.__globals__ | new, tuple(CellType(one) for one in hold) or None
-    made = FunctionType(source.__code__, names, source.__name__, source.__defaults__, closure)
-    return outside(made) if isinstance(value, Outside) else inner.again(made)
-
-
-@intrinsic
-def _pointer(context: Any, address: Any) -> Any:
-    """An address as a pointer."""
-
-    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.intp), build
-
-
-_pointer.identity = "pointer"
-_pointer._set_uuid("pointer")  # Numba would give it a new one in every process, and never find its callers on disk
-
-
-def routine(function: Callable[..., Any]) -> Any:
-    """Compile a part of a step that the lane loop is better without: it may be called instead of inlined."""
-    return only_linked(_compiled(function, no_cfunc_wrapper=True), StepDispatcher)
 
 
 class Driver:
@@ -320,7 +207,7 @@ class Driver:
         """
         found = self._entries.get(arguments)
         if found is None:
-            with _compiler:  # of two threads that need it one compiles
+            with internals.compiler_lock:  # of two threads that need it one compiles
                 found = self._entries.get(arguments) or self._made(arguments)
                 self._entries[arguments] = found
         _entries.used(found, self)
@@ -335,10 +222,11 @@ class Driver:
             twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
             twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
             with compiling():
-                code = compiled(twin, arguments)
+                code = internals.emit(twin, arguments)
             if code.lasting:
                 disk_cache.write(name, tuple(code))
-        return loaded(Code(*code))
+            internals.forget(KEPT)
+        return internals.load(internals.Code(*code))
 
     def let_go(self, found: Any) -> None:
         """Forget an entry point; who holds it may go on using it."""
@@ -364,6 +252,12 @@ def _type(value: Any) -> types.Type:
 MOST_ENTRIES = 256
 """Entry points of drivers that a process keeps, of some 0.3 MB each."""
 
+KEPT = 300
+"""Parts whose code is kept for drivers to come, of some 0.2 MB each; a driver takes in some twenty to sixty, and the
+same for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
+turn.
+"""
+
 
 class _Entries:
     """Entry points of all drivers, those used last at the end."""
@@ -385,25 +279,13 @@ class _Entries:
 
 
 _entries = _Entries()
-_compiler = RLock()
 
-
-@kernel
-def floats(address: int, rows: int, columns: int) -> Any:
-    """The array (rows, columns) of floats that begins at an address."""
-    return carray(_pointer(address), (rows, columns), np.float64)
-
-
-@kernel
-def cubes(address: int, rows: int, columns: int, lanes: int) -> Any:
-    """The array (rows, columns, lanes) of floats that begins at an address."""
-    return carray(_pointer(address), (rows, columns, lanes), np.float64)
-
-
-@kernel
-def wholes(address: int, rows: int, columns: int) -> Any:
-    """The array (rows, columns) of whole numbers that begins at an address."""
-    return carray(_pointer(address), (rows, columns), np.int64)
+floats = internals.matrix_at("floats", types.float64)
+"""floats(address, rows, columns): the array (rows, columns) of floats that begins at an address."""
+cubes = internals.cube_at("cubes", types.float64)
+"""cubes(address, rows, columns, lanes): the array (rows, columns, lanes) of floats that begins at an address."""
+wholes = internals.matrix_at("wholes", types.int64)
+"""wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
 
 
 @kernel

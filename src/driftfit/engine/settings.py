@@ -20,12 +20,12 @@ class DataWarning(UserWarning):
     """Something in the data that makes a result less than it seems; what was found, and the way out."""
 
 
-def warn(message: str) -> None:
+def warn(message: str, kind: type[Warning] = DataWarning) -> None:
     """Warn of data, at the line of the user's program that called the library."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "driftfit":
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, DataWarning, stacklevel=level)
+    warnings.warn(message, kind, stacklevel=level)
 
 
 class Settings:
@@ -76,7 +76,7 @@ def numbers(owner: str, name: str, value: Any, *, ndim: int = 1, low: float = -m
     except (TypeError, ValueError):
         raise ValueError(f"{owner}: {name} must be numeric; got {value!r}.") from None
     if array.ndim > ndim:
-        raise ValueError(f"{owner}: {name} has {array.ndim} axes, shape {array.shape}; at most {ndim} are possible.")
+        raise ValueError(f"{owner}: {name} has {array.ndim} axes, shape {array.shape}; at most {ndim} are allowed.")
     if array.ndim < 2 or low == -math.inf:
         bad = ~np.isfinite(array) | (array <= low if strict else array < low)
         rule = "finite" if low == -math.inf else f"finite and {'above' if strict else 'at least'} {low:g}"
@@ -167,7 +167,7 @@ def input_names(owner: str, name: str, given: Sequence[str]) -> tuple[str, ...]:
     """Names of inputs, each once: parameters and columns of tables are called after them."""
     names = tuple(str(one) for one in given)
     if len(set(names)) < len(names):
-        raise ValueError(f"{owner}: {name} must be names, each once; got {names!r}.")
+        raise ValueError(f"{owner}: {name} must be different names; got {names!r}.")
     return names
 
 
@@ -178,5 +178,5 @@ def output_names(owner: str, ny: Any) -> tuple[str, ...]:
         return ("y",) if count == 1 else tuple(f"y{i + 1}" for i in range(count))
     names = (ny,) if isinstance(ny, str) else tuple(str(name) for name in ny)
     if not names or len(set(names)) < len(names):
-        raise ValueError(f"{owner}: ny must be a number of outputs or their names, each once; got {ny!r}.")
+        raise ValueError(f"{owner}: ny must be the number of outputs or their names, all different; got {ny!r}.")
     return names

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite import ir
 from numba import types
-from numba.core.datamodel import models, register_default
-from numba.extending import intrinsic
+from numba.extending import models, register_model
 
 from driftfit.engine.kernel import ARTANH, EXP, LOG2, LOG2_HIGH, LOG2_LOW, ROUND, kernel
+from driftfit.engine.numba_internals import ir, named_intrinsic
 
 WIDTH = 8
 _I64 = ir.IntType(64)
@@ -41,13 +40,13 @@ class Four(types.Type):
         super().__init__(name="driftfit.Four")
 
 
-@register_default(Eight)
+@register_model(Eight)
 class _Vector(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _EIGHT)
 
 
-@register_default(Four)
+@register_model(Four)
 class _Shorter(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _FOUR)
@@ -57,11 +56,8 @@ eight, four = Eight(), Four()
 
 
 def _named(name: str, build: Any) -> Any:
-    """An operation with a name of its own: Numba would number it anew in every process, and find no caller on disk."""
-    operation = intrinsic(build)
-    operation.identity = f"eights.{name}"
-    operation._set_uuid(operation.identity)
-    return operation
+    """An operation that Numba compiles under the same name in every process."""
+    return named_intrinsic(f"simd.{name}", build)
 
 
 def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:

@@ -15,12 +15,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.core.datamodel import models, register_default
-from numba.core.typing.templates import AttributeTemplate
-from numba.extending import infer_getattr, intrinsic, lower_getattr_generic
+from numba.extending import infer_getattr, lower_getattr_generic, models, register_model
+
+from driftfit.engine.numba_internals import AttributeTemplate, array_at, ir, named_intrinsic
 
 MATRIX, VECTOR, COUNTS, NUMBER = "matrix", "vector", "counts", "number"
 """Kinds of fields: floats (rows, columns), floats (columns,), whole numbers (columns,), one whole number."""
@@ -39,7 +37,7 @@ class TableType(types.Type):
         super().__init__(name=f"driftfit.Table({name}, {self.rows})")
 
 
-@register_default(TableType)
+@register_model(TableType)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _I64.as_pointer())
@@ -65,14 +63,7 @@ def _read(context: Any, builder: Any, table: TableType, value: Any, name: str) -
     if kind == NUMBER:
         return entry(row, 0)
     shape = [entry(row, 1), entry(row, 2)][-_KINDS[kind].ndim :]
-    size = ir.Constant(_I64, 8)
-    strides = [builder.mul(shape[1], size), size] if len(shape) == 2 else [size]
-    made = context.make_array(_KINDS[kind])(context, builder)
-    element = context.get_data_type(_KINDS[kind].dtype).as_pointer()
-    made.data = builder.inttoptr(builder.add(entry(base, 0), entry(row, 0)), element)
-    made.shape, made.strides = cgutils.pack_array(builder, shape), cgutils.pack_array(builder, strides)
-    made.nitems, made.itemsize = builder.mul(shape[0], shape[-1]) if len(shape) == 2 else shape[0], size
-    return made._getvalue()
+    return array_at(context, builder, _KINDS[kind], builder.add(entry(base, 0), entry(row, 0)), shape)
 
 
 class Table:
@@ -94,6 +85,4 @@ class Table:
 
             return kind(types.intp), build
 
-        self.at = intrinsic(typed)
-        self.at.identity = kind.name
-        self.at._set_uuid(kind.name)  # Numba would number it anew in every process, and find no caller on disk
+        self.at = named_intrinsic(kind.name, typed)

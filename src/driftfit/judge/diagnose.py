@@ -32,15 +32,16 @@ from rich.text import Text
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.excitation import INDEX, Excitation, excitation
+from driftfit.judge.plots import Health, draw_diagnosis
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.scale import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 
 if TYPE_CHECKING:
@@ -118,9 +119,8 @@ class Diagnosis(Printed):
 
     def plot(self) -> Figure:
         """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""
-        from driftfit.judge.plots import draw_diagnosis
-
-        return draw_diagnosis(self)
+        parts = (self.run, self.z, self.white, self.excited, self.constant, self.rows)
+        return draw_diagnosis(Health(*parts, lambda name: self[name].ok))
 
 
 def diagnose(run: Track) -> Diagnosis:
@@ -153,8 +153,8 @@ def _whiteness(white: Whiteness) -> Check:
         else "less drift, or one more lag (noise on the output does this too)"
     )
     advice = (
-        f"The innovations are correlated ({first:.2f} at the first lag, {sign}): something that can be predicted is "
-        f"left. Try {hint}."
+        f"The innovations are correlated ({first:.2f} at the first lag, {sign}): the model leaves something "
+        f"predictable. Try {hint}."
     )
     return Check("whiteness (p)", white.p, 0.01, np.inf, advice)
 
@@ -169,8 +169,8 @@ def _inputs(run: Track, z: Array) -> list[Check]:
     given = run.labels.u
     name = given[worst] if worst < len(given) else f"input {worst + 1}"
     advice = (
-        f"The innovations still follow {name}: its effect is not all in the model. "
-        "Try more lags of it, another delay, or a curve."
+        f"The innovations are correlated with {name}: the model does not contain all of its effect. "
+        "Try more lags of it, another delay, or a nonlinearity."
     )
     return [Check("inputs (p)", min(1.0, float(p[worst]) * len(p)), 0.01, np.inf, advice)]
 
@@ -186,16 +186,18 @@ def _level(z: Array, white: Whiteness, robust: bool) -> tuple[Check, Check]:
     slack = 3.0 * np.sqrt(2.0 / count) if count else 0.0
     sign = white.r[0] if len(white.r) and white.p < 0.05 else 0.0
     if level > 1.0:
-        what = f"larger than it says; raise {'q, since they are correlated too' if sign > 0.0 else 'r'}"
+        what = f"larger than predicted; raise {'q, since they are correlated too' if sign > 0.0 else 'r'}"
     else:
-        what = f"smaller than it says; lower {'q, since one overshoots the last' if sign < 0.0 else 'r'}"
-    advice = f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() finds the numbers."
+        what = f"smaller than predicted; lower {'q, since successive errors alternate' if sign < 0.0 else 'r'}"
+    advice = (
+        f"The one-step error is {what}: its squares are {level:.2f} of their variance. tune() estimates the settings."
+    )
     levels = np.array([core(part) for part in np.array_split(z, PARTS)])
     ratio = float(np.nanmax(levels) / np.nanmin(levels)) if np.isfinite(levels).any() else float("nan")
     wide = 3.0 * np.exp(2.0 * slack * np.sqrt(PARTS) / 2.0) if count else 3.0
     changing = (
-        f"The noise is not steady: its variance changes {ratio:.1f}-fold over the record. Bands are too narrow where "
-        f"it is large; {'look there' if robust else 'give weights=, or use AdaptiveKalman, which follows the noise'}."
+        f"The noise is not constant: its variance changes {ratio:.1f}-fold over the record. Bands are too narrow where "
+        f"it is large; {'look there' if robust else 'give weights=, or use AdaptiveKalman, which tracks the noise'}."
     )
     return (
         Check("noise level", level, min(0.75, 1.0 - slack), max(1.33, 1.0 + slack), advice),
@@ -211,13 +213,17 @@ def _distribution(z: Array, robust: bool) -> tuple[Check, Check]:
     limit = max(0.002, 2.5 / len(z))
     outliers = (
         f"{100.0 * share:.2g} % of the innovations are beyond {BEYOND:g} standard deviations. "
-        + ("They are discounted, but look at them." if robust else "Outliers pull the parameters: use AdaptiveKalman, ")
+        + (
+            "They are discounted, but inspect them."
+            if robust
+            else "Outliers distort the parameters: use AdaptiveKalman, "
+        )
         + ("" if robust else "which discounts them, or give weights=0 to known bad samples.")
     )
     held = np.clip(z - np.median(z), -BEYOND, BEYOND)
     skew = float(np.mean((held - held.mean()) ** 3) / np.mean((held - held.mean()) ** 2) ** 1.5) if held.any() else 0.0
     slack = max(0.5, 3.0 * np.sqrt(6.0 / len(z)))
-    skewed = f"The innovations are skewed ({skew:.2f}): try the logarithm of a positive output, or a missing curve."
+    skewed = f"The innovations are skewed ({skew:.2f}): try the logarithm of a positive output, or a nonlinearity."
     return (Check("outliers", share, 0.0, limit, outliers), Check("symmetry", skew, -slack, slack, skewed))
 
 
@@ -228,8 +234,9 @@ def _excitation(run: Track, excited: Excitation) -> Check:
     share = np.abs(excited.direction)
     involved = [name for name, part in zip(run.model.names, share, strict=True) if part > 0.3 * share.max()]
     advice = (
-        f"In {100.0 * poor:.0f} % of the windows the inputs do not tell {', '.join(involved)} apart: there these come "
-        "from what was known before. Excite the system, use fewer lags, or centre the signals if there is an intercept."
+        f"In {100.0 * poor:.0f} % of the windows the inputs do not distinguish {', '.join(involved)}: there they are "
+        "determined by earlier samples. Excite the system, use fewer lags, or centre the signals if there is an "
+        "intercept."
     )
     return Check("excitation", float(excited.condition.max()), 0.0, INDEX, advice)
 
@@ -245,7 +252,7 @@ def _constancy(run: Track, test: Constancy) -> Check:
     least, most = root_mean_square(steady), root_mean_square(own)
     advice = (
         f"Constants are not rejected, and predict better ({least:.4g} against {most:.4g}): the drift is set too high. "
-        "Lower q or raise the memory; tune() finds it."
+        "Lower q or increase the memory; tune() estimates it."
     )
     dear = paired("constant LS", own, MATERIAL * steady).p < SURE
     return Check("constancy (p)", test.p_joint, -np.inf, NOT_REJECTED if dear else np.inf, advice)

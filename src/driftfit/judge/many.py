@@ -14,7 +14,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -25,14 +27,14 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.verdict import Verdict, p_text, verdict
-from driftfit.show.summary import Printed, key_text, table_of
+from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
-BAR = 100
-"""Runs from which on there is a progress bar."""
+PATIENCE = 2.0
+"""Seconds after which there is a progress bar."""
 
 Said = TypeVar("Said")
 
@@ -66,10 +68,12 @@ class Judgement:
 
     @property
     def relative(self) -> float:
-        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named."""
+        """Largest change of a parameter that moves, as a share of its value before; 0 where none is named.
+
+        A value before that is smaller than the standard error of the change counts as that error.
+        """
         moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return float(max((np.abs(np.divide(m.after - m.before, m.before)) for m in moved), default=0.0))
+        return max((abs(m.after - m.before) / max(abs(m.before), m.std) for m in moved), default=0.0)
 
     @property
     def change(self) -> str:
@@ -103,7 +107,7 @@ class ManyVerdicts(Printed):
         for row in self.rows:
             if row.key == key:
                 return row
-        raise KeyError(f"there is no verdict of {key!r}.")
+        raise KeyError(f"there is no verdict for {key!r}.")
 
     def ranked(self, by: str = "clearest") -> ManyVerdicts:
         """The same rows in another order: the "clearest" first, or the largest relative "change" first."""
@@ -125,18 +129,18 @@ class ManyVerdicts(Printed):
         tested, paying = (int(np.isfinite([getattr(row, q) for row in self.rows]).sum()) for q in ("q", "q_pays"))
         drifting, pays = len(self.drifting), sum(row.pays for row in self.rows)
         found = (
-            f"In {drifting} of {tested} the parameters move; of those at most {100.0 * self.level:g} % stand still, on "
+            f"Parameters move in {drifting} of {tested}; at most {100.0 * self.level:g} % of those are constant, on "
             "average (false discovery rate)."
             if drifting
-            else f"In none of {tested} is a drift found. One that is small beside the noise cannot be ruled out."
+            else f"No drift is found in any of {tested}. A drift much smaller than the noise cannot be ruled out."
             if tested
             else ""
         )
         names = Counter(name for row in self.rows for name in row.moving).most_common(3)
-        which = f"Most often it is {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
-        gain = f"Following them pays in {pays} of {paying}." if paying else ""
+        which = f"The most frequent: {', '.join(f'{name} ({count})' for name, count in names)}." if names else ""
+        gain = f"Tracking pays in {pays} of {paying}." if paying else ""
         rest = len(self.rows) - tested
-        short = f"{rest} cannot be tested: too few samples, or regressors that do not span." if rest else ""
+        short = f"{rest} cannot be tested: they have too few samples, or regressors that do not span." if rest else ""
         return tuple(filter(None, (found, which, gain, short)))
 
     @property
@@ -256,10 +260,14 @@ def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: 
     from driftfit.run.fleet import cores
 
     keys, tracks = list(runs), list(runs.values())
-    first = [judge(track) for track in tracks[:1]]
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=len(tracks) < BAR) as progress,
-        ThreadPoolExecutor(cores()) as pool,
-    ):
-        rest = progress.track(pool.map(judge, tracks[1:]), total=len(tracks) - 1, description=what)
-        return dict(zip(keys, [*first, *rest], strict=True))
+    said = [judge(track) for track in tracks[:1]]
+    progress = Progress(console=Console(stderr=True), transient=True)
+    task, begun, shown = progress.add_task(what, total=len(tracks), completed=len(said)), monotonic(), False
+    with ThreadPoolExecutor(cores()) as pool, ExitStack() as stack:
+        for one in pool.map(judge, tracks[1:]):
+            said.append(one)
+            progress.advance(task)
+            if not shown and monotonic() - begun > PATIENCE:
+                stack.enter_context(progress)
+                shown = True
+    return dict(zip(keys, said, strict=True))

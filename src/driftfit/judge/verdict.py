@@ -30,15 +30,15 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import whole
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.attribution import Attribution, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, facts, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "constant ARX")
 CORRELATED = 1e-3
@@ -128,48 +128,47 @@ class Verdict(Printed):
     def _drift(self) -> str:
         if self.drifts is None:
             least = least_rows(len(self.parameters))
-            short = f"{self.samples} samples can be used, and {least} are the least that tell."
-            alike = "its regressors do not tell the parameters apart, or explain it without error."
-            return f"The record cannot say whether parameters move: {short if self.samples < least else alike}"
+            short = f"{self.samples} samples can be used, and at least {least} are needed."
+            alike = "its regressors do not distinguish the parameters, or explain the output without error."
+            return f"The record cannot show whether parameters move: {short if self.samples < least else alike}"
         if self.drifts:
             return f"The parameters move: constants are rejected with {p_equals(self.p)} (level {self.level:g})."
         if self.pays:
             reason = (
-                "once correlated noise is allowed for. A model with too few lags has that, and a parameter that "
-                "wanders as fast looks the same."
+                "once correlated noise is allowed for. A model with too few lags causes such noise, and a parameter "
+                "that varies as fast looks the same."
                 if self.lags
-                else "by a test of the whole record, which a small or a fast drift escapes."
+                else "by a test on the whole record, which misses small and fast drifts."
             )
             return (
-                "Something can be followed, but it is not shown that parameters move: constants are not rejected "
+                "Tracking reduces the error, but there is no evidence that parameters move: constants are not rejected "
                 f"({p_equals(self.p)}, level {self.level:g}) {reason}"
             )
         return (
             f"No drift found: constant parameters are not rejected, {p_equals(self.p)} (level {self.level:g}). "
-            "A drift that is small beside the noise cannot be ruled out."
+            "A drift that is small compared with the noise cannot be ruled out."
         )
 
     def _which(self) -> str:
         if not self.drifts:
             return ""
         if not self.moving:
-            return "Which of them moves cannot be told: their regressors are too alike, or the move is spread over all."
-        return f"It is {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
+            return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
+        return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
         steady = self.rivals[1]
         if self.pays is None:
             return (
-                f"Predictions cannot be compared: {self.scored} samples are left after the first {self.burn}, and "
-                f"{COMPARED} are the least; burn= leaves out fewer."
+                f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
+                f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
         change = 100.0 * (self.rms / steady.rms - 1.0)
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            follow = "Following the parameters pays" if self.drifts else "Following it pays"
-            return f"{follow}: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            return f"Tracking them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
         return (
-            f"Following them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"Tracking them does not clearly pay here: the one-step error is {size} than that of constants "
             f"({p_equals(steady.p)})."
         )
 
@@ -178,9 +177,9 @@ class Verdict(Printed):
         told = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
             told += (
-                "The residuals are correlated, also where parameters are constant: a model with too few lags does "
-                f"that, and so does a fast drift. The test allows for {self.lags} lag{'' if self.lags == 1 else 's'} "
-                "of it; try one more lag in the model."
+                "The residuals are correlated, even within segments of constant parameters. A model with too few "
+                f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
+                f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model."
             )
         return told.strip()
 

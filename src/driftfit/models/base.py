@@ -66,6 +66,10 @@ class Model(Settings, ABC):
         """Names of the parameters of one of several outputs."""
         return tuple(f"{name}[{output}]" for name in self.names)
 
+    def alone(self, output: str) -> Model | None:
+        """The model of one of several outputs, where its regression needs none of the others; None where it does."""
+        return None
+
     @abstractmethod
     def memory(self) -> Mapping[str, Any]:
         """Fields of the record that hold the model's memory, with their values before the first sample."""
@@ -116,8 +120,8 @@ class Model(Settings, ABC):
         ValueError for a model that does not say how.
         """
         raise ValueError(
-            f"{type(self).__name__} does not say how it runs forward, so nothing can be simulated; a model of your own "
-            "does with the methods `reach` and `play` (driftfit.models.base)."
+            f"{type(self).__name__} cannot be run forward, so nothing can be simulated; give your own model "
+            "the methods `reach` and `play` (driftfit.models.base)."
         )
 
     def output_slope(self, theta: Array, y: Array) -> Array:

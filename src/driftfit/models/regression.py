@@ -55,7 +55,7 @@ class Regression(Model):
         if not isinstance(self.ny, int):
             self._set("ny", output_names("Regression", self.ny))
         if self.shared and len(self.outputs) == 1:
-            raise ValueError("Regression: shared=True speaks of several outputs; say how many, as in ny=2.")
+            raise ValueError("Regression: shared=True needs several outputs; give their number, as in ny=2.")
         if self.regressors is not None and self.n == 0:
             raise ValueError("Regression: there is nothing to estimate with 0 regressors and no intercept.")
 
@@ -73,7 +73,7 @@ class Regression(Model):
     def m(self) -> int:
         if self.regressors is None:
             raise ValueError(
-                "Regression: say how many regressors there are, as in Regression(3) or Regression(['income'])."
+                "Regression: give the number of regressors, as in Regression(3) or Regression(['income'])."
             )
         return self.regressors if isinstance(self.regressors, int) else len(self.regressors)
 

@@ -31,11 +31,12 @@ dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; } li { margi
   .wide { overflow: visible; } th, td { white-space: normal; } }
 """
 
-READING = """<p>The output is described as a sum of regressors times parameters. The parameters are followed sample by
-sample: at every time the estimate uses the past only, and the band says how well it was known then.</p>
-<ul><li><b>Do the parameters move?</b> A test of constant parameters that outliers, a changing noise level and changing
-inputs do not fool. A small p means that constants would hardly give such a record.</li>
-<li><b>Does following them pay?</b> The error of predicting the next sample, beside three simple ways: repeating the
-last value (persistence), one set of constants fitted to all of the past (constant LS), and a small constant dynamic
-model (constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
-<li><b>Diagnostics</b> say whether the bands can be trusted. What is out of bounds comes with what to try.</li></ul>"""
+READING = """<p>The output is described as a sum of regressors times parameters. The parameters are estimated sample
+by sample: at every time the estimate uses the past only, and the band shows how accurate it was then.</p>
+<ul><li><b>Do the parameters move?</b> This is a test of constant parameters that is valid with outliers, changing noise
+and changing inputs. A small p means that constant parameters would hardly produce such a record.</li>
+<li><b>Does tracking them pay?</b> The table compares the error of predicting the next sample with three simple
+methods: repeating the last value (persistence), one set of constants fitted to all of the past (constant LS), and a
+small constant dynamic model (constant ARX). A p below 0.05 means that this run is better by more than chance.</li>
+<li><b>Diagnostics</b> show whether the bands can be trusted. Each that is out of bounds comes with a suggestion.</li>
+</ul>"""

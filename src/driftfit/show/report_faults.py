@@ -10,10 +10,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.onsets import onsets
-from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import picture, table
-from driftfit.show.summary import key_text
+from driftfit.show.parts.text import key_text
 
 if TYPE_CHECKING:
     from driftfit.judge.alarms.detect import Alarms
@@ -34,7 +33,7 @@ def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
     wrong = None if labels is None else _checked(run, labels)
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
-        parts += [_said(alarms, wrong), _alarms(alarms), picture(plot_alarms(alarms, wrong), run, PICTURE)]
+        parts += [_said(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
     return "".join(parts)
 
 
@@ -60,10 +59,10 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
     shown = [row for row in watched.values() if len(row.alarms.onsets)][:PICTURED]
     pictures = (
         f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
-        f"{picture(plot_alarms(row.alarms, _given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
         for row in shown
     )
-    return table(f"Stretches labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
+    return table(f"Intervals labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(
         pictures
     )
 
@@ -98,11 +97,11 @@ def _labels(run: Track, alarms: Alarms | None, wrong: Array) -> str:
 def _said(alarms: Alarms, wrong: Array | None) -> str:
     text = (
         f"Alarm: {alarms.kind}, one false alarm in {alarms.every:g} samples. {len(alarms.onsets)} alarms; "
-        f"{p_text(alarms.p)} is the chance that a record without a fault gets as extreme as this one."
+        f"A record without a fault is as extreme as this one with probability {p_text(alarms.p)}."
     )
     if wrong is not None:
         score = alarms.score(wrong)
-        text += f" {score.found} of {score.events} labelled stretches found, {score.false} false alarms."
+        text += f" {score.found} of {score.events} labelled intervals found, {score.false} false alarms."
     return f"<p>{escape(text)}</p>"
 
 

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftfit.engine.version import __version__
 from driftfit.judge.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
+from driftfit.show.parts.text import key_text
 from driftfit.show.report import PARAMETERS, parameter_figure
 from driftfit.show.report_faults import many_faults
-from driftfit.show.summary import key_text
 
 if TYPE_CHECKING:
     from driftfit.engine.kernel import Array
@@ -33,8 +34,8 @@ NAMED = 4
 """Fewer runs, or models, than these are named and not counted."""
 LEVEL = 0.05
 
-MANY = """<p>Each row was judged by itself. Where many are tested some look as if they moved by chance: q is the share
-of false ones among all with a q this small or smaller (false discovery rate).</p>"""
+MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
+among all series with a q this small or smaller (false discovery rate).</p>"""
 
 
 def page_of_many(
@@ -46,7 +47,7 @@ def page_of_many(
 ) -> str:
     """The page as text; ``failed`` says why some have no result; ``labels`` of a key are true where it was wrong."""
     if not runs:
-        raise ValueError("report: there is no run with a result to report on.")
+        raise ValueError("report: no series has a result to report.")
     said, health = verdicts(runs, LEVEL, None), diagnoses(runs)
     heading = title or (", ".join(map(key_text, runs)) if len(runs) < NAMED else f"{len(runs)} series")
     samples, used = sum(map(len, runs.values())), sum(int(run.ok.sum()) for run in runs.values())
@@ -61,11 +62,11 @@ def page_of_many(
             *([section("Faults and alarms", many_faults(runs, alarms, labels or {}))] if alarms or labels else []),
             section("All series", _rows(said, health)),
             section(
-                "Those that move most clearly" if said.drifting else "The clearest",
+                "The series that move most clearly" if said.drifting else "The clearest",
                 "".join(_pictured(row, runs[row.key]) for row in shown),
             ),
             section("Diagnostics", _health(health)),
-            section("Settings, and what was left out", _settings(runs, failed)),
+            section("Settings and omitted data", _settings(runs, failed)),
             section("How to read this", MANY + READING),
         ],
     )
@@ -75,7 +76,7 @@ def _verdict(said: ManyVerdicts, health: ManyDiagnoses) -> str:
     out = sum(not one.ok for one in health.of.values())
     state = f"{out} of {len(health)} have diagnostics out of bounds." if out else "All diagnostics are within limits."
     if not any(np.isfinite(check.value) for one in health.of.values() for check in one.checks):
-        state = "No diagnostic can be told."
+        state = "No diagnostic can be computed."
     lines = "".join(f"<p>{escape(sentence)}</p>" for sentence in (*said.sentences, state))
     return f'<div class="verdict">{lines}</div>'
 
@@ -111,8 +112,6 @@ def _health(health: ManyDiagnoses) -> str:
 
 
 def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:
-    from driftfit import __version__
-
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
     pairs = [

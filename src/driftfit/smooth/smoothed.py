@@ -11,16 +11,17 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
+from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Path, Walk, ordered, walk_of
+from driftfit.smooth.parts.walk import Path, Walk, ordered
+from driftfit.smooth.plots import plot_smoothed
+from driftfit.smooth.problem import walk_of
 
 ALONE = 1e-12
 """Below this sqrt(1 - leverage) a sample alone determines a direction, and says nothing when it is left out."""
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.run.result import Track
 
 
 class Smoothed:
@@ -65,6 +66,8 @@ class Smoothed:
     @classmethod
     def of(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Smooth a run."""
+        if run.start is not None:
+            raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         one_of("smooth", "keep", keep, ("std", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
         walk = walk_of(run)
@@ -77,7 +80,7 @@ class Smoothed:
             size = len(run.names) * (2 if len(walk.trend) else 1)
             raise ValueError(
                 f"smooth: the record does not determine {names} (rank {smoothed.rank.max()} of {size}); "
-                'leave them out of the model, or take the answer nearest to theta0 with undetermined="min_norm".'
+                'leave them out of the model, or take the solution nearest to theta0 with undetermined="min_norm".'
             )
         if undetermined == "nan":
             smoothed.theta[unknown] = np.nan
@@ -113,7 +116,7 @@ class Smoothed:
 
     def _of_slopes(self, values: Array) -> Array:
         if not len(self.walk.trend):
-            raise ValueError("slope: theta itself walks at random here; FLS(mu, differences=2) gives it a slope.")
+            raise ValueError("slope: theta is a plain random walk here; use FLS(mu, differences=2).")
         return values
 
     @cached_property
@@ -178,9 +181,7 @@ class Smoothed:
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters with bands, smoothed and filtered; a matplotlib figure."""
-        from driftfit.show.plots import plot_smoothed
-
-        return plot_smoothed(self, level)
+        return plot_smoothed(self.run, self.theta, *self.band(level))
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
@@ -203,8 +204,8 @@ def noise_variance(walk: Walk, path: Path) -> float:
     least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
     if free <= 0 or path.cost <= least:
         warnings.warn(
-            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual to estimate the noise from; "
-            "the path is given without bands.",
+            f"smooth: {walk.used} samples of rank {path.rank.max()} leave no residual from which to estimate the "
+            "noise; the path has no bands.",
             RuntimeWarning,
             stacklevel=4,
         )

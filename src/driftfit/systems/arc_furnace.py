@@ -1,6 +1,6 @@
 """The electric arc furnace: a valve with a dead zone, a hydraulic drive, and an arc whose resistance is measured.
 
-    v      = u - p1 above p1, u - p2 below p2, 0 between          valve
+    v      = u - p1 above p1, u - p2 below p2, 0 between          valve; u beyond +-10 V acts as 10 V
     w_t    = -sum a_i w_{t-i} + sum_j b_j v_{t-j}                 arc length about the working point, cm
     L      = L0 + w
     U_arc  = a_arc + b_arc L                                      arc voltage, V; b_arc falls as the furnace heats
@@ -29,6 +29,8 @@ B = (0.0378, 0.0333, 0.0097)
 THRESHOLDS = (1.0, -1.0)
 SUPPLY, RESISTANCE, REACTANCE, DROP = 320.0, 0.4, 0.7, 30.0
 """Transformer voltage U_p (V), R_d and X_d (mOhm), a_arc (V)."""
+VOLTAGE = 10.0
+"""The valve takes no more, either way: the limits of equation (61)."""
 WORKING_POINT = 20.0
 SHORTEST, LONGEST = 2.0, 45.0
 
@@ -67,9 +69,10 @@ def slope(R: Array, gradient: Array) -> Array:
     return np.asarray(SUPPLY * (square - R * (R + RESISTANCE)) / square**1.5 / gradient)
 
 
-def valve(u: Array, p1: float = THRESHOLDS[0], p2: float = THRESHOLDS[1]) -> Array:
-    """The dead zone."""
-    return np.where(u >= p1, u - p1, np.where(u <= p2, u - p2, 0.0))
+def valve(u: Array, p1: float = THRESHOLDS[0], p2: float = THRESHOLDS[1], limit: float = VOLTAGE) -> Array:
+    """The dead zone, and the limits beyond which the input moves the valve no more, (61)."""
+    held = np.clip(u, -limit, limit)
+    return np.where(held >= p1, held - p1, np.where(held <= p2, held - p2, 0.0))
 
 
 def furnace(seed: int = 0, T: int = 5000, reach: float = 3.0) -> Furnace:

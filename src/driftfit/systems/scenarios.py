@@ -52,24 +52,24 @@ def _walk(rng: np.random.Generator, T: int, std: Any) -> tuple[Array, Array]:
 
 
 def no_drift(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """Nothing moves."""
+    """Nothing changes."""
     return Plan(np.zeros((T, n)), np.full(T, NOISE), q=np.zeros((T, n)))
 
 
 def slow_walk(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """Every parameter walks, 0.01 a sample."""
+    """Every parameter is a random walk with steps of 0.01 per sample."""
     path, q = _walk(rng, T, np.full(n, 0.01))
     return Plan(path, np.full(T, NOISE), q=q)
 
 
 def fast_walk(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """Every parameter walks, 0.06 a sample."""
+    """Every parameter is a random walk with steps of 0.06 per sample."""
     path, q = _walk(rng, T, np.full(n, 0.06))
     return Plan(path, np.full(T, NOISE), q=q)
 
 
 def sinusoid(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """Every parameter swings by 0.5 with a period of 300 samples, each with its own phase."""
+    """Every parameter oscillates by 0.5 with a period of 300 samples and its own phase."""
     phase = rng.uniform(0.0, 2.0 * np.pi, n)
     path = 0.5 * np.sin(2.0 * np.pi * np.arange(T)[:, None] / 300.0 + phase)
     q = np.gradient(path, axis=0) ** 2
@@ -77,7 +77,7 @@ def sinusoid(rng: np.random.Generator, T: int, n: int) -> Plan:
 
 
 def ramp(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """Every parameter stands, moves by up to 1 over the middle third, and stands again."""
+    """Every parameter is constant, changes by up to 1 over the middle third, and is constant again."""
     part = np.clip(3.0 * np.arange(T) / T - 1.0, 0.0, 1.0)
     path = part[:, None] * rng.uniform(-1.0, 1.0, n)
     return Plan(path, np.full(T, NOISE), q=np.gradient(path, axis=0) ** 2)
@@ -91,7 +91,7 @@ def sparse_jumps(rng: np.random.Generator, T: int, n: int) -> Plan:
 
 
 def mixed_rates(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """One parameter walks fast, one slowly, the others stand."""
+    """One parameter is a fast random walk, one a slow one, and the others are constant."""
     std = np.zeros(n)
     std[0], std[-1] = 0.04, 0.005
     path, q = _walk(rng, T, std)
@@ -99,14 +99,14 @@ def mixed_rates(rng: np.random.Generator, T: int, n: int) -> Plan:
 
 
 def outliers(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """A slow walk; 5 % of the noise is ten times as large."""
+    """The drift is a slow random walk, and 5 % of the noise is ten times as large."""
     plan = slow_walk(rng, T, n)
     plan.outlier = rng.random(T) < 0.05
     return plan
 
 
 def missing_data(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """A slow walk; 15 % of the outputs are missing, and one block of 60."""
+    """The drift is a slow random walk; 15 % of the outputs are missing, and one block of 60."""
     plan = slow_walk(rng, T, n)
     plan.missing = rng.random(T) < 0.15
     plan.missing[T // 2 : T // 2 + 60] = True
@@ -114,7 +114,7 @@ def missing_data(rng: np.random.Generator, T: int, n: int) -> Plan:
 
 
 def lost_excitation(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """A slow walk; the inputs stand still for a sixth of the record."""
+    """The drift is a slow random walk, and the inputs are constant for a sixth of the record."""
     plan = slow_walk(rng, T, n)
     plan.quiet = np.zeros(T, bool)
     plan.quiet[T // 2 : T // 2 + T // 6] = True
@@ -122,14 +122,14 @@ def lost_excitation(rng: np.random.Generator, T: int, n: int) -> Plan:
 
 
 def changing_noise(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """A slow walk; the noise is four times as large over the middle third."""
+    """The drift is a slow random walk, and the noise is four times as large over the middle third."""
     plan = slow_walk(rng, T, n)
     plan.noise[T // 3 : 2 * T // 3] *= 4.0
     return plan
 
 
 def collinear_inputs(rng: np.random.Generator, T: int, n: int) -> Plan:
-    """A slow walk; the inputs are correlated by 0.97."""
+    """The drift is a slow random walk, and the inputs have a correlation of 0.97."""
     plan = slow_walk(rng, T, n)
     plan.correlation = 0.97
     return plan

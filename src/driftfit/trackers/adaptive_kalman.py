@@ -3,13 +3,13 @@
 K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k r / c_i`` a nominal sample,
 where r is the present noise variance and c_i the mean square of regressor i, so ratio_k is the share of r that the
 drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. The filters are the
-modes of a Markov chain and interact (`driftfit.trackers.parts.drift_ladder`).
+modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
-the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.mode_filters`). Readings out of all
+the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
 proportion are left out (`driftfit.trackers.parts.disproportion`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
-(`driftfit.trackers.parts.drift_ladder`), or more noise.
+(`driftfit.trackers.parts.modes.ladder`), or more noise.
 
 Reported are the mean and covariance of the mixture; the one-step variance leaves the outlier level out, so its band is
 one for samples that are not outliers.
@@ -26,33 +26,40 @@ levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.diffuse import ALMOST_ANY, MACHINES, enter, knowing_nothing, measurement, spanned_variance
+from driftfit.trackers.parts.coordinates import (
+    FRAME,
+    frame,
+    located,
+    located_within,
+    unseen_variance,
+    whiten,
+    whiten_within,
+)
+from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.disproportion import bound_leverage, learn_proportion, leave_out, no_proportion, proportion
-from driftfit.trackers.parts.drift_ladder import filters, mix
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
-from driftfit.trackers.parts.mode_filters import (
-    determined,
+from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
     mixture,
+    outgrown,
     predict,
-    unseen_variance,
     update_filters,
     weigh,
 )
-from driftfit.trackers.parts.mode_smoother import NOTED, note, varying
+from driftfit.trackers.parts.modes.ladder import filters, mix
+from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
 from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
@@ -73,17 +80,18 @@ def learn_start(s: State, l: int) -> None:
 
 @kernel
 def settle(s: State, l: int) -> None:
-    """Start the filters from least squares once there are residuals to tell r from."""
-    n = s.theta.shape[0]
+    """Start the filters from least squares once there are residuals to tell r from: z = M theta ~ N(d, r I)."""
     if s.count[l] >= RESIDUALS:
         s.r[l] = max(s.scale[l], finest(s, l))
         s.scale[l] = 1.0
         s.settled[l] = 1
-        for k in range(s.mu.shape[0]):
-            for i in range(n):
-                s.m[i, k, l] = s.theta[i, l]
-                for j in range(i + 1):
-                    s.C[i, j, k, l] = s.P[i, j, l] * s.r[l]
+        for i in range(s.theta.shape[0]):
+            for k in range(s.mu.shape[0]):
+                s.m[i, k, l] = s.d[i, l]
+                s.C[i, i, k, l] = s.r[l] if s.S[i, i, l] > 0.0 else 0.0
+            for j in range(i + 1):
+                s.P[i, j, l] *= s.r[l]
+        frame(s, l)
 
 
 @kernel
@@ -95,15 +103,21 @@ def learn(s: State, l: int, odd: float) -> None:
 
 
 @kernel
-def follow(s: State, l: int) -> None:
-    """One sample, once the filters run."""
+def follow(s: State, entering: int, l: int) -> None:
+    """One sample, once the filters run; ``entering`` is the column by which it leaves what was seen before, or -1."""
+    resolve(s, l)
     noise_prior(s, l)
     bound_leverage(s, l)
     innovate(s, l)
+    if entering >= 0:
+        s.y_hat[l] = prediction(s, l)
+        s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
     leave_out(s, l)
     s.odd[l], s.weighed[l] = 0.0, 0
-    entered = s.root[l] > 0 and enter_filters(s, l)
-    if s.ok[l] > 0.0 and not entered:
+    column = entering if entering >= 0 else outgrown(s, l)
+    if s.ok[l] > 0.0 and column >= 0:
+        enter_filters(s, column, l)
+    elif s.ok[l] > 0.0:
         s.weighed[l] = 1
         weigh(s, l)
         update_filters(s, l)
@@ -113,46 +127,51 @@ def follow(s: State, l: int) -> None:
 
 @kernel
 def correct(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.settled[l] == 0:
-        learn(s, l, 0.0)
-        measurement(s, l)
-        learn_start(s, l)
-        settle(s, l)
-    else:
-        follow(s, l)
+    whiten(s, l)
+    follow(s, -1, l)
+
+
+@kernel
+def interact(s: State, l: int) -> None:
+    if s.ok[l] > 0.0:
+        # now, not before the next sample: its prediction may not depend on whether its output will be there
+        mix(s, l)
 
 
 @kernel
 def report(s: State, l: int) -> None:
-    if s.settled[l] > 0:
-        mixture(s, l)
-        if s.ok[l] > 0.0:
-            # now, not before the next sample: its prediction may not depend on whether its output will be there
-            mix(s, l)
-    else:
-        for i in range(s.theta.shape[0]):
-            s.var[i, l] = s.P[i, i, l] * s.scale[l]
+    mixture(s, l)
+    if s.ok[l] > 0.0:
+        located(s, l)
+    interact(s, l)
 
 
 @kernel
 def begin(s: State, l: int) -> None:
-    """While there are directions that nothing is known of: `follow` in those that there are."""
+    """Least squares until the filters start; then, while there are directions that nothing is known of, those there
+    are."""
     if s.settled[l] > 0:
-        resolve(s, l)
         predict(s, l)
-        follow(s, l)
-        report(s, l)
+        follow(s, whiten_within(s, l), l)
+        mixture(s, l)
+        if s.ok[l] > 0.0:
+            located_within(s, l)
+        interact(s, l)
         unseen_variance(s, l)
     else:
         resolve(s, l)
         learn(s, l, 0.0)
-        enter(s, l)
+        take_in(s, l)
         if s.s[l] < np.inf:
             learn_start(s, l)
-            if determined(s, l):
-                settle(s, l)
+            s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
         spanned_variance(s, l)
+        settle(s, l)
+
+
+@kernel
+def keep_density(o: State, s: State, l: int) -> None:
+    o.density[l] = s.density[l]
 
 
 @dataclass(frozen=True)
@@ -173,6 +192,8 @@ class AdaptiveKalman(Tracker):
     groups: Any = None
 
     width: ClassVar[int] = 1
+    outputs: ClassVar[tuple[str, ...]] = ("density",)
+    density: ClassVar[str] = "density"
     noted: ClassVar[tuple[str, ...]] = NOTED
     adapts: ClassVar[bool] = True
 
@@ -194,7 +215,9 @@ class AdaptiveKalman(Tracker):
         return {
             "theta": np.zeros(n),
             "P": np.zeros((n, n)),
-            "g": np.zeros(n),
+            "x": np.zeros(n),
+            "W": np.zeros((n, n)),
+            "density": np.nan,
             "r": 1.0,
             "scale": np.nan,
             "squares": 0.0,
@@ -207,7 +230,7 @@ class AdaptiveKalman(Tracker):
             "h": np.zeros(K),
             "inverse": np.zeros((J, K)),
             "joint": np.zeros((J, K)),
-            **knowing_nothing(n, ALMOST_ANY),
+            **knowing_nothing(n),
             **no_excitation(n),
             **no_proportion(),
             **unresolved(),
@@ -217,33 +240,41 @@ class AdaptiveKalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin, note=note, machines=MACHINES)
+        return TrackerSteps(predict, correct, report, begin, keep_density, note=note, machines=FRAME)
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        if lane["settled"]:
+            lane["C"][:] += np.tril((lane["S"] * p) @ lane["S"].T)[..., None]
+            np.einsum("ii->i", lane["P"])[:] += p
+            lane["var"][:] += p
+        else:
+            super().widen(lane, p)
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        """All filters are moved alike, so that their mixture stands where it is said to."""
+        before = lane["d"].copy()
+        super().place(lane, which, values)
+        lane["m"][:] += (lane["d"] - before)[:, None]
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         return learned(lane)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        lane, names = run.end().state, np.array(run.names)
+        lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
         said = []
         if never.any():
-            said.append(("Not learned", f"{', '.join(names[never])}: never moved apart from the others; std is inf"))
+            said.append(
+                ("Not learned", f"{', '.join(names[never])}: never varied separately from the others; std is inf")
+            )
         if lately.any():
-            said.append(("Not learned now", f"{', '.join(names[lately])}: the last regressors do not tell"))
+            said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
         return (*said, *proportion(lane), *resolution(lane))
 
-    def inspect(self, run: Any) -> None:
-        lane = run.end().state
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
-        if never.any() and lane["settled"] and lane["seen_samples"] >= window(len(never)):
-            warnings.warn(
-                f"AdaptiveKalman: {', '.join(np.array(run.names)[never])} could not be learned, since the regressors "
-                "never moved apart from the others: std is inf. The other parameters are followed all the same; leave "
-                "out a column that stands still, or that repeats another, to be rid of this.",
-                UserWarning,
-                stacklevel=4,
-            )
+        return never & bool(lane["settled"] and lane["seen_samples"] >= window(len(never)))

@@ -148,7 +148,7 @@ class Tracker(Settings, ABC):
         if not self.covariance or P is None or P.shape != (n, n):
             raise ValueError(
                 f"{type(self).__name__} carries no covariance that can be widened; "
-                "say where the parameters stand now, with theta=."
+                "give the new values of the parameters with theta=."
             )
         scale = float(lane["scale"])
         np.einsum("ii->i", P)[:] += p / scale if scale > 0.0 else p
@@ -176,8 +176,9 @@ class Tracker(Settings, ABC):
         """What the summary of a run should say beside its numbers: a name and a sentence each."""
         return ()
 
-    def inspect(self, run: Any) -> None:
-        """Warn of what a record could not tell; `track` calls it with the run of a single series."""
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
+        """Which entries of theta a record should have told by now and has not, (n,) bool: `track` warns of them."""
+        return np.zeros(len(lane["theta"]), bool)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
         """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""

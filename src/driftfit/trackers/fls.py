@@ -74,7 +74,7 @@ def price(mu: Any) -> Any:
         raise ValueError(f"FLS: mu must be numeric; got {mu!r}.") from None
     if array.ndim == 2 and array.size and (array > 0.0).all():
         raise ValueError(
-            f"FLS: mu must be one number or one per parameter; got shape {array.shape}. A mu for every step goes with "
+            f"FLS: mu must be one number or one per parameter; got shape {array.shape}. Pass a mu for every step with "
             "the record: FLS(1.0) and track(.., drift=1 / mu), drift being (T, n) with the steps in rows 1 to T - 1."
         )
     if array.ndim > 1 or not (array > 0.0).all():
@@ -124,7 +124,7 @@ class FLS(Tracker):
         if self.differences not in (1, 2):
             raise ValueError(f"FLS: differences must be 1 or 2; got {self.differences!r}.")
         if self.differences == 2 and self.p0 is not None:
-            raise ValueError("FLS: p0 says nothing of the slope; with differences=2 leave it None (nothing is known).")
+            raise ValueError("FLS: p0 does not describe the slope; with differences=2 leave it None (a diffuse start).")
 
     def state(self, n: int) -> Mapping[str, Any]:
         mu, theta0 = vector("FLS", "mu", self.mu, n), vector("FLS", "theta0", self.theta0, n)
@@ -148,7 +148,7 @@ class FLS(Tracker):
         return second_differences.STEPS if self.differences == 2 else STEPS
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.end().state)
+        return resolution(run.state)
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])

@@ -32,20 +32,18 @@ import numpy as np
 from numba import types
 from scipy import special
 
-from driftfit.data import storage
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
-from driftfit.engine.drivers import INPUTS, drivers, tile_type
+from driftfit.engine.drivers import INPUTS, tile_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
-from driftfit.use.forecast import final_state
+from driftfit.run.program import state_of
+from driftfit.run.result import Track
 from driftfit.use.simulate import noise_at
 
 if TYPE_CHECKING:
     import polars
-
-    from driftfit.run.result import Track
 
 DRAWS = 2000
 
@@ -153,7 +151,7 @@ def crossing(
     if what in run.names:
         h = len(run) if horizon is None else whole("crossing", "horizon", horizon, 1)
         place = run.names.index(what)
-        lane = {name: values[0, ..., 0] for name, values in _fields(final_state(run)).items()}
+        lane = state_of(run.program.resting(run.state))
         drawn = "slope" in lane
         by = (_along_slopes if drawn else _reflected)(run, lane, place, sign, limit, h)
     elif what in ("y", run.labels.y):
@@ -161,7 +159,7 @@ def crossing(
         by = _of_output(run, sign, limit, whole("crossing", "horizon", h, 1), u)
     else:
         raise ValueError(f"crossing: there is no {what!r}; {near(str(what), (*run.names, run.labels.y))}")
-    times = None if run._time is None else Clock.of(run.labels.dt, run.labels.zone).ahead(run._time[-1], h)
+    times = Clock.of(run.labels.dt, run.labels.zone).ahead(run.last, h) if run.timed else None
     return Crossing(what, limit, side, level, h, by, times, run.labels.zone)
 
 
@@ -170,27 +168,22 @@ def _limit(below: float | None, above: float | None) -> tuple[float, str]:
         raise ValueError("crossing: give one limit, below= or above=.")
     limit, side = (below, "below") if below is not None else (above, "above")
     if limit is None or not np.isfinite(limit):
-        raise ValueError(f"crossing: {side}={limit!r} is no finite number.")
+        raise ValueError(f"crossing: {side}={limit!r} is not finite.")
     return float(limit), side
-
-
-def _fields(tile: Array) -> dict[str, Array]:
-    return {name: tile[name] for name in storage.fields(tile)}
 
 
 def _known(run: Track, cov: Array, place: int | None = None) -> Array:
     """A covariance; ValueError where nothing is known yet of what it is about."""
     if not np.isfinite(cov if place is None else cov[place, place]).all():
-        raise ValueError("crossing: nothing is known yet of a parameter that it needs: its std is infinite.")
+        raise ValueError("crossing: a parameter that it needs is not determined yet: its std is infinite.")
     return cov
 
 
 def _covariances(run: Track) -> tuple[Array, Array]:
     """(covariance of theta at the end, what a nominal sample without an observation adds to it), (n, n) each."""
-    tile = final_state(run)
-    lane = {name: values[0, ..., 0] for name, values in _fields(tile).items()}
-    steps = drivers(run.model.steps, run.tracker.steps_for(run.model))
-    update = steps.update.entry(tile_type(tile), types.float64, INPUTS)
+    tile = run.program.resting(run.state)
+    lane = state_of(tile)
+    update = run.program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
     now = run.tracker.cov(lane).copy()
     update(tile, np.nan, np.full(run.model.m, np.nan))
     with np.errstate(invalid="ignore"):
@@ -235,9 +228,13 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
     """F from paths of the output, (h + 1,); at the end itself nothing has been measured beyond it."""
     model = run.model
     if u is None and model.m:
-        raise ValueError(f"crossing: the output depends on {model.m} inputs; give those to come, u= ({h}, {model.m}).")
-    if run.tracker.output_error or "slope" in storage.fields(run._tile):
-        raise ValueError("crossing: the output is run on for parameters that walk at random; ask for a parameter.")
+        raise ValueError(
+            f"crossing: the output depends on {model.m} inputs; give their future values, u= ({h}, {model.m})."
+        )
+    if run.tracker.output_error or "slope" in run.state:
+        raise ValueError(
+            "crossing: the crossing of the output needs parameters that are random walks; ask for a parameter."
+        )
     p, rng = model.reach, np.random.default_rng(0)
     r = noise_at(run, -1)
     now, q = _covariances(run)
@@ -245,7 +242,7 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
     inputs = np.concatenate([run.u[len(run) - p :], later])
     past = np.tile(run.y[len(run) - p :], (DRAWS, 1))
     if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
-        raise ValueError("crossing: the last samples and the inputs to come must be known, where lags hold them.")
+        raise ValueError("crossing: the last samples and the future inputs must be known, because lags contain them.")
     zero = np.zeros(len(now))
     theta = run.theta[-1] + rng.multivariate_normal(zero, _known(run, now), DRAWS, method="eigh")
     values, vectors = np.linalg.eigh(q)

@@ -11,17 +11,15 @@ nobody knows: an output block is inverted on their range, widened by a fifth. Co
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.use.simulate import Prediction, drift, moved, unbroken
+from driftfit.run.result import Track
+from driftfit.use.prediction import Prediction, drift, moved, unbroken
 from driftfit.use.system import covariances, taken
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
 
 Span = tuple[Any, Any]
 
@@ -104,7 +102,9 @@ def systems(run: Track, theta: Array) -> Array:
         return theta
     structure = getattr(run.model, "structure", None)
     if structure is None or theta.shape[-1] != structure.n_x:
-        raise ValueError(f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which is no system.")
+        raise ValueError(
+            f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which do not define a system."
+        )
     return np.asarray(structure.products(theta))
 
 

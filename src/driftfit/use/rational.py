@@ -68,7 +68,7 @@ def rational_model(y: Any, phi: Any, psi: Any) -> Rational:
     output, top, below = output[used], top[used], below[used]
     n, m = top.shape[1], below.shape[1]
     if len(output) <= n + m:
-        raise ValueError(f"rational_model: {len(output)} usable samples cannot tell {n + m} parameters apart.")
+        raise ValueError(f"rational_model: {len(output)} usable samples cannot determine {n + m} parameters.")
     for name, columns in (("phi", top), ("psi", below)):
         if (columns == output[:, None]).all(axis=0).any():
             raise ValueError(f"rational_model: a column of {name} is y itself, whose noise is not independent of y.")

@@ -78,7 +78,7 @@ def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     pairs = {entry: entry.partition("=") for entry in given or []}
     for entry, (name, _, unit) in pairs.items():
         if not name.strip() or not unit.strip():
-            raise ValueError(f"--unit {entry}: a unit is given as column=unit, such as --unit flow=l/min.")
+            raise ValueError(f"--unit {entry}: give a unit as column=unit, such as --unit flow=l/min.")
     return {name.strip(): unit.strip() for name, _, unit in pairs.values()}
 
 
@@ -102,7 +102,7 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
     for entry in given:
         key, is_named, value = entry.partition("=")
         if not is_named or not value.strip():
-            raise ValueError(f"-p {entry}: a setting is name=value, such as -p {known[0]}=1e-4.")
+            raise ValueError(f"-p {entry}: give a setting as name=value, such as -p {known[0]}=1e-4.")
         others = [other for other, at in trackers.found().items() if key.strip() in {f.name for f in given_fields(at)}]
         if key.strip() not in known and others:
             raise ValueError(

@@ -89,7 +89,7 @@ class Given:
         if not names:
             raise ValueError("--y names no column.")
         if len(set(names)) < len(names):
-            raise ValueError(f"--y {','.join(names)}: an output is named once.")
+            raise ValueError(f"--y {','.join(names)}: name each output once.")
         return names
 
     @property
@@ -130,7 +130,7 @@ class Given:
 
     def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
         """The run that the options ask for: a Track, an Outputs or a fleet."""
-        from driftfit.run.track import track
+        from driftfit.tracking import track
 
         model, chosen, before = self._begun()
         signals: Any = self.signals(rows)
@@ -142,13 +142,11 @@ class Given:
         """(model, tracker, the run to begin from, or None); those of the saved run where one is given."""
         models = self.models()
         if len(models) > 1:
-            raise ValueError("--model: one model is followed at a time; `driftfit select` compares several.")
+            raise ValueError("--model: give one model; `driftfit select` compares several.")
         if self.start is None:
             return models[0], self.chosen_tracker(), None
         if self.model or self.p or self.own or self.tracker != "adaptive-kalman":
-            raise ValueError(
-                f"--start {self.start}: model and tracker are those of the file; leave out --model, -p ..."
-            )
+            raise ValueError(f"--start {self.start}: model and tracker come from the file; leave out --model, -p ...")
         if self.by or len(self.outputs) > 1:
             raise ValueError(f"--start {self.start}: the file holds one run of one output; leave out --by.")
         before = saved(self.start)
@@ -173,8 +171,8 @@ class Given:
 
 def saved(path: Path) -> Any:
     """A run, or a live state, from a file."""
-    from driftfit.run.live.live import Live
-    from driftfit.run.result import Track
+    from driftfit.results import Track
+    from driftfit.streams import Live
 
     try:
         return Track.load(path)

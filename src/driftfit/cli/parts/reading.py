@@ -43,10 +43,10 @@ class Part:
     ) -> Part:  # fmt: skip
         """From what was typed."""
         if decimal not in (".", ","):
-            raise ValueError(f"--decimal {decimal}: the sign is a point or a comma.")
+            raise ValueError(f"--decimal {decimal}: the decimal sign must be a point or a comma.")
         sign = "\t" if separator in ("tab", "\\t") else separator
         if sign is not None and len(sign) != 1:
-            raise ValueError(f"--separator {separator}: one sign, such as ';', or tab.")
+            raise ValueError(f"--separator {separator}: the separator must be one character, such as ';', or tab.")
         ranges = tuple(_limits(entry, names) for entry in limits or [])
         return cls(first, last, _rows(rows), sign, decimal, ranges, tuple(map(stretch, exclude or [])))
 
@@ -65,7 +65,7 @@ class Part:
     def _sample(self, row: str) -> int:
         """The sample of a row."""
         if not row.isdigit():
-            raise ValueError(f"--exclude: without --time a stretch is given in rows, such as 100..120; got {row!r}.")
+            raise ValueError(f"--exclude: without --time give an interval of rows, such as 100..120; got {row!r}.")
         return int(row) - self.rows[0]
 
 
@@ -107,7 +107,7 @@ def _limits(entry: str, names: Sequence[str]) -> tuple[str, Range]:
     except ValueError:
         colon = ""
     if not colon or not found[0] <= found[1]:
-        raise ValueError(f"--limits {entry}: a valid range is given as column=low:high, such as --limits flow=0:80.")
+        raise ValueError(f"--limits {entry}: give a valid range as column=low:high, such as --limits flow=0:80.")
     if name.strip() not in names:
         raise ValueError(f"--limits {entry}: no signal has the name {name.strip()!r}; {near(name.strip(), names)}")
     return name.strip(), found
@@ -117,7 +117,7 @@ def stretch(entry: str, option: str = "--exclude") -> tuple[str, str]:
     """``2024-03-01..2024-03-04`` as its ends."""
     first, dots, last = entry.partition("..")
     if not (dots and first.strip() and last.strip()):
-        raise ValueError(f"{option} {entry}: a stretch is given as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
+        raise ValueError(f"{option} {entry}: give an interval as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
     return first.strip(), last.strip()
 
 
@@ -129,7 +129,9 @@ def _rows(text: str | None) -> tuple[int, int | None]:
         raise ValueError(f"--rows {text}: rows are counted from 1, as in --rows 100:500, 100: or :500.")
     a, b = int(first or 1), int(last) if last.strip() else None
     if a < 1 or (b is not None and b < a):
-        raise ValueError(f"--rows {text}: there is no such row; rows are counted from 1 and the first comes first.")
+        raise ValueError(
+            f"--rows {text}: there are no such rows; rows are counted from 1, and the first must not be after the last."
+        )
     return a, b
 
 

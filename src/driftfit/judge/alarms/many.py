@@ -33,7 +33,7 @@ from driftfit.engine.settings import numbers
 from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.many import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
-from driftfit.show.summary import Printed, facts, key_text, table_of
+from driftfit.show.parts.text import Printed, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -86,7 +86,7 @@ class ManyAlarms(Printed):
         for row in self.rows:
             if row.key == key:
                 return row.alarms
-        raise KeyError(f"there are no alarms of {key!r}{': ' + self.failed[key] if key in self.failed else '.'}")
+        raise KeyError(f"there are no alarms for {key!r}{': ' + self.failed[key] if key in self.failed else '.'}")
 
     @property
     def faulty(self) -> tuple[Hashable, ...]:
@@ -124,12 +124,12 @@ class ManyAlarms(Printed):
             ("Alarms", f"{begun} in {len(self.alarmed)} series; {self.expected:.2g} false alarms expected"),
             (
                 "Series",
-                f"{len(self.faulty)} had something; of those at most {100.0 * self.level:g} % had nothing, on average",
+                f"{len(self.faulty)} with a fault; at most {100.0 * self.level:g} % of those are false, on average",
             ),
         )
         table = table_of("The most extreme first", "", "alarms", "the first", "p", "q", "", names=1)
         for row in self.rows[:SHOWN]:
-            numbers = (p_text(row.alarms.p), p_text(row.q), "something" if row.faulty else "")
+            numbers = (p_text(row.alarms.p), p_text(row.q), "fault" if row.faulty else "")
             table.add_row(Text(key_text(row.key)), str(len(row.alarms.onsets)), Text(row.first), *numbers)
         yield table
         if len(self.rows) > SHOWN:
@@ -145,7 +145,7 @@ def alarms(
     from driftfit.run.fleet import cores
 
     if not runs:
-        raise ValueError("detect: there is no run with a result to watch.")
+        raise ValueError("detect: no series has a result to watch.")
     level = numbers("detect", "level", level, ndim=0)
     if not 0.0 < level < 1.0:
         raise ValueError(f"detect: level must lie between 0 and 1; got {level!r}.")
@@ -154,7 +154,7 @@ def alarms(
     lacking = [key_text(key) for key in runs if own and key not in reference]
     if lacking:
         raise ValueError(
-            f"detect: reference has nothing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
+            f"detect: reference is missing for {', '.join(lacking[:SHOWN])}; give one for every key, or one for all."
         )
 
     def watch(key: Hashable) -> Alarms | ValueError:

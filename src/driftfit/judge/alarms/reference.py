@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from driftfit.engine.settings import whole
+from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -19,7 +20,7 @@ LEAST = 20
 
 def burn(run: Track) -> int:
     """Samples at the beginning of a run that judge nothing: an estimate that has just begun is no alarm."""
-    return max(50, 5 * run.model.n)
+    return burn_in(run.model.n)
 
 
 def in_samples(run: Track, reference: Any) -> Any:
@@ -38,16 +39,16 @@ def stretch(run: Track, reference: Any) -> tuple[int, int]:
         first, end = reference
     elif reference is None or isinstance(reference, tuple | list):
         raise ValueError(
-            'detect: say where the parameters belong, reference={"b1": (0.9, 1.1)}, how many of the first samples are '
-            f"normal, reference=500, or from when to when, reference=(from, to); got {reference!r}."
+            'detect: give the normal range of the parameters, reference={"b1": (0.9, 1.1)}, the number of first '
+            f"samples that are normal, reference=500, or an interval, reference=(from, to); got {reference!r}."
         )
     else:
         first, end = 0, whole("detect", "reference", reference, 1)
     first = max(first, burn(run))
     if not first + LEAST <= end <= len(run):
         raise ValueError(
-            f"detect: the reference leaves too little: of its samples up to {end} those from {first} on count (the run "
-            f"has {len(run)}, and starts until {burn(run)}), and {LEAST} are needed."
+            f"detect: the reference is too short: it covers samples {first} to {end} (the run has {len(run)}, of "
+            f"which the first {burn(run)} are its start), but {LEAST} samples are needed."
         )
     return first, end
 
@@ -69,7 +70,7 @@ def as_date(given: Any, zone: str | None) -> np.datetime64:
     try:
         date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
     except ValueError:
-        raise ValueError(f"detect: {given!r} is no date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
+        raise ValueError(f"detect: {given!r} is not a date; write it as 2024-03-01 or 2024-03-01 12:30.") from None
     if isinstance(date, np.datetime64):
         if zone is None:
             return date

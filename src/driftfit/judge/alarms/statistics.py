@@ -22,8 +22,9 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, stretch
-from driftfit.judge.alarms.rule import CHANGE, AlarmRule, check_fits, power_and_mean
+from driftfit.run.live.rule import CHANGE, AlarmRule, check_fits, power_and_mean
 from driftfit.run.result import Track
+from driftfit.trackers.bank.results.results import Hypotheses
 
 Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
@@ -58,7 +59,7 @@ def _edges(reference: Mapping[str, tuple[float, float]]) -> Array:
         edges = np.zeros(0)
     if edges.ndim != 2 or len(edges) != 2 or not (edges[0] <= edges[1]).all():
         raise ValueError(
-            f"detect: a reference names parameters, each with a band (low, high), low <= high; got {dict(reference)!r}."
+            f"detect: a reference maps parameters to bands (low, high), low <= high; got {dict(reference)!r}."
         )
     return edges
 
@@ -79,7 +80,7 @@ def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[Alar
     check_fits(rule, run.tracker, run.names)
     if isinstance(reference, Mapping):
         raise ValueError(
-            'detect: the reference of "innovation" is a number of samples, such as reference=500, or (from, to).'
+            'detect: the reference of "innovation" must be a number of samples, such as reference=500, or (from, to).'
         )
     if reference is not None:
         first, start = stretch(run, reference)
@@ -104,7 +105,7 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
         return rule.outside(run.theta[:, columns], run.std[:, columns])
     if rule.kind == "probability":
         bank: Any = run
-        p = bank._written(CHANGE) if CHANGE in run.tracker.outputs else bank.hypotheses.window
+        p = bank.written(CHANGE) if CHANGE in run.tracker.outputs else Hypotheses(bank).window
         return np.asarray(np.reshape(p, (len(run), -1))[:, :1])
     g = rule.scores(run.innovation, run.innovation_std)
     used = np.flatnonzero(np.isfinite(g) & (np.arange(len(g)) >= start))

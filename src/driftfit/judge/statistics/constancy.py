@@ -48,7 +48,7 @@ from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_f
 from driftfit.judge.statistics.supremum import suprema, together
 
 POINTS = 48
-"""At most so many points of the path enter the statistics and their null."""
+"""At most so many points of the path enter the suprema and their null; every second of them enters the mean squares."""
 ROWS = 200
 """At most about so many rows of the covariance of the joint path."""
 CELLS = 200
@@ -128,15 +128,16 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
         return _nothing(N, n)
     S, inverse = np.cumsum(X * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
-    own = np.einsum("ij,bjck,kl->bicl", inverse, null, inverse, optimize=True)
+    own = _turned(null, inverse)
     path = S @ inverse
-    var = np.einsum("ij,jk,ki->i", inverse, V[-1], inverse)
+    var = np.diag(inverse @ V[-1] @ inverse)
     least, apart = shortest(n), len(found.breaks) > 0
-    L, p = _each(S[ends - 1], null, np.diag(V[-1]))
-    _, p_path = _each(path[ends - 1], own, var)
+    mean = np.arange(m)[::-2][::-1]
+    L, p = _each(S[ends[mean] - 1], _thinned(null, mean), np.diag(V[-1]))
+    _, p_path = _each(path[ends[mean] - 1], _thinned(own, mean), var)
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
-    joint, p_mean = _joint(S[ends - 1], null, V[-1])
+    joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
     p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
@@ -196,6 +197,17 @@ def _null(A: Array, V: Array, inverse: Array) -> Array:
     return np.ascontiguousarray(cov)
 
 
+def _thinned(cov: Array, points: Array) -> Array:
+    """Covariance of some points of a path."""
+    return cov[points][:, :, points]
+
+
+def _turned(cov: Array, M: Array) -> Array:
+    """Covariance (m, n, m, n) of a path whose rows are multiplied by M (n, n)."""
+    turned: Array = np.ascontiguousarray(np.swapaxes(M @ np.swapaxes(cov, 1, 2) @ M.T, 1, 2))
+    return turned
+
+
 def _weights(cov: Array) -> Array:
     """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
     weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
@@ -216,7 +228,7 @@ def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
     lower = np.linalg.cholesky(V)
     root = np.linalg.inv(lower)
     L = float(np.sum((S @ root.T) ** 2) / m)
-    white = np.einsum("ij,bjck,lk->bicl", root, cov, root, optimize=True).reshape(m * n, m * n)
+    white = _turned(cov, root).reshape(m * n, m * n)
     return L, tail(_weights(white) / m, L)
 
 

@@ -172,7 +172,7 @@ def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, 
     search = _Search(Q, y, c, spans, g, P, order, np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:],
                      least, penalty(N, n, least, quiet))  # fmt: skip
     r = r[r[:, 0] > 0.0]
-    pacf = np.median(_partial(r / r[:, :1], g, width), axis=0) if len(r) else np.zeros(P)
+    pacf = np.median(_partial(r, g, width), axis=0) if len(r) else np.zeros(P)
     local = _chosen(pacf, min(N, 8 * width), order)
     whole = search.correlation(y, np.zeros(0, np.int64))
     found = search.settle(local, residual, residual)
@@ -242,7 +242,7 @@ class _Search(NamedTuple):
         _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
         if not r[0] > 0.0:
             return r[:0]
-        return _chosen(_partial(r[None] / r[0], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
+        return _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
 
     def size(self, v: Array, ar: Array) -> float:
         """Standard deviation of the white noise, outliers held."""
@@ -298,27 +298,41 @@ def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
 
 
 def _partial(r: Array, g: Array, N: float) -> Array:
-    """Partial autocorrelations (W, P) from autocorrelations r (W, P + 1) of residuals of fits on N rows."""
-    W, P = len(r), r.shape[1] - 1
-    found, a, left = np.zeros((W, P)), np.zeros((W, 0)), np.ones(W)
-    for k in range(P):
-        last = (r[:, k + 1] - np.sum(a * r[:, k:0:-1], axis=1)) / np.maximum(left, 1e-9)
-        found[:, k] = last = np.minimum(np.maximum(last, -LARGEST), LARGEST)
-        a = np.concatenate([a - last[:, None] * a[:, ::-1], last[:, None]], axis=1)
-        left *= 1.0 - last * last
-    if P:
-        found[:, 0] = _unbiased(found[:, 0], g, N)
+    """Partial autocorrelations (W, P) from sums at lags 0 .. P, r (W, P + 1), of residuals of fits on N rows."""
+    found = np.empty((len(r), r.shape[1] - 1))
+    _recursion(np.ascontiguousarray(r), np.ascontiguousarray(g), float(N), found)
     return found
 
 
-def _unbiased(r: Array, g: Array, N: float) -> Array:
-    """The autocorrelations whose estimates from N residuals are r (W,) on average."""
-    rho = r
-    for _ in range(10):
-        each = rho[:, None]
-        lost = (2.0 * rho + np.sum((g - each) * (1.0 + g * each) / (1.0 - g * each), axis=1)) / N
-        rho = np.minimum(np.maximum(r + lost, -LARGEST), LARGEST)
-    return rho
+def _levinson(r: Array, g: Array, N: float, found: Array) -> None:
+    """The recursion of Durbin and Levinson, and what the fit took from the first autocorrelation."""
+    W, P = found.shape
+    a, turned = np.zeros(P), np.zeros(P)
+    for w in range(W):
+        left = 1.0
+        for k in range(P):
+            last = r[w, k + 1] / r[w, 0]
+            for j in range(k):
+                last -= a[j] * r[w, k - j] / r[w, 0]
+            last = min(max(last / max(left, 1e-9), -LARGEST), LARGEST)
+            found[w, k] = last
+            for j in range(k):
+                turned[j] = a[j] - last * a[k - 1 - j]
+            for j in range(k):
+                a[j] = turned[j]
+            a[k] = last
+            left *= 1.0 - last * last
+        if P > 0:
+            first = rho = found[w, 0]
+            for _ in range(10):
+                lost = 2.0 * rho
+                for i in range(g.shape[0]):
+                    lost += (g[i] - rho) * (1.0 + g[i] * rho) / (1.0 - g[i] * rho)
+                rho = min(max(first + lost / N, -LARGEST), LARGEST)
+            found[w, 0] = rho
+
+
+_recursion = Driver(_levinson)
 
 
 def _chosen(pacf: Array, N: int, order: int | None) -> Array:

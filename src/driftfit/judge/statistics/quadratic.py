@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from driftfit.engine.kernel import Array, Driver, exp, log
+from driftfit.engine.kernel import Array, Driver
 
 TERMS = 65536
 """Terms of the sum at the most."""
@@ -41,19 +41,25 @@ def tail(weights: Array, x: float) -> float:
 
 
 def _inverted(w: Array, x: Array, total: Array) -> None:
-    """The sum, until its terms have vanished."""
+    """The sum, until its terms have vanished; two weights at a time, so that a root is the principal one."""
+    count = w.shape[0]
     step = 2.0 * np.pi / (x[0] + w.sum() + 60.0)
     for term in range(TERMS):
         k = term + 0.5
         v = k * step
-        angle, log_size = -v * x[0], 0.0
-        for j in range(w.shape[0]):
-            scaled = 2.0 * v * w[j]
-            angle += 0.5 * np.arctan(scaled)
-            log_size -= 0.25 * log(1.0 + scaled * scaled)
-        size = exp(log_size) / (np.pi * k)
-        total[0] += size * np.sin(angle)
-        if size < 1e-9:
+        # c + i d = 1 / phi(v)
+        c, d = 1.0, 0.0
+        for j in range(0, count, 2):
+            one = 2.0 * v * w[j]
+            two = 2.0 * v * w[j + 1] if j + 1 < count else 0.0
+            real, imaginary = 1.0 - one * two, -(one + two)
+            larger = np.sqrt(0.5 * (np.sqrt(real * real + imaginary * imaginary) + abs(real)))
+            smaller = 0.5 * imaginary / larger
+            p, q = (larger, smaller) if real >= 0.0 else (-smaller, -larger)
+            c, d = c * p - d * q, c * q + d * p
+        square = c * c + d * d
+        total[0] -= (np.sin(v * x[0]) * c + np.cos(v * x[0]) * d) / (square * np.pi * k)
+        if square * k * k > 1e17:
             break
 
 

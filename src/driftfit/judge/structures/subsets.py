@@ -14,6 +14,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure
+from driftfit.run.result import burn_in
 from driftfit.trackers.base import Tracker
 
 ALL = 5
@@ -27,7 +28,7 @@ def subsets(
 ) -> tuple[list[Structure], list[Predicted]]:
     """Subsets of the regressors of one model: all, or those that a search visits."""
     if full.columns is None:
-        raise ValueError("select: subsets are those of the regressors of ARX or Regression; give a list of models.")
+        raise ValueError("select: subsets of regressors need an ARX or Regression; otherwise give a list of models.")
     unknown = [name for name in keep if name not in pool.names]
     if unknown:
         raise ValueError(f"select: there is no regressor {unknown[0]!r}; there is {', '.join(pool.names)}.")
@@ -52,7 +53,7 @@ class Tried:
         self.structures: list[Structure] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
-        self._start = min(max(50, 5 * len(pool.names)), len(pool.y) // 2)
+        self._start = min(burn_in(len(pool.names)), len(pool.y) // 2)
 
     def __call__(self, subsets: Sequence[frozenset[int]]) -> Array:
         """logliks of subsets, after the start, (k,)."""

@@ -4,7 +4,11 @@
     w_t = -sum_{i=1..na} a_i w_{t-i} + sum_{j=1..nb} b_j v_{t-nk-j+1}  linear block
     sum_k d_k g_k(y_t) = w_t,  d_1 = 1                                inverse of the output block, increasing
 
-With several inputs each has a curve v_i and coefficients b_i of its own, and their sum drives the linear block.
+With several inputs each has a curve v_i and coefficients b_i of its own, and their sum drives the linear block. With
+several outputs each has a linear block and an output block of its own: a regression on its own lags and on the inputs,
+in a lane of its own. That is no restriction without noise, since every row of a transfer matrix has a denominator
+in common, of at most the order of the whole. Where the input blocks are the same for all outputs,
+`driftfit.models.hammerstein_wiener.results.shared_curves` separates them together.
 
 In terms of what is measured this is a regression on products of the parameters
 (`driftfit.models.hammerstein_wiener.products`):
@@ -31,7 +35,6 @@ the input carry a minus sign, without which the regression gives -b. Cost per sa
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -41,13 +44,14 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import numbers, whole
+from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.memory import memory, places_of
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.rows import FLOOR
 from driftfit.models.hammerstein_wiener.steps import applying, build
+from driftfit.models.hammerstein_wiener.values import DIGITS
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
@@ -75,7 +79,7 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class HammersteinWiener(Model):
-    """Hammerstein-Wiener model with one output.
+    """Hammerstein-Wiener model.
 
     Parameters
     ----------
@@ -89,16 +93,20 @@ class HammersteinWiener(Model):
         inputs, each with a curve of its own; ``nb`` and ``nk`` then may be lists as well.
     intercept : bool
         Add one constant; those of the two blocks cannot be told apart.
-    output_noise : number or None
+    output_noise : number, one for each output, or None
         Standard deviation of white noise on y. The noise variance of the equation then is r times
         sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
     name : str, tuple of str or None
         Name of the input, or of each.
+    ny : int or names
+        Outputs, columns of y. With several, ``output`` and ``output_noise`` may be lists with one entry for each; the
+        bases of all outputs are of one kind and size, with ranges and knots of their own.
 
     Raises
     ------
     ValueError
-        For orders that are not whole, lists of different lengths, or a dead zone or saturation in the output block.
+        For orders that are not whole, lists of different lengths, a dead zone or saturation in the output block, or
+        output bases of different kinds.
     """
 
     na: int
@@ -107,8 +115,9 @@ class HammersteinWiener(Model):
     input: Any = None
     output: Any = None
     intercept: bool = False
-    output_noise: float | None = None
+    output_noise: Any = None
     name: Any = None
+    ny: Any = 1
 
     def __post_init__(self) -> None:
         self._set("na", whole("HammersteinWiener", "na", self.na, 0))
@@ -123,13 +132,31 @@ class HammersteinWiener(Model):
             for name in counts:
                 self._set(name, getattr(self, name)[0])
         self._set("input", _blocks(self.input))
-        self._set("output", basis_of(self.output))
-        if self.output is not None and self.output.adaptive:
+        self._check_outputs()
+
+    def _check_outputs(self) -> None:
+        """Outputs, their bases and their noises."""
+        lists = {name: len(value) for name in ("output", "output_noise") if several(value := getattr(self, name))}
+        self._set("ny", max([1, *lists.values()]) if self.ny == 1 else self.ny)
+        if not isinstance(self.ny, int):
+            self._set("ny", output_names("HammersteinWiener", self.ny))
+        count = len(output_names("HammersteinWiener", self.ny))
+        if set(lists.values()) - {count}:
+            raise ValueError(f"HammersteinWiener: there are {count} outputs, but one entry for each of {lists}.")
+        self._set("output", _blocks(self.output))
+        for basis in self.output if several(self.output) else (self.output,):
+            if basis is not None and basis.adaptive:
+                raise ValueError(
+                    f"HammersteinWiener: {type(basis).__name__} is not one-to-one, so it can only be an input block."
+                )
+        if len({(basis.kind, basis.n, basis.parameters.size) for basis in self.outs}) > 1:
             raise ValueError(
-                f"HammersteinWiener: {type(self.output).__name__} is not one-to-one, so it can only be an input block."
+                f"HammersteinWiener: outputs that run together have bases of one kind and size; got {self.output!r}. "
+                "Others are models of their own."
             )
         if self.output_noise is not None:
-            sigma = numbers("HammersteinWiener", "output_noise", self.output_noise, ndim=0, low=0.0, strict=True)
+            ndim = 1 if several(self.output_noise) else 0
+            sigma = numbers("HammersteinWiener", "output_noise", self.output_noise, ndim=ndim, low=0.0, strict=True)
             self._set("output_noise", sigma)
 
     def settings(self) -> dict[str, Any]:
@@ -137,7 +164,7 @@ class HammersteinWiener(Model):
 
     @classmethod
     def from_settings(cls, settings: dict[str, Any]) -> Self:
-        bases = {"input": _blocks(settings.get("input")), "output": basis_of(settings.get("output"))}
+        bases = {"input": _blocks(settings.get("input")), "output": _blocks(settings.get("output"))}
         return super().from_settings(settings | bases)
 
     def bind(self, inputs: int | Sequence[str]) -> HammersteinWiener:
@@ -177,13 +204,28 @@ class HammersteinWiener(Model):
     def into(self) -> Basis:
         """Functions of the input block; ValueError where there are several inputs."""
         if self.m > 1:
-            raise ValueError("HammersteinWiener: what was asked for needs a model with one input.")
+            raise ValueError("HammersteinWiener: this method needs a model with one input.")
         return self.bases[0]
 
     @property
+    def outputs(self) -> tuple[str, ...]:
+        return output_names("HammersteinWiener", self.ny)
+
+    @property
+    def outs(self) -> tuple[Basis, ...]:
+        """Functions of the inverse of the output block of each output."""
+        given = self.output if several(self.output) else (self.output,) * len(self.outputs)
+        return tuple(IDENTITY if basis is None else basis for basis in given)
+
+    @property
     def out(self) -> Basis:
-        """Functions of the inverse of the output block."""
-        return self.output if isinstance(self.output, Basis) else IDENTITY
+        """Functions of the inverse of the output block, of the first output where there are several."""
+        return self.outs[0]
+
+    def alone(self, output: str) -> HammersteinWiener:
+        i = self.outputs.index(output)
+        one = {name: value[i] for name in ("output", "output_noise") if several(value := getattr(self, name))}
+        return replace(self, ny=1, **one)
 
     @property
     def structure(self) -> Structure:
@@ -302,19 +344,20 @@ class HammersteinWiener(Model):
             outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
-                warnings.warn(
+                warn(
                     f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
                     f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
                     UserWarning,
-                    stacklevel=4,
                 )
             size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
-                warnings.warn(
+                powers = np.abs(seen[:, None] ** [1, basis.degree])
+                lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
+                said = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
+                warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
-                    f"scaled; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
+                    f"scaled{said}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
                     UserWarning,
-                    stacklevel=4,
                 )
 
 
@@ -328,7 +371,8 @@ def _places(model: HammersteinWiener) -> tuple[int, ...]:
 @lru_cache
 def _memory(model: HammersteinWiener) -> Array:
     into = tuple(basis.parameters for basis in model.bases)
-    return memory(model.structure, model.delays, into, model.out.parameters, model.out.limits, model.output_noise)
+    sigma = model.output_noise[0] if several(model.output_noise) else model.output_noise
+    return memory(model.structure, model.delays, into, model.out.parameters, model.out.limits, sigma)
 
 
 @lru_cache

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, part
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
 from driftfit.models.hammerstein_wiener.memory import (
     BEFORE,
@@ -123,7 +123,7 @@ def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int
     return count
 
 
-@core
+@shared
 def look(m: Array, p: Places) -> None:
     """Whether the levels rise along the grid, and how far d may go before that is looked at again; else an envelope."""
     n_out, d, seen, reach, at = p[N_OUT], p[D_NOW], p[D_SEEN], p[REACH], p[CURVE]
@@ -149,7 +149,7 @@ def look(m: Array, p: Places) -> None:
             m[levels + i - 1, 0] = min(m[levels + i - 1, 0], m[levels + i, 0])
 
 
-@core
+@shared
 def on_envelope(m: Array, p: Places, right: float) -> float:
     """The y at which the envelope has a level; the end of the grid for a level beyond it."""
     levels = p[LEVEL]
@@ -196,8 +196,9 @@ def locating(lanes: bool = False) -> Any:
 
     def locate(m: Array, p: Places, right: float) -> Any:
         m[LATE, 0] = 0.0
-        if not (m[STEP, 0] > 0.0 and abs(right) < LARGEST):
+        if not m[STEP, 0] > 0.0 or right != right:
             return np.nan
+        right = min(max(right, -LARGEST), LARGEST)  # the level beyond all levels of the grid is infinite
         if not rises(m, p):
             return on_envelope(m, p, right)
         below = EIGHT * count(m, p, p[COARSE], EIGHT, right)
@@ -251,7 +252,7 @@ def inverse_of(level_at: Any, lanes: bool = False) -> Any:
 @lru_cache
 def inverting(out: Kind) -> Any:
     """The same as a core, for any lane and for where it is seldom needed."""
-    return core(inverse_of(level_of(out), lanes=True).py_func)
+    return shared(inverse_of(level_of(out), lanes=True).py_func)
 
 
 @lru_cache
@@ -285,4 +286,4 @@ def laying(values: Any) -> Any:
                 m[coarse + k * EIGHT + j, 0] = m[curve + k * ROW + EIGHT * (j + 1), 0] if j < EIGHT - 1 else beyond
 
     table = part(fill_table)
-    return core(lay)
+    return shared(lay)

@@ -112,37 +112,38 @@ class Structure(NamedTuple):
         c = np.insert(c, self.leads - np.arange(len(self.n_in)), 1.0, axis=-1)
         return a, b, c, np.insert(d, 0, 1.0, axis=-1)
 
+    @property
+    def alone(self) -> Array:
+        """(entry of theta, entry of xi) of the parameters that stand in theta by themselves, (k, 2)."""
+        at_d, at_l = self.starts[0], self.n - 1
+        x_d = self.n_x - self.intercept - self.n_out + 1
+        d = [(at_d + k, x_d + k) for k in range(self.n_out - 1)]
+        return np.array([*((i, i) for i in range(at_d)), *d, *([(at_l, self.n_x - 1)] if self.intercept else [])])
+
+    @property
+    def pairs(self) -> Array:
+        """(entry of theta, entry of xi, entry of xi) of the products b c and a d, (k, 3)."""
+        at_d, row, _ = self.starts
+        at_b, x_c, found = self.na, at_d, []
+        for nb, n_in in zip(self.nb, self.n_in, strict=True):
+            found += [(row + k * nb + j, at_b + j, x_c + k) for k in range(n_in - 1) for j in range(nb)]
+            at_b, x_c, row = at_b + nb, x_c + n_in - 1, row + nb * (n_in - 1)
+        found += [(row + k * self.na + i, i, x_c + k) for k in range(self.n_out - 1) for i in range(self.na)]
+        return np.array(found, dtype=np.int64).reshape(-1, 3)
+
     def products(self, xi: Array) -> Array:
         """theta = g(xi), (..., n)."""
-        a, b, c, d = self.groups(xi)
-        pairs = zip(self.of_inputs(b, self.nb), self.of_inputs(c, self.n_in), strict=True)
-        bc = [(ci[..., 1:, None] * bi[..., None, :]).reshape(*xi.shape[:-1], -1) for bi, ci in pairs]
-        ad = (d[..., 1:, None] * a[..., None, :]).reshape(*xi.shape[:-1], -1)
-        rest = xi[..., self.n_x - 1 :] if self.intercept else xi[..., :0]
-        return np.concatenate([a, b, d[..., 1:], *bc, ad, rest], axis=-1)
+        theta = np.empty((*xi.shape[:-1], self.n))
+        (rows, entries), (products, first, second) = self.alone.T, self.pairs.T
+        theta[..., rows] = xi[..., entries]
+        theta[..., products] = xi[..., first] * xi[..., second]
+        return theta
 
     def jacobian(self, xi: Array) -> Array:
         """J (..., n, n_x)."""
-        a, b, c, d = self.groups(xi)
-        at_d, row, at_ad = self.starts
-        at_b, x_c = self.na, at_d
-        x_d = x_c + sum(self.n_in) - len(self.n_in)
         J = np.zeros((*xi.shape[:-1], self.n, self.n_x))
-        J[..., range(at_d), range(at_d)] = 1.0
-        for bi, ci in zip(self.of_inputs(b, self.nb), self.of_inputs(c, self.n_in), strict=True):
-            nb = bi.shape[-1]
-            for k in range(1, ci.shape[-1]):
-                for j in range(nb):
-                    J[..., row, at_b + j] = ci[..., k]
-                    J[..., row, x_c] = bi[..., j]
-                    row += 1
-                x_c += 1
-            at_b += nb
-        for k in range(self.n_out - 1):
-            J[..., at_d + k, x_d + k] = 1.0
-            for i in range(self.na):
-                J[..., at_ad + k * self.na + i, i] = d[..., k + 1]
-                J[..., at_ad + k * self.na + i, x_d + k] = a[..., i]
-        if self.intercept:
-            J[..., -1, -1] = 1.0
+        (rows, entries), (products, first, second) = self.alone.T, self.pairs.T
+        J[..., rows, entries] = 1.0
+        J[..., products, first] = xi[..., second]
+        J[..., products, second] = xi[..., first]
         return J

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, part
+from driftfit.engine.kernel import Array, part, shared
 from driftfit.models.hammerstein_wiener.memory import (
     D_NOW,
     EACH,
@@ -18,7 +18,6 @@ from driftfit.models.hammerstein_wiener.memory import (
     G_PAST,
     H_PAST,
     INPUTS,
-    N_IN,
     N_OUT,
     NA,
     NB,
@@ -64,32 +63,32 @@ def past(m: Array, p: Places, theta: Array) -> float:
     return one + other
 
 
-@core
+@shared
 def minimal_past(m: Array, p: Places, theta: Array) -> float:
     """The same where theta is xi."""
-    na, nb, more_in, more_out, now = p[NA], p[NB], p[N_IN] - 1, p[N_OUT] - 1, p[NOW]
-    x_c, d = na + nb, p[D_NOW] + 1
-    x_d, at_bc = x_c + more_in, now + x_c + more_out
-    at_ad = at_bc + nb * more_in
-    total = 0.0
+    na, more_out, now, at = p[NA], p[N_OUT] - 1, p[NOW], p[NA] + p[NB] + p[N_OUT] - 1
+    b, c, total = na, na + p[NB], 0.0
+    for i in range(p[INPUTS]):
+        nb, more_in = p[OWN + EACH * i + OWN_NB], p[OWN + EACH * i + OWN_N_IN] - 1
+        for j in range(nb):
+            column = m[now + b + j, 0]
+            for k in range(more_in):
+                column += theta[c + k, 0] * m[now + at + k * nb + j, 0]
+            total -= theta[b + j, 0] * column
+        b, c, at = b + nb, c + more_in, at + nb * more_in
     for k in range(more_out):
-        m[d + k, 0] = theta[x_d + k, 0]
+        m[p[D_NOW] + 1 + k, 0] = theta[c + k, 0]
     for i in range(na):
         column = m[now + i, 0]
         for k in range(more_out):
-            column += m[d + k, 0] * m[at_ad + k * na + i, 0]
+            column += theta[c + k, 0] * m[now + at + k * na + i, 0]
         total -= theta[i, 0] * column
-    for j in range(nb):
-        column = m[now + na + j, 0]
-        for k in range(more_in):
-            column += theta[x_c + k, 0] * m[at_bc + k * nb + j, 0]
-        total -= theta[na + j, 0] * column
-    for i in range(at_ad + na * more_out, now + p[N]):
-        total -= theta[x_d + more_out, 0] * m[i, 0]
+    for i in range(at + na * more_out, p[N]):
+        total -= theta[c + more_out, 0] * m[now + i, 0]
     return total
 
 
-@core
+@shared
 def noise_factor(m: Array, p: Places, theta: Array) -> float:
     """sigma^2 sum_i a_i^2 F'(y_(t-i))^2 + floor, a_0 = 1, from the estimates before the sample."""
     n_out, d = p[N_OUT], p[D_NOW]
@@ -104,7 +103,7 @@ def noise_factor(m: Array, p: Places, theta: Array) -> float:
     return factor if factor < LARGEST else 1.0
 
 
-@core
+@shared
 def forget(m: Array, p: Places) -> None:
     """All lags are missing."""
     for i in range(p[F_PAST], p[SPARE]):
@@ -135,7 +134,7 @@ def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
         m[i, 0] = 1.0
 
 
-@core
+@shared
 def complete(m: Array, p: Places) -> bool:
     """Whether all lags are there."""
     at_d = p[NA] + p[NB]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
-from driftfit.engine.kernel import Array, State, Step, core, floats, kernel, outside, part
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
 from driftfit.models.arx import GAP
 from driftfit.models.hammerstein_wiener.memory import (
     ADAPTIVE,
@@ -61,16 +61,16 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
 from driftfit.models.hammerstein_wiener.rows import complete, fill, forget, minimal_past, noise_factor, past, shift
-from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values
+from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values, usable
 
 INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
 
 
-@core
+@shared
 def thresholds(m: Array, p: Places, theta: Array) -> None:
     """The coefficients of a dead zone, fed back: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
-    at_b, at_bc = p[NA], p[NA] + p[NB] + p[N_OUT] - 1
+    at_b, at_bc, x_c = p[NA], p[NA] + p[NB] + p[N_OUT] - 1, p[NA] + p[NB]
     for i in range(p[INPUTS]):
         own = OWN + EACH * i
         nb, into = p[own + OWN_NB], p[own + OWN_INTO]
@@ -80,11 +80,12 @@ def thresholds(m: Array, p: Places, theta: Array) -> None:
                 gain, product = theta[at_b + j, 0], theta[at_bc + k * nb + j, 0]
                 size += 1.0 if m[into + 4, 0] > 0.0 else gain * gain
                 total += product / gain if m[into + 4, 0] > 0.0 else product * gain
-            threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[at_b + nb + k, 0]
+            threshold = total / size if m[MINIMAL, 0] == 0.0 else theta[x_c + k, 0]
             if abs(threshold) < LARGEST:
                 top, bottom = INSIDE * m[into + 3, 0] * (1 - k), -INSIDE * m[into + 3, 0] * k
                 m[into + 1 + k, 0] = min(max(threshold, bottom), top)
-        at_b, at_bc = at_b + nb, at_bc + nb * (p[own + OWN_N_IN] - 1)
+        more = p[own + OWN_N_IN] - 1
+        at_b, at_bc, x_c = at_b + nb, at_bc + nb * more, x_c + more
 
 
 @lru_cache
@@ -96,6 +97,8 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
         if moves:
             shift(m, p[own + OWN_F], p[own + OWN_N_IN], p[own + OWN_NB] + p[own + OWN_NK])
         input_at(m, p, m[p[US] + i, 0], p[own + OWN_F], p[SPARE])
+        if not usable(m, p[own + OWN_F], p[own + OWN_N_IN]):
+            m[p[own + OWN_F], 0] = np.nan
 
     enter = part(one)
     if i + 1 == len(into):
@@ -142,8 +145,7 @@ def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
                 output_at(m, p, y, g, h)
             else:
                 bare_output_at(m, p, y, g, h)
-            for k in range(n_out):
-                seen = seen and abs(m[g + k, 0]) < LARGEST
+            seen = usable(m, g, n_out)
         m[RAW, 0] = y if seen else np.nan
         if p[IDENTITY] == 0:
             if seen:
@@ -174,7 +176,7 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
         stride = L if lanes else 1  # which the compiler knows
         work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
 
-    return outside(machine_regress)
+    return machine(machine_regress)
 
 
 @lru_cache
@@ -187,7 +189,7 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
         if m[LATE, 0] > 0.0:
             m[PREDICTED, 0] = refine(m, orders, m[PREDICTED, 0])
 
-    return outside(machine_push)
+    return machine(machine_push)
 
 
 @lru_cache
@@ -233,12 +235,12 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
             s.blocks[now + i, l] = s.blocks[following + i, l]
 
     def ready(L: int) -> None:
-        for machine in (
+        for routine in (
             *(one[0] for one in into),
             out[0],
             *((regress_one, push_one) if L == 1 else (regress_lane, push_lane)),
         ):
-            machine.load()
+            routine.load()
 
     return ModelSteps(regress, push, ready)
 

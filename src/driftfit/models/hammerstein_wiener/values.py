@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part
 from driftfit.models.hammerstein_wiener.curves.kernels import LEGENDRE, POWERS
 from driftfit.models.hammerstein_wiener.memory import (
@@ -26,8 +27,25 @@ from driftfit.models.hammerstein_wiener.memory import (
     Places,
 )
 
+DIGITS = 1e13
+"""Largest ratio of the functions of a reading to the first of them, or to 1: of sixteen digits, what an absurd reading
+leaves of ordinary ones in the same columns."""
+CURVED = 1e19
+"""Largest function of a reading where there are several, which far out are nearly proportional: products of two stay
+below LARGEST."""
+
 Kind = tuple[Any, int]
 """The machine of a basis, and its code."""
+
+
+@part
+def usable(m: Array, at: int, count: int) -> bool:
+    """Whether the functions of a reading, from a place on, are numbers of comparable size."""
+    top = min(DIGITS * max(abs(m[at, 0]), 1.0), CURVED) if count > 1 else LARGEST
+    beyond = 0
+    for k in range(count):
+        beyond += 0 if abs(m[at + k, 0]) < top else 1
+    return beyond == 0
 
 
 @lru_cache

@@ -13,7 +13,7 @@ import numpy as np
 
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.rule import AlarmRule, change_probability, check_fits, last_power_and_mean
+from driftfit.run.live.rule import AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
 KEPT = 256
@@ -130,7 +130,7 @@ def check_rule(rule: Any) -> AlarmRule:
     """Refuse what is no rule, with the way to one."""
     if not isinstance(rule, AlarmRule):
         raise TypeError(
-            "Live.detect: it takes the rule of a reference run, as in run.detect('innovation', reference=500).rule; "
+            "Live.detect: pass the rule of a reference run, as in run.detect('innovation', reference=500).rule; "
             f"got {type(rule).__name__}."
         )
     return rule

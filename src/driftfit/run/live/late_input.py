@@ -33,8 +33,8 @@ def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
     if step is None:
         raise ValueError(
             f"Live.update: no input was given, but {model!r} needs the input of a sample to predict its output "
-            "(a regression, or nk = 0): update(y, u), with u=None where it is not known. In a control loop, where u is "
-            "chosen after y has been read, take a model with nk of at least 1, and update(y), then apply(u)."
+            "(a regression, or nk = 0): update(y, u), with u=None if it is not known. In a control loop, where u is "
+            "chosen after y has been read, use a model with nk of at least 1, and call update(y), then apply(u)."
         )
     return _compiled(step).entry(tile_type(tile), INPUTS)
 
@@ -56,8 +56,8 @@ def check_applied(expected: int) -> None:
     """Refuse the next sample while the input of the last one is outstanding."""
     if expected != NOTHING:
         raise ValueError(
-            "Live.update: the input of the last sample has not come yet: apply(u) after update(y), or apply(None) "
-            "where it is not known."
+            "Live.update: the input of the last sample has not been given yet: apply(u) after update(y), or "
+            "apply(None) where it is not known."
         )
 
 
@@ -65,5 +65,6 @@ def check_expected(expected: int) -> None:
     """Refuse an input that no sample waits for."""
     if expected == NOTHING:
         raise ValueError(
-            "Live.apply: no sample waits for its input. The order is update(y) without u, then apply(u), once a sample."
+            "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once per "
+            "sample."
         )

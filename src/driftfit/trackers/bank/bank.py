@@ -15,7 +15,10 @@ Jumps show only through the regressors: no excitation, no detection.
 left None) q and p0 are in units of it, unless a ``guess`` of it is given.
 
 A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
-Until the regressors have full rank (and, with unknown noise, four residuals are there) only the first change acts.
+Until there are four residuals (with known noise: full rank, or four samples that nothing new is in) only the first
+change acts. Then the tree grows in the directions that the regressors span, and a later one enters as the exact limit
+of a wide prior; a bank with changes that forget, with leaves that have output lags of their own or with form="sqrt"
+waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -35,7 +38,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
@@ -68,7 +71,8 @@ from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.diffuse import ALMOST_ANY, knowing, knowing_nothing
+from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
+from driftfit.trackers.parts.excitation import window
 from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.resolution import resolution, unresolved
 
@@ -147,11 +151,11 @@ class Bank(Tracker):
         nominal, others = self.all_sensors[0], self.all_sensors[1:]
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
-        self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        self._shape, self.event_probabilities  # noqa: B018  (both refuse what does not fit)
         if self.all_changes[0].reset:
-            raise ValueError("Bank: the first change is the ordinary course of things, and cannot be a reset.")
+            raise ValueError("Bank: the first change is the normal course of events and cannot be a reset.")
         if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
-            raise ValueError("Bank: FirstFloor knows random walks only; changes that forget need another reduction.")
+            raise ValueError("Bank: FirstFloor supports random walks only; changes that forget need another reduction.")
         self.reduction.losses(self._count)
         kinds = {other.kind for other in others}
         reduce = self.reduction
@@ -192,12 +196,12 @@ class Bank(Tracker):
         return self.reduction.shape(len(self.all_changes), len(self.all_sensors))
 
     @property
-    def _events(self) -> tuple[Array, Array]:
+    def event_probabilities(self) -> tuple[Array, Array]:
         return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
 
     @property
     def _alike(self) -> bool:
-        P = self._events[0]
+        P = self.event_probabilities[0]
         return bool((P[0] == P).all())
 
     @property
@@ -206,9 +210,14 @@ class Bank(Tracker):
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
             return False
-        P = self._events[0].reshape(-1, Hd, Hm)
+        P = self.event_probabilities[0].reshape(-1, Hd, Hm)
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
         return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
+
+    def _frames(self, na: int) -> bool:
+        """Whether it may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
+        walks = not any(one.forgets for one in self.all_changes)
+        return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
 
     @property
     def change_names(self) -> tuple[str, ...]:
@@ -289,7 +298,9 @@ class Bank(Tracker):
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
             "scale": scale, "count": count, "squares": squares, "sample": sample,
             "counters": counters, **unresolved(),
-            **(knowing_nothing(n, ALMOST_ANY) if self.p0 is None else knowing(n)),
+            **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
+            "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
+            "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
             "q0": q0, "G": triangular_root(Q0 + np.tril(Q0, -1).T), "size0": self.all_changes[0].increments(n)[1],
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
@@ -306,11 +317,11 @@ class Bank(Tracker):
                 columns[:, H : H + Hd * Hd] = chains("Bank", given, T, Hd)
             else:
                 given = np.broadcast_to(given, (T, given.shape[-1]))
-                columns[:, :H] = per_sample("Bank", given, self._events[1], Hd)
+                columns[:, :H] = per_sample("Bank", given, self.event_probabilities[1], Hd)
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
-                raise ValueError(f"Bank: drift must have {Hd} columns, one a change; got shape {np.shape(drift)}.")
+                raise ValueError(f"Bank: drift must have {Hd} columns, one per change; got shape {np.shape(drift)}.")
             columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 
@@ -323,22 +334,30 @@ class Bank(Tracker):
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
-        super().widen(lane, p)
-        n = len(p)
-        diagonal = np.array([i * (i + 3) // 2 for i in range(n)])
+        n, framed = len(p), bool(lane["framed"])
+        add = np.diag(p)
+        if framed:
+            np.einsum("ii->i", lane["P"])[:] += p
+            lane["var"][:] += p
+            add = (lane["S"] * p) @ lane["S"].T
+            lane["Pz"][:] += np.tril(add)
+        else:
+            super().widen(lane, p)
         B = self._leaves(lane)
         factor = B[S] / (B[NU] - 2.0) if lane["unknown"] else np.ones(B.shape[1])
-        more, C = p[:, None] / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
+        each, C = 1.0 / np.where(factor > 0.0, factor, 1.0), B[FIRST + n : FIRST + n + n * (n + 1) // 2]
         if self.form == "sqrt":
-            widened(C, more)
+            widened(C, p[:, None] * each)
         else:
-            C[diagonal] += more
+            C += add[np.tril_indices(n)][:, None] * each
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
         """All leaves are moved alike, so that the mixture stands where it is said to."""
-        B, at = self._leaves(lane), list(which)
-        B[FIRST + np.array(at)] += (values - lane["theta"][at])[:, None]
+        name = "d" if lane["framed"] else "theta"
+        before = lane[name].copy()
         super().place(lane, which, values)
+        B = self._leaves(lane)
+        B[FIRST : FIRST + len(before)] += (lane[name] - before)[:, None]
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
         """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
@@ -377,13 +396,24 @@ class Bank(Tracker):
         kinds = [event.kind for event in told.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
-        faults = int(run._tile["counters"][0, FAULTS, run._lane])
+        faults = int(run.state["counters"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
-        lane = run.end().state
+        lane = run.state
+        if (never := np.isinf(lane["var"])).any():
+            names = ", ".join(np.array(run.names)[never])
+            said.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))
         return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
+
+    def learning(self, lane: Mapping[str, Array]) -> Array:
+        """Which entries of theta the regressors have told apart so far, (n,) bool."""
+        return np.isfinite(lane["var"])
+
+    def unlearned(self, lane: Mapping[str, Array]) -> Array:
+        never = np.isinf(lane["var"])
+        return never & bool(lane["framed"] and lane["seen_samples"] >= window(len(never)))
 
     @property
     def steps(self) -> TrackerSteps:

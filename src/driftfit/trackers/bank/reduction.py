@@ -62,7 +62,7 @@ def tree(owner: str, H: int, depth: int, instead: str) -> int:
     """H^depth, if a step can afford it."""
     if H**depth > MOST:
         raise ValueError(
-            f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates a sample, more than {MOST}; {instead}."
+            f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates per sample, more than {MOST}; {instead}."
         )
     return int(H**depth)
 
@@ -206,7 +206,7 @@ class Hybrid(Reduction):
         bases = np.array([1.0, float(Hm) ** self.sensor_events, float(Hd) ** self.window])
         if bases.prod() * (self.age_cap + 1) > 2.0**53:
             raise ValueError(
-                f"Hybrid: a window of {self.window} with {Hd} changes cannot be told apart; use a smaller one."
+                f"Hybrid: a window of {self.window} with {Hd} changes cannot be distinguished; use a smaller one."
             )
         return Shape(
             self.leaves,
@@ -234,7 +234,7 @@ class FirstFloor(Reduction):
 
     def shape(self, Hd: int, Hm: int) -> Shape:
         if Hm > 1:
-            raise ValueError("FirstFloor: it knows one sensor only; use GPB.")
+            raise ValueError("FirstFloor: it supports one sensor only; use GPB.")
         children = tree("FirstFloor", Hd, self.depth, "use a smaller depth")
         vector = knobs(selection.REFILTER, depth=self.depth, prior=float(self.weights == "prior"))
         return Shape(children // Hd, children, self.depth, 1, vector, np.array([children * 1.0, 1, 1]))

@@ -93,14 +93,14 @@ class Sensor(Settings):
         An offset that lasts is a parameter: ``intercept=True`` in the model, and a `Change` of that parameter.
         """
         if (value is None) == (std is None):
-            raise ValueError(f"Sensor.offset: give value= or std=, one of them; got value={value!r}, std={std!r}.")
+            raise ValueError(f"Sensor.offset: give either value= or std=; got value={value!r}, std={std!r}.")
         if std is None:
             return cls("offset", prob=prob, value=float(value or 0.0))
         if r is None:
-            raise ValueError("Sensor.offset: std= needs r=, the noise variance that it comes on top of.")
+            raise ValueError("Sensor.offset: std= needs r=, the noise variance to which it is added.")
         warnings.warn(
-            "Sensor.offset(std=) is the same hypothesis as an outlier of variance r + std^2, and is made one; for an "
-            "offset that lasts add an intercept to the model and a Change of it.",
+            "Sensor.offset(std=) is the same hypothesis as an outlier of variance r + std^2, and is replaced by one; "
+            "for a lasting offset add an intercept to the model and a Change of it.",
             stacklevel=2,
         )
         return cls("outlier", prob=prob, factor=1.0 + std * std / r)

@@ -30,8 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, core, cubes, exp, floats, kernel, log
-from driftfit.engine.kernel import outside as machine
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, shared
 from driftfit.trackers.parts.information import spread
 
 ROUNDING = 1e-13
@@ -50,9 +49,10 @@ ALMOST_ANY = 1e13
 SIZE, STD, LOOSE, ROW, WORK = range(5)
 """Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
 
-Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, NOW = range(9)
+Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
 """Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
-variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation."""
+variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation,
+and the column by which a regressor enters."""
 
 
 def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
@@ -132,7 +132,7 @@ def measurement(s: State, l: int) -> None:
     s.s[l] = v
 
 
-@core
+@shared
 def refresh(S: Array, R: Array, work: Array) -> None:
     """R = S^-1 where S has rows, its free columns the vectors that no sample has seen; and the norms of both."""
     n = len(S)
@@ -162,7 +162,7 @@ def refresh(S: Array, R: Array, work: Array) -> None:
                 R[i, j] = 0.0
 
 
-@core
+@shared
 def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
     """The first free column j along which phi leaves the span, and u_j; or -1, 0 and |S^-T phi|^2 for a phi within it.
 
@@ -182,7 +182,7 @@ def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
     return -1, 0.0, squares
 
 
-@core
+@shared
 def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
     """Rotate ``row' theta = y`` into (S, d), past free columns, where it holds rounding, up to the one it enters by."""
     n = len(S)
@@ -204,7 +204,7 @@ def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
             break
 
 
-@core
+@shared
 def sheared(x: Array, time: float) -> None:
     """x = (level, slope) as it is ``time`` later."""
     half = len(x) // 2
@@ -212,7 +212,7 @@ def sheared(x: Array, time: float) -> None:
         x[i] += time * x[half + i]
 
 
-@core
+@shared
 def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
     """Q = an orthonormal basis, one column for each free column, of what no sample has seen; returns log det N' N.
 
@@ -244,7 +244,7 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
     return volume
 
 
-@core
+@shared
 def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -> None:
     """theta that solves S theta = d and keeps what it was in the directions of Q, those that no sample has seen."""
     n = len(S)
@@ -271,7 +271,7 @@ def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -
         theta[i] = x[i]
 
 
-@core
+@shared
 def covariance(S: Array, R: Array, P: Array) -> None:
     """The lower triangle of P = R R', given the parameters of free columns."""
     n = len(S)
@@ -283,7 +283,7 @@ def covariance(S: Array, R: Array, P: Array) -> None:
             P[i, j] = total
 
 
-@core
+@shared
 def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
     """Take in a sample, if there is one, after time has passed; ``now`` is ``at_start``."""
     n = len(S)
@@ -306,7 +306,7 @@ def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work
     now[INFLATION] = worst
 
 
-@core
+@shared
 def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
     """var = diag P, inf where a free column has a share."""
     for i in range(len(var)):

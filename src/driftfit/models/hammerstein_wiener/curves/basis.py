@@ -29,6 +29,7 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
+from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, one_of, whole
 from driftfit.models.hammerstein_wiener.curves import kernels
@@ -205,7 +206,7 @@ class DeadZone(Thresholds):
     """A dead zone between p2 < 0 < p1: v = u - p1 above it, u - p2 below, 0 inside; an input block only.
 
     In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u outside the dead zone, f_2 = -1 above it and
-    f_3 = -1 below it, 0 elsewhere.
+    f_3 = -1 below it, 0 elsewhere. A valve ends where it is fully open: u beyond ``limit`` acts as the limit does.
 
     Parameters
     ----------
@@ -217,26 +218,47 @@ class DeadZone(Thresholds):
         A filter of products has nb estimates of each threshold, the products b_j p1 beside the b_j. They are fed back
         as sum_j b_j (b_j p1) / sum_j b_j^2, or as the mean over j of (b_j p1) / b_j, which Feng and Hong (2021) have
         and a b_j near zero throws off. With minimal parameters (`ExtendedKalman`) p1 and p2 are estimated themselves.
+    limit : number or None
+        Known size beyond which the input moves the valve no more, as the 10 V of equation (61) of Feng and Hong (2021).
 
     Raises
     ------
     ValueError
-        For a u_max that is not above 0, a start below 0, or another ``fed``.
+        For a u_max or a limit that is not above 0, a start below 0, or another ``fed``.
     """
 
     start: Any = 0.01
+    fed: str = "least-squares"
+    limit: float | None = None
 
     code: ClassVar[int] = kernels.DEAD_ZONE
     begins: ClassVar[float] = 0.0
     machine: ClassVar[tuple[Any, Any]] = (kernels.dead_zone, kernels.dead_zone_slopes)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.limit is not None:
+            self._set("limit", numbers("DeadZone", "limit", self.limit, ndim=0, low=0.0, strict=True))
+
+    @property
+    def own_numbers(self) -> Array:
+        return np.append(super().own_numbers, self.reach)
+
+    @property
+    def reach(self) -> float:
+        """Size beyond which the input moves nothing."""
+        return LARGEST if self.limit is None else self.limit
 
     @property
     def names(self) -> tuple[str, ...]:
         return ("outside", "p1", "p2")
 
     def split(self, u: Array, above: Array, below: Array) -> Array:
-        known = np.where(np.isfinite(u), 0.0, np.nan)
-        return np.stack([np.where(above | below, u, known), -1.0 * above, -1.0 * below], axis=-1)
+        known, held = np.where(np.isfinite(u), 0.0, np.nan), np.clip(u, -self.reach, self.reach)
+        return np.stack([np.where(above | below, held, known), -1.0 * above, -1.0 * below], axis=-1)
+
+    def known(self, p1: float, p2: float) -> Functions:
+        return Functions(*self.machine, 3, (p1, p2, *self.own_numbers[2:]), self.names)
 
 
 @dataclass(frozen=True)

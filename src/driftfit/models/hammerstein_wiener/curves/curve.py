@@ -217,7 +217,7 @@ def _imported(function: Any) -> Any:
         try:
             return getattr(import_module(module), name)
         except (ImportError, AttributeError):
-            raise ValueError(f"Functions: {function!r} cannot be imported; it must stand in a module.") from None
+            raise ValueError(f"Functions: {function!r} cannot be imported; define it in a module.") from None
     if not (callable(function) or isinstance(function, Dispatcher)):
         raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {function!r}.")
     return function

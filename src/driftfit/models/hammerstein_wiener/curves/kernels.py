@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, exp, floats, kernel, outside
+from driftfit.engine.kernel import Array, exp, floats, kernel, machine
 
 POWERS, LEGENDRE, CHEBYSHEV, HINGES, SPLINES, DEAD_ZONE, SATURATION, SIGMOIDS = range(8)
 
@@ -80,14 +80,15 @@ def chebyshev_slopes(x: float, p: Array, out: Array) -> None:
 @kernel
 def dead_zone(x: float, p: Array, out: Array) -> None:
     above, below = x >= p[0], x <= p[1]
-    out[0] = x if above or below or x != x else 0.0
+    held = min(max(x, -p[4]), p[4]) if abs(x) < LARGEST else x
+    out[0] = held if above or below or x != x else 0.0
     out[1] = -1.0 if above else 0.0
     out[2] = -1.0 if below else 0.0
 
 
 @kernel
 def dead_zone_slopes(x: float, p: Array, out: Array) -> None:
-    out[0] = 1.0 if x >= p[0] or x <= p[1] else 0.0
+    out[0] = 1.0 if (x >= p[0] or x <= p[1]) and abs(x) <= p[4] else 0.0
     out[1] = 0.0
     out[2] = 0.0
 
@@ -237,7 +238,7 @@ def machine_of(function: Any) -> Any:
         function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
 
     machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a place on disk of its own
-    return outside(machine_evaluate)
+    return machine(machine_evaluate)
 
 
 evaluate = machine_of(every)

@@ -23,7 +23,7 @@ def knots_of(owner: str, value: Any, least: int, name: str = "knots") -> tuple[f
     knots = given if isinstance(given, tuple) else (given,)
     if len(knots) < least or any(b <= a for a, b in pairwise(knots)):
         raise ValueError(
-            f"{owner}: {name} must be at least {least} increasing numbers, each once (one given twice would make two "
+            f"{owner}: {name} must be at least {least} strictly increasing numbers (a repeated one would make two "
             f"columns equal); got {value!r}."
         )
     return knots

@@ -70,7 +70,7 @@ def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, s
         For another model, fewer usable samples than parameters, or sigma with another basis.
     """
     if not isinstance(model, HammersteinWiener) or model.into.adaptive:
-        raise ValueError(f"fit_constant: takes a HammersteinWiener without a dead zone; got {model!r}.")
+        raise ValueError(f"fit_constant: needs a HammersteinWiener model without a dead zone; got {model!r}.")
     whole("fit_constant", "rounds", rounds, 0)
     output = as_output(y)
     drive = as_inputs(u, len(output))[:, 0]
@@ -79,7 +79,7 @@ def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, s
     phi, z = regression(model, f, g)
     used = (np.abs(phi) < LARGEST).all(axis=1) & (np.abs(z) < LARGEST)
     if used.sum() < model.n:
-        raise ValueError(f"fit_constant: {int(used.sum())} usable samples cannot tell {model.n} products apart.")
+        raise ValueError(f"fit_constant: {int(used.sum())} usable samples cannot determine {model.n} products.")
     found = _separated(model, np.linalg.lstsq(phi[used], z[used], rcond=None)[0], f, output)
     for _ in range(rounds):
         instruments = regression(model, f, model.out.value(found.y))[0]

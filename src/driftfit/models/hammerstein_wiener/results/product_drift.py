@@ -22,10 +22,11 @@ from driftfit.data.signals import as_inputs, as_output
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Separator, minimal
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.run.track import track_one
 from driftfit.trackers.kalman import Kalman
 
 FLOOR = 1e-3
@@ -45,7 +46,7 @@ def product_drift(model: HammersteinWiener, xi: Array, q: Any) -> Array:
     given = numbers("product_drift", "q", q, low=0.0)
     four = given if isinstance(given, tuple) else (given,) * 4
     if len(four) != 4:
-        raise ValueError(f"product_drift: q is one variance, or those of a, b, c and d; got {q!r}.")
+        raise ValueError(f"product_drift: q must be one variance, or four for a, b, c and d; got {q!r}.")
     na, nb, n_in, n_out, intercept = model.structure
     counts = [na, sum(nb), sum(n_in) - len(n_in), n_out - 1, int(intercept)]
     variances = np.repeat([*four, max(four)], counts)
@@ -79,7 +80,7 @@ def track_products(
         For another model, or variances below 0.
     """
     if not isinstance(model, HammersteinWiener):
-        raise ValueError(f"track_products: takes a HammersteinWiener; got {type(model).__name__}.")
+        raise ValueError(f"track_products: needs a HammersteinWiener model; got {type(model).__name__}.")
     whole("track_products", "every", every, 1)
     output = as_output(y)
     inputs = as_inputs(u, len(output))
@@ -90,8 +91,8 @@ def track_products(
         tracker = Kalman(q=Q, r=r, p0=p0, theta0=theta0)
         with warnings.catch_warnings():  # a piece is too short for what is said about records
             warnings.simplefilter("ignore", UserWarning)
-            run = track(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
-            paths.append(run.blocks("gls").xi)
+            run = track_one(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
+            paths.append(blocks_of(run, "gls").xi)
         runs.append(run)
         xi = _separated(model, run.theta[-1], xi)
     return ProductTrack(np.concatenate(paths), np.concatenate([one.theta for one in runs]), tuple(runs))
@@ -115,7 +116,7 @@ def renewed(live: Live, q: Any) -> Live:
     model, tracker = live.model, live.tracker
     if not isinstance(model, HammersteinWiener) or not isinstance(tracker, Kalman) or np.ndim(tracker.q) != 2:
         raise ValueError(
-            "renewed: takes a stream of a HammersteinWiener model and a Kalman filter with a full matrix q."
+            "renewed: needs a stream of a HammersteinWiener model and a Kalman filter with a full matrix q."
         )
     xi = _separated(model, live.theta, None)
     if xi is None:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.engine.drivers import drivers, output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation.least_squares import refine
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks, Groups, deviations, split
 from driftfit.models.hammerstein_wiener.separation.separate import METHODS
+from driftfit.run.program import lane_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -30,7 +30,7 @@ def blocks_of(
     """The blocks of a run; see `Track.blocks`."""
     model = run.model
     if not isinstance(model, HammersteinWiener):
-        raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
+        raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
     one_of("blocks", "method", method, METHODS)
     if run.names == model.structure.minimal_names:
         found = _of_minimal(run, model)
@@ -53,7 +53,7 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
         warnings.warn(
-            f"blocks: {used} usable samples cannot tell {n} products apart; what is shown is mostly the start.",
+            f"blocks: {used} usable samples cannot determine {n} products; the blocks are mostly the initial values.",
             UserWarning,
             stacklevel=4,
         )
@@ -77,8 +77,8 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
         small = near < 0.05 * near.max(axis=1, initial=0.0, keepdims=True)
         if small.any():
             warnings.warn(
-                f'blocks: a b_j is next to zero in {int(small.any(axis=1).sum())} samples, where "average" has spikes; '
-                'use "svd-joint".',
+                f'blocks: a b_j is close to zero in {int(small.any(axis=1).sum())} samples, where "average" has '
+                'spikes; use "svd-joint".',
                 UserWarning,
                 stacklevel=4,
             )
@@ -86,13 +86,15 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
 
 def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
     """The blocks of a tracker that follows the minimal parameters themselves."""
-    a, b, c, d = model.structure.groups(run.theta)
-    at = model.structure.na + sum(model.structure.nb)
-    fixed = [at, at + model.structure.n_in[0] - 1]  # c_1 and d_1, before which free entries of xi they stand
-    var = np.insert(run._written("var"), fixed, 0.0, axis=1)
+    structure = model.structure
+    at = structure.na + sum(structure.nb)
+    leads = at + structure.leads - np.arange(model.m)
+    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 stand
+    var = np.insert(run.var, fixed, 0.0, axis=1)
     cov = None
-    if "P" in (run._out.dtype.names or ()):
-        cov = np.insert(np.insert(run._written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    if run.keeps_cov:
+        cov = np.insert(np.insert(run.written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    a, b, c, d = structure.groups(run.theta)
     exact, std = np.zeros((len(run), 2)), deviations(model, var)
     return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
 
@@ -100,7 +102,7 @@ def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
 def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
     """Replay the run in pieces, with covariances, and refine the separation of each."""
     if not run.tracker.covariance:
-        raise ValueError(f'blocks: "gls" weighs by the covariance, and {type(run.tracker).__name__} carries none.')
+        raise ValueError(f'blocks: "gls" needs a covariance, but {type(run.tracker).__name__} carries none.')
     a, b, c, d, quality = split(model, run.theta, "svd-joint")
     rest, at = _intercept(run), a.shape[1] + b.shape[1] + c.shape[1]
     zeta = np.concatenate([a, b, c, d[:, 1:], *([] if rest is None else [rest[:, None]])], axis=1)
@@ -122,14 +124,13 @@ def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
 def covariances(run: Track) -> Any:
     """(first sample, P (k, n, n)) for the pieces of a run, replayed unless the run kept them."""
     T = len(run)
-    if "P" in (run._out.dtype.names or ()):
-        yield 0, np.ascontiguousarray(run._written("P"))
+    if run.keeps_cov:
+        yield 0, np.ascontiguousarray(run.written("P"))
         return
-    tile = run._fresh_tile()
-    out = np.empty(min(BLOCK, T), output_type(tile, run.tracker.outputs, "cov"))
-    drive = drivers(run.model.steps, run.tracker.steps_for(run.model), "cov").run
+    tile = run.fresh()
+    out = run.program.written(tile, min(BLOCK, T), "cov")
+    drive = run.program.drivers("cov").run
     for first in range(0, T, BLOCK):
         last = min(first + BLOCK, T)
-        known = run._known if len(run._known) == 1 else run._known[first:last]
-        drive(tile, run.y[first:last, None], run.u[first:last, :, None], known[:, :, None], out[: last - first])
+        drive(tile, *lane_of(run.record.part(slice(first, last))), out[: last - first])
         yield first, np.ascontiguousarray(out["P"][: last - first, ..., 0])

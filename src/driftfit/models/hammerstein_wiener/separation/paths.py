@@ -169,7 +169,9 @@ class Blocks:
             scale[:, b] *= (gain / level)[:, None]
             scale[:, c] /= gain[:, None]
         if not np.isfinite(scale).all() and np.isfinite(x).all():
-            raise ValueError('gauge: the coefficient that is to be 1 passes zero; choose input="unit", output="d1".')
+            raise ValueError(
+                'gauge: the coefficient to be set to 1 passes through zero; choose input="unit", output="d1".'
+            )
         cov = None if self.cov is None else _carried(self.cov, x * scale, scale, rate, rates, spans)
         return self._apart(x * scale, cov, (input, output), spans)
 
@@ -276,7 +278,7 @@ class Separator:
 
     def __init__(self, model: Model) -> None:
         if not isinstance(model, HammersteinWiener):
-            raise ValueError(f"blocks: {type(model).__name__} has none; they belong to HammersteinWiener.")
+            raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
         self.model = model
         self._theta, self._parts = np.empty((1, model.n)), empty(model, 1)
         self._sizes, self._rise = model.structure.sizes, model.rise

@@ -47,12 +47,10 @@ def structure_of(owner: str, model: Model) -> Structure:
             f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."
         )
     structure = model.structure
-    if model.m > 1:
-        raise ValueError(f"{owner}: takes a model with one input; follow the products of several with Kalman.")
     if structure.n == structure.n_x and structure.names != structure.minimal_names:
         raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb[0]} products and minimal parameters are as many "
-            "and cannot be told apart; follow the products with Kalman and separate them."
+            f"{owner}: with na = {structure.na} and nb = {structure.nb} there are as many products as minimal "
+            "parameters, so the two cannot be distinguished; track the products with Kalman and separate them."
         )
     return structure
 
@@ -67,39 +65,24 @@ def minimal_memory(model: Model) -> Array:
 @lru_cache
 def linearised(structure: Structure) -> Any:
     """A kernel that fills ``s.h_row`` = phi' J(xi) and returns phi' g(xi)."""
-    na, (nb,), (n_in,), n_out, intercept = structure
-    at_d, at_bc, at_ad = structure.starts
-    x_c, x_d, n = na + nb, na + nb + n_in - 1, structure.n
+    alone, pairs = structure.alone, structure.pairs
+    lone, paired = len(alone), len(pairs)
 
     @kernel
     def row(s: State, l: int) -> float:
+        for x in range(s.theta.shape[0]):
+            s.h_row[x, l] = 0.0
         total = 0.0
-        for i in range(na):
-            slope = s.phi[i, l]
-            for k in range(n_out - 1):
-                slope += s.theta[x_d + k, l] * s.phi[at_ad + k * na + i, l]
-            s.h_row[i, l] = slope
-            total += slope * s.theta[i, l]
-        for j in range(nb):
-            slope = s.phi[na + j, l]
-            for k in range(n_in - 1):
-                slope += s.theta[x_c + k, l] * s.phi[at_bc + k * nb + j, l]
-            s.h_row[na + j, l] = slope
-            total += slope * s.theta[na + j, l]
-        for k in range(n_in - 1):
-            slope = 0.0
-            for j in range(nb):
-                slope += s.theta[na + j, l] * s.phi[at_bc + k * nb + j, l]
-            s.h_row[x_c + k, l] = slope
-        for k in range(n_out - 1):
-            slope = s.phi[at_d + k, l]
-            total += slope * s.theta[x_d + k, l]
-            for i in range(na):
-                slope += s.theta[i, l] * s.phi[at_ad + k * na + i, l]
-            s.h_row[x_d + k, l] = slope
-        if intercept:
-            s.h_row[x_d + n_out - 1, l] = s.phi[n - 1, l]
-            total += s.phi[n - 1, l] * s.theta[x_d + n_out - 1, l]
+        for k in range(lone):
+            i, x = alone[k, 0], alone[k, 1]
+            s.h_row[x, l] = s.phi[i, l]
+            total += s.phi[i, l] * s.theta[x, l]
+        for k in range(paired):
+            i, x, z = pairs[k, 0], pairs[k, 1], pairs[k, 2]
+            part = s.phi[i, l] * s.theta[z, l]
+            s.h_row[x, l] += part
+            s.h_row[z, l] += s.phi[i, l] * s.theta[x, l]
+            total += part * s.theta[x, l]
         return total
 
     return row

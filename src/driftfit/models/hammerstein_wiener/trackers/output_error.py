@@ -1,7 +1,7 @@
 """Output-error filter: an extended Kalman filter that simulates the linear block, so that y is never a regressor.
 
     state       [w_t .. w_{t-na+1}, xi_t],   xi = (a, b, c_2 .., d_2 ..) a random walk of covariance q
-    predict     w_t = -a'[w_{t-1} .. w_{t-na}] + sum_j b_j v_{t-nk-j+1} (- l) + N(0, q_w)
+    predict     w_t = -a'[w_{t-1} .. w_{t-na}] + sum_j b_j v_{t-nk-j+1} (- l) + N(0, q_w), v and b of every input
                 row of the transition: -a | -w_{t-i} | v_{t-nk-j+1} | sum_j b_j f_k(u) | 0 | (-1), then the shifts
     measure     y_t = F^-1(w_t; d) + n_t,  n ~ N(0, r);   F' = max(F'(y_hat), 0.05)
                 row of the measurement: 1 / F' for w_t, -g_k(y_hat) / F' for d_k
@@ -39,7 +39,6 @@ from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     Q_W,
     S2,
     SEEN,
-    SIZE,
     TIME,
     V_POWER,
     VALID,
@@ -74,8 +73,8 @@ def _applying(place: Step, p: tuple[int, ...]) -> Step:
 
     def apply(s: State, l: int) -> None:
         place(s, l)
-        m, n = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0]
-        theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, SIZE)[0]
+        m, n, k = floats(s.blocks.ctypes.data, 1, 1), s.theta.shape[0], s.own.shape[0]
+        theta, own = floats(s.theta.ctypes.data, 1, n)[0], floats(s.own.ctypes.data, 1, k)[0]
         follow_power(m, orders, theta, own)
 
     step: Step = kernel(apply)
@@ -131,13 +130,10 @@ class OutputError(Tracker):
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The part of the state that depends on the number n of minimal parameters alone."""
-        own = np.zeros(SIZE)
-        own[[R, Q_W, P_W, V_POWER]] = self.r, self.q_w, self.p_w, 1.0
         return {
             "theta": vector("OutputError", "theta0", self.theta0, n),
             "P": matrix("OutputError", "p0", self.p0, n),
             "q": matrix("OutputError", "q", self.q, n),
-            "own": own,
             "var": np.zeros(n),
         }
 
@@ -149,15 +145,20 @@ class OutputError(Tracker):
         structure = structure_of("OutputError", model)
         n_w = max(structure.na, 1)
         N = n_w + structure.n_x
+        own = np.ones(V_POWER + model.m)
+        own[:V_POWER] = 0.0
+        own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)
         return {
-            **self.state(structure.n_x), "blocks": minimal_memory(model), "w": np.zeros(n_w), "S": S,
-            "scratch": np.zeros(2 * N),
+            **self.state(structure.n_x), "blocks": minimal_memory(model), "own": own,
+            "w": np.zeros(n_w), "S": S, "scratch": np.zeros(2 * N),
         }  # fmt: skip
 
     def steps_for(self, model: Model) -> TrackerSteps:
         structure_of("OutputError", model)
+        if len(model.outputs) > 1:
+            raise ValueError("OutputError: follows one output at a time; track each by itself.")
         assert isinstance(model, HammersteinWiener)
         machine = output_error(model.out.kind, model.places)
         for one in (model.out.evaluate, machine):  # the machine calls the other

@@ -14,24 +14,28 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, core, floats, outside, part
+from driftfit.engine.kernel import Array, floats, machine, part, shared
 from driftfit.models.hammerstein_wiener.memory import (
     CURVE,
     D_NOW,
-    F_PAST,
+    EACH,
     G_PAST,
     GIVEN,
     GRID,
     HIGHEST,
     IDENTITY,
+    INPUTS,
     LATE,
     LEVEL,
     LOWEST,
-    N_IN,
     N_OUT,
     NA,
     NB,
-    NK,
+    OWN,
+    OWN_F,
+    OWN_N_IN,
+    OWN_NB,
+    OWN_NK,
     PREDICTED,
     RAW,
     STARTED,
@@ -41,6 +45,7 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
 from driftfit.models.hammerstein_wiener.values import Kind, level_of, output_values
+from driftfit.trackers.parts.diffuse import LEFT
 
 FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
@@ -48,22 +53,37 @@ REACH = 3.0
 """Times the largest w of the outputs seen: w is held within that."""
 FARTHEST = 1e6
 """The same before any output was seen."""
+TINY = 1e-300
+"""Least variance of what is missing: a sample without an input is marked, also where b is 0."""
 LARGEST_VARIANCE = 1e20
 """Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
 
-TIME, R, Q_W, P_W, V_POWER, BEGUN, VALID, SEEN, OK, E, S2, SIZE = range(12)
-"""Numbers of the filter: nominal intervals times the drift, variances, power of v, whether w stands, what comes out."""
+TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, V_POWER = range(11)
+"""Numbers of the filter: nominal intervals times the drift, variances, whether w stands, what comes out; from V_POWER
+on the usual power of v of each input.
+"""
 
 
-@core
+@part
+def at_d(p: Places) -> int:
+    """Where d begins in xi."""
+    found = p[NA] + p[NB]
+    for i in range(p[INPUTS]):
+        found += p[OWN + EACH * i + OWN_N_IN] - 1
+    return found
+
+
+@shared
 def past_levels(m: Array, p: Places, w: Array, S: Array, p_w: float) -> None:
-    """w = F(y) at the last outputs, each of variance p_w."""
+    """w = F(y) at the last outputs, each of variance p_w and independent of xi."""
     na, n_out, d, g = p[NA], p[N_OUT], p[D_NOW], p[G_PAST]
     for i in range(na):
         total = m[g + (i + 1) * n_out, 0]
         for k in range(1, n_out):
             total += m[d + k, 0] * m[g + (i + 1) * n_out + k, 0]
         w[i] = total if total == total else 0.0
+        for x in range(i, len(S)):
+            S[x, i] = 0.0
         S[i, i] = p_w
 
 
@@ -82,29 +102,12 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
     return total
 
 
-@core
+@shared
 def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
     """The time update of w and of S."""
-    na, nb, n_in, n_out = p[NA], p[NB], p[N_IN], p[N_OUT]
     n_w, N = len(w), len(S)
-    at_bc = na + nb + n_out - 1
-    x_c = n_w + na + nb
-    total = 0.0
-    for i in range(N):
-        row[i] = 0.0
-    for i in range(na):
-        row[i] = -theta[i]
-        row[n_w + i] = -w[i]
-        total -= theta[i] * w[i]
-    for j in range(nb):
-        v = -phi[na + j]
-        for k in range(n_in - 1):
-            f = -phi[at_bc + k * nb + j]
-            v += theta[na + nb + k] * f
-            row[x_c + k] += theta[na + j] * f
-        row[n_w + na + j] = v
-        total += theta[na + j] * v
-    for x in range(x_c + n_in - 1 + n_out - 1, N):
+    total, x_d = transition(p, theta, phi, w, row)
+    for x in range(x_d + p[N_OUT] - 1, N):
         row[x] = -1.0
         total -= theta[x - n_w]
     own = product(S, row, moved, q_w)
@@ -121,14 +124,40 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array,
     w[0] = total
 
 
-@core
+@part
+def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tuple[float, int]:
+    """The row of the transition for the present w but for the intercept; returns w, and where d begins in the state."""
+    na, n_w = p[NA], len(w)
+    for x in range(len(row)):
+        row[x] = 0.0
+    total = 0.0
+    for i in range(na):
+        row[i] = -theta[i]
+        row[n_w + i] = -w[i]
+        total -= theta[i] * w[i]
+    b, c, at = na, na + p[NB], na + p[NB] + p[N_OUT] - 1
+    for i in range(p[INPUTS]):
+        nb, more_in = p[OWN + EACH * i + OWN_NB], p[OWN + EACH * i + OWN_N_IN] - 1
+        for j in range(nb):
+            v = -phi[b + j]
+            for k in range(more_in):
+                f = -phi[at + k * nb + j]
+                v += theta[c + k] * f
+                row[n_w + c + k] += theta[b + j] * f
+            row[n_w + b + j] = v
+            total += theta[b + j] * v
+        b, c, at = b + nb, c + more_in, at + nb * more_in
+    return total, n_w + c
+
+
+@shared
 def absorb(
     e: float, slope: float, m: Array, p: Places, r: float, ok: bool, theta: Array, w: Array, S: Array, row: Array,
     moved: Array,
 ) -> float:  # fmt: skip
     """The measurement update; returns the variance of the innovation."""
     n_w, N, n_out, g = len(w), len(S), p[N_OUT], p[TRIAL]
-    x_d = n_w + p[NA] + p[NB] + p[N_IN] - 1
+    x_d = n_w + at_d(p)
     for x in range(N):
         row[x] = 0.0
     row[0] = 1.0 / slope
@@ -142,33 +171,42 @@ def absorb(
                 w[x] += k * e
             else:
                 theta[x - n_w] += k * e
-            for z in range(x + 1):
+            for z in range(x):
                 S[x, z] -= k * moved[z]
+            S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
     return s
 
 
-@core
-def inputs_known(m: Array, p: Places) -> bool:
-    """Whether all inputs that the linear block needs are there."""
-    nb, nk, n_in = p[NB], p[NK], p[N_IN]
-    missing = 0
-    for k in range(n_in):
+@shared
+def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
+    """The variance that missing inputs leave in w, sum b_j^2 times the usual power of v; 0 where all are there."""
+    b, total = p[NA], 0.0
+    for i in range(p[INPUTS]):
+        at = OWN + EACH * i
+        nb, n_in, f = p[at + OWN_NB], p[at + OWN_N_IN], p[at + OWN_F] + p[at + OWN_NK] * p[at + OWN_N_IN]
         for j in range(nb):
-            missing += 0 if abs(m[p[F_PAST] + (nk + j) * n_in + k, 0]) < LARGEST else 1
-    return missing == 0
+            missing = 0
+            for k in range(n_in):
+                missing += 0 if abs(m[f + j * n_in + k, 0]) < LARGEST else 1
+            total += max(theta[b + j] * theta[b + j] * own[V_POWER + i], TINY) if missing > 0 else 0.0
+        b += nb
+    return total
 
 
-@core
+@shared
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
     """The usual power of v, which stands for inputs that are missing."""
-    na, nb, f = p[NA], p[NB], p[F_PAST]
-    v = m[f, 0]
-    for k in range(1, p[N_IN]):
-        v += theta[na + nb + k - 1] * m[f + k, 0]
-    own[V_POWER] += 0.01 * (v * v - own[V_POWER]) if abs(v) < 1e6 else 0.0
+    c = p[NA] + p[NB]
+    for i in range(p[INPUTS]):
+        f, more_in = p[OWN + EACH * i + OWN_F], p[OWN + EACH * i + OWN_N_IN] - 1
+        v = m[f, 0]
+        for k in range(more_in):
+            v += theta[c + k] * m[f + 1 + k, 0]
+        own[V_POWER + i] += 0.01 * (v * v - own[V_POWER + i]) if abs(v) < 1e6 else 0.0
+        c += more_in
 
 
-@core
+@shared
 def hold(m: Array, p: Places, w: Array) -> None:
     """Keep the present w within reach of the outputs seen, whatever the poles do."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
@@ -190,20 +228,18 @@ def _work(out: Kind) -> Any:
         m: Array, p: Places, own: Array, theta: Array, phi: Array, q: Array, w: Array, S: Array, P: Array, row: Array,
         moved: Array,
     ) -> None:  # fmt: skip
-        na, nb, n_in, n_out, d = p[NA], p[NB], p[N_IN], p[N_OUT], p[D_NOW]
-        n_w, n_x = len(w), len(theta)
+        n_out, d, free, n_w, n_x = p[N_OUT], p[D_NOW], at_d(p), len(w), len(theta)
         for i in range(n_x):
             for j in range(i + 1):
                 S[n_w + i, n_w + j] += q[i, j] * own[TIME]
         for k in range(n_out - 1):
-            m[d + k + 1, 0] = theta[na + nb + n_in - 1 + k]
+            m[d + k + 1, 0] = theta[free + k]
         if own[BEGUN] == 0.0 and m[STARTED, 0] > 0.0:
             past_levels(m, p, w, S, own[P_W])
             own[BEGUN] = 1.0
-        known, power = inputs_known(m, p), 0.0
-        for j in range(nb):
-            power += theta[na + j] * theta[na + j]
-        advance(p, theta, phi, w, S, row, moved, own[Q_W] + (0.0 if known else power * own[V_POWER]))
+        power = unknown_power(m, p, theta, own)
+        known = power == 0.0
+        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power)
         hold(m, p, w)
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
@@ -223,7 +259,7 @@ def _work(out: Kind) -> Any:
             for j in range(i + 1):
                 P[i, j] = S[n_w + i, n_w + j]
 
-    return core(output_error_work)
+    return shared(output_error_work)
 
 
 @lru_cache
@@ -234,12 +270,12 @@ def output_error(out: Kind, p: tuple[int, ...]) -> Any:
     def machine_output_error(
         blocks: int, theta: int, phi: int, q: int, w: int, S: int, scratch: int, own: int, P: int, n_x: int, n: int,
     ) -> None:  # fmt: skip
-        n_w = max(orders[NA], 1)
+        n_w, size = max(orders[NA], 1), V_POWER + orders[INPUTS]
         N = n_w + n_x
         work(
-            floats(blocks, 1, 1), orders, floats(own, 1, SIZE)[0], floats(theta, 1, n_x)[0], floats(phi, 1, n)[0],
+            floats(blocks, 1, 1), orders, floats(own, 1, size)[0], floats(theta, 1, n_x)[0], floats(phi, 1, n)[0],
             floats(q, n_x, n_x), floats(w, 1, n_w)[0], floats(S, N, N), floats(P, n_x, n_x), floats(scratch, 2, N)[0],
             floats(scratch, 2, N)[1],
         )  # fmt: skip
 
-    return outside(machine_output_error)
+    return machine(machine_output_error)

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, minus, over, plus, reaches, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import FIRST
 
@@ -98,7 +98,7 @@ def absorb(C: Array, l: int, n: int, b: Array, a: Any, B: Array, to: int) -> Any
     return a
 
 
-@core
+@shared
 def condense(W: Array, count: int, n: int, A: Array, to: int) -> None:
     """The factor of sum_k d_k w_k w_k' into column ``to`` of A: the w_k are columns of the first n rows of W, the d_k
     its row n; row n + 1 is spare, and there is room up to the next eight.
@@ -124,7 +124,7 @@ def condense(W: Array, count: int, n: int, A: Array, to: int) -> None:
                 store(W, i, k, minus(load(W, i, k), times(fill(u), load(W, j, k))))
 
 
-@core
+@shared
 def factorise(C: Array, n: int, least: float) -> None:
     """A positive semi-definite lower triangle (tri,) becomes its factor, in place.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import fill, higher, load, lower, minus, over, plus, reaches, store, times
 from driftfit.trackers.bank.leaves.factored import absorb, add, along, raised
 from driftfit.trackers.bank.leaves.forget import (
@@ -93,7 +93,7 @@ def measure(C: Array, m: Array, n: int, l: int, w: Array, mean: Array, r: float,
         store(m, i, l, plus(load(m, i, l), times(gain, load(V, i, 0))))
 
 
-@core
+@shared
 def develop_eight(t: Any, A: Array, of: int, c: int, C: Array, m: Array, to: int, V: Array) -> None:
     """Eight leaves of A with change c, to the columns from ``to``; V has n + max(tri, 2 n) narrow rows."""
     n, maps, places = t.n, t.maps, t.places
@@ -125,7 +125,7 @@ def chance_of(prior: Array, c: int, Hm: int, l: int) -> Any:
     return chance
 
 
-@core
+@shared
 def blur(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
     """`leaves.blur` of eight leaves."""
     for k in range(t.n * (t.n + 1) // 2):
@@ -134,7 +134,7 @@ def blur(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
         raised(t.C, t.n, l, t.Q[c], chance_of(t.prior, c, Hm, l), V)
 
 
-@core
+@shared
 def average(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
     """`forget.average` of eight leaves. Changes are merged one after the other, with their chances p so far and now:
 
@@ -168,7 +168,7 @@ def average(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
         so_far = both
 
 
-@core
+@shared
 def add_walked(t: Any, l: int, Hd: int, Hm: int) -> None:
     """h <- h + sum_c p_c z'Q_c z of eight leaves."""
     n, Q, Z, zl, total = t.n, t.Q, t.z, l if t.output_lags > 0 else 0, fill(0.0)

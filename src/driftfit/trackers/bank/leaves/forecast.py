@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import WEIGHT, total
 from driftfit.trackers.bank.machine.layout import ALIKE, IN_NOISE, LAST, R
@@ -15,7 +15,7 @@ FACTOR, VALUE, FROZEN, STUCK, CLEANS = range(5)
 """Columns of the table of sensors."""
 
 
-@core
+@shared
 def expect(t: Any, L: int) -> tuple[float, float]:
     """Mean and variance of the output under the mixture of leaves and sensors.
 
@@ -64,7 +64,7 @@ def expect(t: Any, L: int) -> tuple[float, float]:
     return mean, variance if noise < np.inf else np.inf
 
 
-@core
+@shared
 def expect_together(t: Any, L: int) -> tuple[float, float]:
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
 

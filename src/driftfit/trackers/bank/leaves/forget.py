@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, exp
+from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST, blur, spread
 
 KEEP, RESET, KIND, GAIN = range(4)
@@ -34,7 +34,7 @@ ANCHORS on n rows for every change: W, or in the first of them which parameters 
 """
 
 
-@core
+@shared
 def for_interval(settings: Array, dt: float, maps: Array) -> None:
     """The maps for an interval, of which the settings are those of the nominal one."""
     for i in range(len(settings)):
@@ -54,7 +54,7 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
             maps[i, GAIN] = 1.0 - 1.0 / maps[i, KEEP]
 
 
-@core
+@shared
 def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
     """The rest of change c in the columns a .. b of C and m, which have taken in KEEP, RESET and Q.
 
@@ -73,7 +73,7 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
         renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], t.Q[c])
 
 
-@core
+@shared
 def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
     """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
     n, keep, cap, q = t.n, t.maps[c, KEEP], t.places[CAP, 0], t.Q[c]
@@ -90,7 +90,7 @@ def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
             C[k, l] = (C[k, l] - q[k]) * h[l] + q[k] if h[l] != 1.0 else C[k, l]
 
 
-@core
+@shared
 def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> None:
     """g = C z, h = z' C z."""
     for l in range(a, b):
@@ -106,7 +106,7 @@ def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> Non
             h[l] += z[i] * g[i, l]
 
 
-@core
+@shared
 def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array) -> None:
     """Directional forgetting; nothing where z or C z is zero."""
     g, h = work, work[n]
@@ -121,7 +121,7 @@ def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array)
             at += 1
 
 
-@core
+@shared
 def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, work: Array) -> None:
     """A measurement of w' theta with noise r that says w' mean."""
     n = len(w)
@@ -145,7 +145,7 @@ def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float,
             m[i, l] += h[l] * g[i, l]
 
 
-@core
+@shared
 def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
     """Some parameters begin anew."""
     at = 0
@@ -160,7 +160,7 @@ def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Arra
             at += 1
 
 
-@core
+@shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean m and covariance C of every leaf if any change may happen and no data come: the first two moments
 
@@ -203,7 +203,7 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
             m[i, l] += B[FIRST + i, l]
 
 
-@core
+@shared
 def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
     """The share of one change in the first two moments about the means of the leaves."""
     B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
@@ -217,7 +217,7 @@ def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
             at += 1
 
 
-@core
+@shared
 def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
     """The rows z'C z and z'm of `expected` for every leaf with all that may happen to it, and m; and C, which no caller
     needs where the sample is ``used``. Only the first ``Hd`` changes may happen, under ``Hm`` sensors.

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST
 from driftfit.trackers.bank.machine.layout import IN_Y, MOST, R
 
@@ -34,13 +34,13 @@ def plausible(expected: Array, l: int, most: float, r: float) -> bool:
     return expected[1, l] * expected[1, l] <= most and expected[0, l] <= VAGUE * r  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def covariance_row(n: int, na: int) -> int:
     """The first row of V, whose lower triangle is the last thing in a leaf."""
     return FIRST + n + n * (n + 1) // 2 + na
 
 
-@core
+@shared
 def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
     """Output lags of leaves that took no sample in: y where it was seen, else what each expected, within bounds."""
     B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.sample[IN_Y], math.sqrt(most)
@@ -53,7 +53,7 @@ def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
             B[at, l] = y if seen else min(max(y_hat[l], -limit), limit)
 
 
-@core
+@shared
 def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
     """h <- h + a' V a for columns c K + l, whose lags are those of leaf l of B."""
     na, m, h = t.output_lags, t.m, t.expected[0]
@@ -69,7 +69,7 @@ def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
             at += 1
 
 
-@core
+@shared
 def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool) -> None:
     """V of the leaves from column ``at`` on, whose parents are K columns of A: one lag later, and the variance of what
     was put in, zero where that was measured or given up. A may be the leaves themselves.
@@ -102,7 +102,7 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
         to[l] = expected[0, l] + r if own and plausible(expected, l, most, r) else 0.0
 
 
-@core
+@shared
 def merge_covariance(t: Any, members: Array, share: Array, to: int) -> None:
     """A parent, column ``to``: the average of V and the spread of the lags, whose mean stands there already."""
     B, A, n, na = t.leaves, t.parents, t.n, t.output_lags

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel, log, part, sized
+from driftfit.engine.kernel import Array, kernel, log, part, shared
 from driftfit.engine.simd import (
     WIDTH,
     exp_of,
@@ -72,7 +72,7 @@ def largest(x: Array, count: int) -> float:
     return max(max(a, b), max(c, d))
 
 
-@core
+@shared
 def normalise(B: Array, L: int) -> float:
     """Weights from their logarithms, zeros beyond; returns log sum, or NaN where no leaf is possible."""
     top = largest(B[LOG], L)
@@ -95,7 +95,7 @@ def normalise(B: Array, L: int) -> float:
     return float(gone)
 
 
-@core
+@shared
 def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
     """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2); spec, section 8."""
     B, unknown = t.leaves, t.unknown > 0
@@ -104,7 +104,7 @@ def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
         store(X, row, l, only(ratio, load(B, WEIGHT, l)))
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def mixture(n: int, t: Any, L: int) -> None:
     """Mean and covariance (lower triangle) of all leaves, spec section 4: sum w m, sum w (C + d d'), d = m - mean."""
     B, X, theta, P = t.leaves, t.scratch, t.theta, t.cov
@@ -139,7 +139,7 @@ def mixture(n: int, t: Any, L: int) -> None:
             at += 1
 
 
-@core
+@shared
 def priors(t: Any, L: int, expanded: bool) -> None:
     """prior[e, l] = p(next event is e | leaf): one row for all, or the row of the chain for the leaf's last event.
 
@@ -165,7 +165,7 @@ def priors(t: Any, L: int, expanded: bool) -> None:
                 prior[e, l] = P[event[l], e]
 
 
-@core
+@shared
 def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
     """Further steps of the chain of events; X has a row for each of them."""
     H = len(prior)
@@ -181,7 +181,7 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
                 prior[e, l] = X[e, l]
 
 
-@core
+@shared
 def standstill(prior: Array, L: int, Hm: int) -> None:
     """No time passes, so nothing changes: the sensors keep their shares, all changes but the first have none."""
     for l in range(L):
@@ -193,7 +193,7 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
             prior[j, l] = share
 
 
-@core
+@shared
 def increments(t: Any, time: float, each: float) -> None:
     """Q[i] = lower triangle of the covariance that change i adds in this interval.
 
@@ -210,7 +210,7 @@ def increments(t: Any, time: float, each: float) -> None:
                 Q[i, k * (k + 1) // 2 + k] += relative[i, k] * (unit / powers[k]) * span
 
 
-@core
+@shared
 def ready(t: Any) -> None:
     """Covariances of changes as leaves take them in: as they are."""
 
@@ -247,7 +247,7 @@ def spread(C: Array, z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
         store(expected, 1, l, y)
 
 
-@core
+@shared
 def blur(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
     B, C, m, Q, prior, chance, n = t.leaves, t.C, t.m, t.Q, t.prior, t.spare[0], t.n

@@ -1,6 +1,6 @@
 """The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the machine of `driftfit.trackers.bank.machine.advance` with those parts exchanged that work on covariances, so
+It is the machine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
 that everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
 `driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
 are factorised once a sample.
@@ -15,8 +15,9 @@ from functools import cache
 from typing import Any
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, Outside, core, exchanged
+from driftfit.engine.kernel import Array, Machine, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
+from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
@@ -26,14 +27,14 @@ from driftfit.trackers.bank.machine import advance, grow, lookahead, merge, refi
 covariance_begin = start.begin
 
 
-@core
+@shared
 def ready(t: Any) -> None:
     """`leaves.ready`: factorised."""
     for i in range(len(t.walks)):
         factorise(t.Q[i], t.n, 0.0)
 
 
-@core
+@shared
 def begin(t: Any, nu: float, squares: float) -> None:
     """`start.begin`, factorised."""
     covariance_begin(t, nu, squares)
@@ -41,7 +42,7 @@ def begin(t: Any, nu: float, squares: float) -> None:
     factorise(t.leaves[FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 1.0)
 
 
-@core
+@shared
 def mixture(n: int, t: Any, L: int) -> None:
     """`leaves.mixture`, multiplied out."""
     B, X, theta = t.leaves, t.scratch, t.theta
@@ -69,7 +70,7 @@ def mixture(n: int, t: Any, L: int) -> None:
             t.cov[i, j] = sum_of(sums)
 
 
-@core
+@shared
 def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
     """`leaves.spread`, but with f = U'z in g."""
     for l in range(0, L, WIDTH):
@@ -80,7 +81,7 @@ def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
         store(expected, 1, l, y)
 
 
-@core
+@shared
 def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
     """`grow.correct`; what the uncertainty of lags adds to z'C z counts as noise."""
     B, C, m, g, expected, scores, b = t.leaves, t.C, t.m, t.g, t.expected, t.scores, t.narrow
@@ -99,7 +100,7 @@ def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> No
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(gain, load(b, i, 0))))
 
 
-@core
+@shared
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     """`grow.ahead`. An eight may reach into the columns of the next change, which are written after it."""
     A, V, Hd, Hm = t.parents, t.narrow, len(t.walks), len(t.sensors)
@@ -113,7 +114,7 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     return int(columns)
 
 
-@core
+@shared
 def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
     """`forget.foresee`. Where all changes walk the variance of the forecast needs no factor of what may happen."""
     B, m, n, V = t.leaves, t.m, t.n, t.narrow
@@ -132,7 +133,7 @@ def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
             blur(t, l, Hd, Hm, V)
 
 
-@core
+@shared
 def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
     A, B, n = t.parents, t.leaves, t.n
@@ -152,7 +153,7 @@ def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     condense(W, count, n, A, to)
 
 
-@core
+@shared
 def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
     """The columns of a leaf's factor as columns of W, their D times ``share`` below them."""
     at = FIRST + n
@@ -166,14 +167,14 @@ def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
         at += j + 1
 
 
-@core
+@shared
 def widen(t: Any, weight: Array, X: Array) -> None:
     """`refilter.widen`."""
     for e in range(len(t.walks)):
         raised(t.root[FIRST + t.n :], t.n, 0, t.Q[e], fill(weight[e]), t.narrow)
 
 
-@core
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """`lookahead.width`."""
     lags, wide, at = FIRST + n + n * (n + 1) // 2, 0.0, 0
@@ -190,13 +191,13 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 
 
 @cache
-def made() -> tuple[Outside, TrackerSteps]:
+def made() -> tuple[Machine, TrackerSteps]:
     """The machine and the steps that run it."""
     others = {
         leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
         forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
         refilter.widen: widen, lookahead.width: width,
     }  # fmt: skip
-    (machine,) = exchanged([advance.bank], others)
-    correct_step, begin_step = exchanged([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
+    (machine,) = substituted([advance.bank], others)
+    correct_step, begin_step = substituted([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
     return machine, steps.STEPS._replace(correct=correct_step, begin=begin_step)

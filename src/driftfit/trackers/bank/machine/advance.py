@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from driftfit.engine.kernel import Array, core, outside
+from driftfit.engine.kernel import Array, machine, shared
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
@@ -93,7 +93,7 @@ MOST_STEPS = 1000
 """Steps of a chain of events that an interval may have."""
 
 
-@outside
+@machine
 def bank(address: int) -> None:
     """One sample, by the table of a bank. One that is refused as a fault code is done again, as missing."""
     t = table_at(address)
@@ -115,7 +115,7 @@ def bank(address: int) -> None:
     note(t, head[1])
 
 
-@core
+@shared
 def advance(t: Any) -> None:
     """One sample of a tree that has begun."""
     counters, sample = t.counters, t.sample
@@ -141,7 +141,7 @@ def advance(t: Any) -> None:
         sample[LAST] = sample[IN_Y]
 
 
-@core
+@shared
 def prepare(t: Any) -> None:
     """What may happen in this interval: the prior of the events, and what changes add to a covariance."""
     counters, dt, used, Hm = t.counters, t.sample[IN_DT], t.sample[IN_OK] > 0.0, len(t.sensors)
@@ -167,7 +167,7 @@ def prepare(t: Any) -> None:
         for_interval(t.maps_nominal, dt, t.maps)
 
 
-@core
+@shared
 def copy(P: Array, to: Array) -> None:
     """All entries of a matrix."""
     for i in range(P.shape[0]):
@@ -175,14 +175,14 @@ def copy(P: Array, to: Array) -> None:
             to[i, j] = P[i, j]
 
 
-@core
+@shared
 def increments_now(t: Any) -> None:
     """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
     time, dt = t.sample[IN_TIME], t.sample[IN_DT]
     increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
 
 
-@core
+@shared
 def forecast(t: Any, L: int) -> None:
     """Mean and variance of the output before it comes: every leaf with all that may happen to it.
 
@@ -204,7 +204,7 @@ def forecast(t: Any, L: int) -> None:
         sample[Y_HAT], sample[S2] = expect(t, L)
 
 
-@core
+@shared
 def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
     """Probabilities of the events of this interval, or of the ``whole`` gap, for every leaf."""
     dt, Hm, wide = t.sample[IN_DT], len(t.sensors), t.counters[WIDE] > 0
@@ -217,7 +217,7 @@ def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
         chances(t.prior, L, Hm, t.gap, whole)
 
 
-@core
+@shared
 def take_in(t: Any) -> None:
     """A sample that is used: reduce, grow, weigh, and decide which leaves go on."""
     counters, sample, prior, kind = t.counters, t.sample, t.prior, int(t.reduction[KIND])
@@ -258,7 +258,7 @@ def take_in(t: Any) -> None:
     choose(t, counters[LEAVES])
 
 
-@core
+@shared
 def accept(t: Any, gone: float) -> None:
     """Some leaf allows the sample, whose log density under all of them is ``gone``."""
     counters = t.counters
@@ -273,7 +273,7 @@ def accept(t: Any, gone: float) -> None:
         close(t.gap)
 
 
-@core
+@shared
 def reject(t: Any, K: int) -> None:
     """No leaf allows what was seen: go on as if it had not been."""
     counters = t.counters
@@ -286,7 +286,7 @@ def reject(t: Any, K: int) -> None:
     shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
 
 
-@core
+@shared
 def let_pass(t: Any, L: int) -> None:
     """A sample that is not used: what time does to the leaves."""
     counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
@@ -314,7 +314,7 @@ def let_pass(t: Any, L: int) -> None:
     counters[FLOORS] += 1
 
 
-@core
+@shared
 def choose(t: Any, L: int) -> None:
     """Which leaves go on, spec section 5; `reduce` does it before the next sample that is used."""
     counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
@@ -332,7 +332,7 @@ def choose(t: Any, L: int) -> None:
         counters[GROUPS] = hybrid(t, L)
 
 
-@core
+@shared
 def reduce(t: Any) -> int:
     """Carry out what `choose` said: the parents of the next floor, whose number is returned."""
     counters, L, kind, order = t.counters, t.counters[LEAVES], int(t.reduction[KIND]), t.order
@@ -364,7 +364,7 @@ def reduce(t: Any) -> int:
     return int(G)
 
 
-@core
+@shared
 def refused(sample: Array, counters: Array) -> bool:
     """Whether a sample is so far from what was expected that it is taken for a fault code: it counts as missing.
 
@@ -381,14 +381,14 @@ def refused(sample: Array, counters: Array) -> bool:
     return False
 
 
-@core
+@shared
 def certain(prior: Array, L: int) -> None:
     """The first event, for sure."""
     for l in range(L):
         prior[0, l] = 1.0
 
 
-@core
+@shared
 def keep_sample(t: Any) -> None:
     """Store the sample for growing the tree again, or for looking ahead."""
     kept = t.samples[t.counters[STORED] % len(t.samples)]
@@ -398,7 +398,7 @@ def keep_sample(t: Any) -> None:
     t.counters[STORED] += 1
 
 
-@core
+@shared
 def recover(A: Array, K: int, B: Array, rows: int) -> int:
     """The parents again, as if the sample had not come."""
     for row in range(rows):
@@ -408,7 +408,7 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
     return K
 
 
-@core
+@shared
 def lone_density(sample: Array) -> float:
     """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none."""
     far, s = sample[IN_Y] - sample[Y_HAT], sample[S2]
@@ -417,7 +417,7 @@ def lone_density(sample: Array) -> float:
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
     """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
     H = len(P)
@@ -432,7 +432,7 @@ def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
                     moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
 
 
-@core
+@shared
 def note(t: Any, window: float) -> None:
     """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
     known at last of the event W - 1 floors back.

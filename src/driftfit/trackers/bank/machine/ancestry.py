@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves.leaves import WEIGHT
 from driftfit.trackers.bank.machine.layout import EXPANDED, FLIPPED, PARENTS, flip
@@ -45,7 +45,7 @@ def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, 
         store(T2, to, block + k, times(load(T, of, k), load(news, quiet, block + k)))
 
 
-@core
+@shared
 def write_out(t: Any, L: int) -> None:
     """The histories of the children, from those of their parents."""
     H, Hm = len(t.initial), len(t.sensors)
@@ -56,7 +56,7 @@ def write_out(t: Any, L: int) -> None:
     t.counters[EXPANDED] = 1
 
 
-@core
+@shared
 def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
     """One more floor of which nothing was seen: its events are as likely as before."""
     H = len(prior)
@@ -74,7 +74,7 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
             T[l, k] *= quiet
 
 
-@core
+@shared
 def pick(t: Any, G: int) -> None:
     """The histories of leaves that were kept as they were, in `order`."""
     H, Hm = len(t.initial), len(t.sensors)
@@ -89,7 +89,7 @@ def pick(t: Any, G: int) -> None:
     flip(t)
 
 
-@core
+@shared
 def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
     """Row ``to`` of T2: the average over the members."""
     for at in range(0, T.shape[1], WIDTH):
@@ -99,7 +99,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
         store(T2, to, at, total)
 
 
-@core
+@shared
 def summary(lags: Array, newest: Array) -> None:
     """The newest floors, and the oldest."""
     last = len(newest) - 1
@@ -109,7 +109,7 @@ def summary(lags: Array, newest: Array) -> None:
             newest[k, e] = lags[row, e]
 
 
-@core
+@shared
 def marginals(t: Any, L: int) -> float:
     """lag_prob[k, e] = p(event e, k floors back), spec section 4; returns the probability of a change among the floors
     of the histories.

@@ -23,7 +23,7 @@ Cost: O(H n^2) for each sample that is not used.
 
 from __future__ import annotations
 
-from driftfit.engine.kernel import Array, core, exp, log
+from driftfit.engine.kernel import Array, exp, log, shared
 from driftfit.engine.simd import WIDTH
 
 SINCE, NOW, SCALE, MORE = range(4)
@@ -32,7 +32,7 @@ and in the first row how many changes follow the first of an interval on average
 """
 
 
-@core
+@shared
 def odds(gap: Array, row: Array, Hm: int, dt: float, told: bool) -> None:
     """The chances of this interval; those that were ``told`` are of the interval, whatever its length."""
     at = gap.shape[1] - WIDTH
@@ -55,7 +55,7 @@ def odds(gap: Array, row: Array, Hm: int, dt: float, told: bool) -> None:
             gap[i, at + NOW], gap[i, at + SCALE] = 1.0 if i == 0 else 0.0, 1.0
 
 
-@core
+@shared
 def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
     """Q, of one change each, becomes that of the floor. A sample that is not ``used`` leaves it to the next one."""
     at = gap.shape[1] - WIDTH
@@ -81,7 +81,7 @@ def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
                     gap[i, k] = kept
 
 
-@core
+@shared
 def chances(prior: Array, L: int, Hm: int, gap: Array, whole: bool) -> None:
     """The prior of one nominal sample becomes that of the interval, or of the ``whole`` gap."""
     at = gap.shape[1] - WIDTH
@@ -96,7 +96,7 @@ def chances(prior: Array, L: int, Hm: int, gap: Array, whole: bool) -> None:
                 prior[i * Hm + j, l] = now * prior[i * Hm + j, l] + first * share
 
 
-@core
+@shared
 def extend(gap: Array) -> None:
     """A sample that is not used makes the gap longer."""
     at = gap.shape[1] - WIDTH
@@ -105,14 +105,14 @@ def extend(gap: Array) -> None:
     gap[0, at + SINCE] *= gap[0, at + NOW]
 
 
-@core
+@shared
 def close(gap: Array) -> None:
     """A sample was used."""
     for i in range(len(gap)):
         gap[i, gap.shape[1] - WIDTH + SINCE] = 1.0 if i == 0 else 0.0
 
 
-@core
+@shared
 def widen(gap: Array, unit: float, P: Array) -> None:
     """The covariance of the mixture with what may have happened in the gap; ``unit`` is what that is in units of."""
     at = gap.shape[1] - WIDTH
@@ -124,7 +124,7 @@ def widen(gap: Array, unit: float, P: Array) -> None:
                 k += 1
 
 
-@core
+@shared
 def take_back(T: Array, L: int, floors: int, gap: Array, H: int, Hm: int) -> None:
     """The floors of a gap, whose changes are told of by the floor that ends it: they changed nothing themselves."""
     block, width = H + 1, T.shape[1]

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, log, part, sized
+from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
@@ -54,7 +54,7 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
     return K * len(t.walks)
 
 
-@core
+@shared
 def develop_own(t: Any, K: int) -> int:
     """The same where parent l stands for the joint event l."""
     A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
@@ -70,7 +70,7 @@ def develop_own(t: Any, K: int) -> int:
     return K
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     """What the parents and all that may happen to them expect of the sample; returns the number of columns."""
     columns = develop(n, t, K, own)
@@ -79,7 +79,7 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
     return int(columns)
 
 
-@sized
+@part(sizes=(2, 3, 4))
 def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
     """The data in the leaves from column ``at`` on, spec section 3; the last two rows of `scores` take eps^2 / s and s.
 
@@ -103,7 +103,7 @@ def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> No
             entry += 1
 
 
-@core
+@shared
 def leave(t: Any, at: int, columns: int) -> None:
     """The leaves from column ``at`` on, under a sensor that says nothing of theta."""
     B, C, m, n = t.leaves, t.C, t.m, t.n
@@ -114,7 +114,7 @@ def leave(t: Any, at: int, columns: int) -> None:
             store(B, FIRST + n + k, at + l, load(C, k, l))
 
 
-@core
+@shared
 def gaussian(X: Array, columns: int) -> None:
     """Row 0 of X: log N(eps; 0, s), where eps^2 / s and s are in the two rows after it."""
     for l in range(0, columns, WIDTH):
@@ -122,7 +122,7 @@ def gaussian(X: Array, columns: int) -> None:
         store(X, 0, l, times(fill(-0.5), far))
 
 
-@core
+@shared
 def student(t: Any, at: int, columns: int) -> None:
     """The same in `scores` with unknown variance, spec section 8; nu and S of the leaves from column ``at`` on take the
     sample in.
@@ -148,7 +148,7 @@ def student(t: Any, at: int, columns: int) -> None:
         store(B, S, at + l, higher(plus(scale, far), times(fill(least), more)))
 
 
-@core
+@shared
 def frozen(t: Any, at: int, columns: int, y: float, last: float, width: float) -> None:
     """Log density of the last output again, N(y; last, width), in the first row of `scores`; a width below zero is in
     variances of the noise.
@@ -162,7 +162,7 @@ def frozen(t: Any, at: int, columns: int, y: float, last: float, width: float) -
         out[l] = -0.5 * (LOG_2PI + log(wide) + far * far / wide) if abs(last) < np.inf else -np.inf
 
 
-@core
+@shared
 def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: float) -> int:
     """The leaves that K parents grow by a sample, with their weights not normalised; returns how many there are.
 
@@ -195,7 +195,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
     return columns * len(sensors)
 
 
-@core
+@shared
 def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
     """A row of children as their parents have it."""
     A, B = t.parents, t.leaves
@@ -204,7 +204,7 @@ def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
             B[row, np.uint64(c + l)] = A[row, l]
 
 
-@core
+@shared
 def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None:
     """Output lags of the children: the parent's, one later, and y or what the leaf expected."""
     A, B, expected, n, na, r, most = t.parents, t.leaves, t.expected, t.n, t.output_lags, t.sample[R], t.sample[MOST]
@@ -218,7 +218,7 @@ def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None
         B[first, np.uint64(at + l)] = expected[1, l] if believed else y
 
 
-@core
+@shared
 def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
     """log w+ = log w + log p(event | leaf) + log N of the children under sensor j, spec section 3; their ages, whose
     children they are, and by which event.
@@ -248,7 +248,7 @@ def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
             parents[np.uint64(to + l)], events[np.uint64(to + l)] = l, e
 
 
-@core
+@shared
 def encode(t: Any, K: int, at: int, columns: int, j: int) -> None:
     """The codes of the children; `bases` limits the three codes, and 1 keeps none."""
     A, B, events, bases, Hd, Hm = t.parents, t.leaves, t.event, t.bases, len(t.walks), len(t.sensors)

@@ -12,6 +12,7 @@ parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors,
     slots                   a table of hashes for numbering groups
     prior                   p(next joint event | leaf), (H, leaves)
     walks, relative_walks   covariances that changes add in a nominal sample; in units of r / (mean square of phi_i)
+    fixed_walks             the first of these for theta, where `machine.framed` writes them in other coordinates
     drift                   factors of the drift of every change at this sample
     Q                       covariances that changes add in this interval, and a spare row
     maps, maps_nominal      changes that forget (`leaves.forget`), for this interval and for a nominal one
@@ -72,9 +73,9 @@ TOLD = 8
 """Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
 
 MATRICES = (
-    "parents", "leaves", "history", "history_2", "prior", "walks", "relative_walks", "maps", "maps_nominal", "places",
-    "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring", "new_events", "gap",
-    "chain", "lag_prob", "scratch",
+    "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
+    "maps_nominal", "places", "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
+    "new_events", "gap", "chain", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
 WHOLE = ("parent", "event", "start", "order", "group", "slots")

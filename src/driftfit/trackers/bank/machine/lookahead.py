@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, exp
+from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
@@ -29,7 +29,7 @@ SMALL = 1e-9
 """Components of less weight than this are left out of the nodes, though not of the integral."""
 
 
-@core
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """z' (keep C + Q) z of a leaf."""
     lags, at, wide = FIRST + n + n * (n + 1) // 2, 0, 0.0
@@ -42,7 +42,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
     return wide
 
 
-@core
+@shared
 def density_parts(t: Any, L: int, top: float, mass: float, phi: Array) -> int:
     """Components of the predictive density as columns: oldest event, weight, mean, standard deviation."""
     B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
@@ -76,7 +76,7 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array) -> int:
     return count
 
 
-@core
+@shared
 def sort(x: Array, count: int) -> None:
     """Ascending, in place, by Shell's method."""
     gap = count // 2
@@ -90,7 +90,7 @@ def sort(x: Array, count: int) -> None:
         gap = gap * 5 // 11 if gap != 2 else 1
 
 
-@core
+@shared
 def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> float:
     """int min_k sum_e L[e, k] f_e(y) dy over all components."""
     H = len(loss)
@@ -122,7 +122,7 @@ def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> 
     return total
 
 
-@core
+@shared
 def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array) -> float:
     """ER for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
     components = t.components

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
@@ -17,9 +18,8 @@ from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.machine.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
 from driftfit.trackers.bank.machine.lookahead import NODES
-
-if TYPE_CHECKING:
-    from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.reduction import Reduction
+from driftfit.trackers.bank.sensor import Sensor
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -27,11 +27,29 @@ RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
 
-def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+class Settings(Protocol):
+    """The settings of a `Bank`, as far as its memory depends on them."""
+
+    @property
+    def all_changes(self) -> tuple[Change, ...]: ...
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]: ...
+    @property
+    def reduction(self) -> Reduction: ...
+    @property
+    def event_probabilities(self) -> tuple[Array, Array]: ...
+    @property
+    def lag_variance(self) -> bool: ...
+    @property
+    def form(self) -> str: ...
+
+
+def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
     """The arrays of `driftfit.trackers.bank.machine.layout` before the first sample, but for fields of the state and
     windows of the scratch; covariances are multiplied by ``unit``.
     """
-    shape, Hd, Hm, H = bank._shape, len(bank.all_changes), len(bank.all_sensors), bank._count
+    Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
+    shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
     tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
@@ -57,7 +75,7 @@ def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[s
     }  # fmt: skip
 
 
-def _of_changes(bank: Bank, n: int, unit: float, theta0: Array) -> dict[str, Array]:
+def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
     """Those that say what may happen to theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _eights(tri)
@@ -66,10 +84,11 @@ def _of_changes(bank: Bank, n: int, unit: float, theta0: Array) -> dict[str, Arr
     places[forget.MEAN], places[forget.CAP] = theta0, np.inf
     if forgets:
         places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
-    transition, initial = bank._events
+    transition, initial = bank.event_probabilities
     maps = np.array([change.mapping() for change in changes])
+    walks = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
     return {
-        "walks": np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps]),
+        "walks": walks, "fixed_walks": walks,
         "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
         "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "transition": transition,
         "chain": transition.copy(),

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
 from driftfit.trackers.bank.leaves.lags import merge_covariance
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
@@ -26,7 +26,7 @@ from driftfit.trackers.bank.machine.ancestry import average
 from driftfit.trackers.bank.machine.layout import FLIPPED, flip
 
 
-@core
+@shared
 def digamma(x: float) -> float:
     total = 0.0
     while x < 8.0:
@@ -39,7 +39,7 @@ def digamma(x: float) -> float:
     )  # fmt: skip
 
 
-@core
+@shared
 def trigamma(x: float) -> float:
     total = 0.0
     while x < 8.0:
@@ -49,7 +49,7 @@ def trigamma(x: float) -> float:
     return total + (1.0 + 0.5 / x + f * (1.0 / 6.0 - f * (1.0 / 30.0 - f * (1.0 / 42.0 - f / 30.0)))) / x
 
 
-@core
+@shared
 def freedom(t: float, start: float) -> float:
     """nu with psi(nu/2) - log(nu/2) = t < 0, by Newton's method in log nu."""
     x = 0.5 * start
@@ -63,7 +63,7 @@ def freedom(t: float, start: float) -> float:
     return 2.0 * x
 
 
-@core
+@shared
 def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     """The covariance of parent ``to``, whose mean stands there already: sum w (C_l + g_l d_l d_l'); X is spare."""
     B, A, n, unknown = t.leaves, t.parents, t.n, t.unknown > 0
@@ -78,7 +78,7 @@ def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
                 at += 1
 
 
-@core
+@shared
 def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     """Parent ``to`` from the members, which have the given shares, summing to 1; X is spare."""
     B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
@@ -110,7 +110,7 @@ def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
         A[S, to] = A[NU, to] / g
 
 
-@core
+@shared
 def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
     """Members of group k are order[start[k] : start[k + 1]]; returns how many leaves are in some group."""
     for k in range(G + 1):
@@ -130,7 +130,7 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
     return int(start[G])
 
 
-@core
+@shared
 def combine(t: Any, L: int, G: int) -> float:
     """A parent, and its history, for every group that `sort` put in order; returns the mass that is left."""
     A, B, start, order, X = t.parents, t.leaves, t.start, t.order, t.scratch
@@ -155,7 +155,7 @@ def combine(t: Any, L: int, G: int) -> float:
     return kept
 
 
-@core
+@shared
 def take(t: Any, G: int) -> float:
     """Leaves that are kept as they are, in `order`, of which only the rows that are in use; returns their mass."""
     A, B, order, bases, unknown = t.parents, t.leaves, t.order, t.bases, t.unknown > 0
@@ -176,7 +176,7 @@ def take(t: Any, G: int) -> float:
     return kept
 
 
-@core
+@shared
 def mix(t: Any, L: int) -> int:
     """Interaction (IMM), spec section 5: parent e goes on from all leaves that may lead to event e, with the weights
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.layout import FLIPPED
@@ -21,7 +21,7 @@ Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""
 
 
-@core
+@shared
 def widen(t: Any, weight: Array, X: Array) -> None:
     """C + sum w_i Q_i of the root; X is spare."""
     root, n, Q = t.root, t.n, t.Q
@@ -30,7 +30,7 @@ def widen(t: Any, weight: Array, X: Array) -> None:
             root[FIRST + n + k, 0] += weight[e] * Q[e, k]
 
 
-@core
+@shared
 def refilter(t: Any, L: int) -> int:
     """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
     among the parents.
@@ -54,7 +54,8 @@ def refilter(t: Any, L: int) -> int:
     for k in range(len(root)):
         A[k, 0] = root[k, 0]
     A[LOG, 0] = 0.0
-    L = floor(t, min(D, 1), samples[0])
+    L = min(D, 1)
+    floor(t, L, samples[0])
     for k in range(len(root)):
         root[k, 0] = A[k, 0] = B[k, 0]
     root[LOG, 0] = A[LOG, 0] = A[CODE, 0] = 0.0
@@ -75,7 +76,7 @@ def refilter(t: Any, L: int) -> int:
     return L
 
 
-@core
+@shared
 def histories(t: Any, L: int) -> None:
     """The histories of the new tree: what happened in the D - 1 floors that it has."""
     A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
@@ -92,7 +93,7 @@ def histories(t: Any, L: int) -> None:
             T[l, k * block + e], T[l, k * block + H] = 1.0, quiet
 
 
-@core
+@shared
 def floor(t: Any, K: int, sample: Array) -> int:
     """One floor of the new tree, with a stored sample."""
     return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))

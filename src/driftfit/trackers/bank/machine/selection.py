@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.trackers.bank.machine.layout import CLOCK, HELD
@@ -35,7 +35,7 @@ def reached(V: Array, row: int, count: int, value: float) -> float:
     return float(sum_of(sums))
 
 
-@core
+@shared
 def bound(V: Array, row: int, count: int, M: int) -> float:
     """The M-th largest entry of a row, or any number between it and the next; 0 if no more than M are positive.
 
@@ -55,7 +55,7 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
     return float(np.int64(low).view(np.float64))
 
 
-@core
+@shared
 def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
     many. What follows in the row, up to the next eight, must be zero; ``ranks`` (1, count) is overwritten.
@@ -94,13 +94,13 @@ def clear(V: Array, row: int, count: int) -> None:
         V[row, l] = 0.0
 
 
-@core
+@shared
 def beam(t: Any, L: int) -> int:
     """The heaviest leaves."""
     return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order, t.scratch[2:3]))
 
 
-@core
+@shared
 def merge(t: Any, L: int) -> int:
     """Leaves of one code become one; codes are numbered as they come."""
     B, group, slots, G = t.leaves, t.group, t.slots, 0
@@ -117,7 +117,7 @@ def merge(t: Any, L: int) -> int:
     return G
 
 
-@core
+@shared
 def hybrid(t: Any, L: int) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
     B, group, slots, X, bases = t.leaves, t.group, t.slots, t.scratch, t.bases
@@ -151,7 +151,7 @@ def hybrid(t: Any, L: int) -> int:
     return G
 
 
-@core
+@shared
 def decide(t: Any, L: int, phi: Array) -> None:
     """Resolve the oldest events while the rule says so, spec section 5.
 
@@ -182,7 +182,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
     t.counters[HELD] = held
 
 
-@core
+@shared
 def oldest(t: Any, L: int, top: float, p: Array) -> float:
     """The weights of the oldest events in p, whose digit in the codes counts ``top``; returns their sum."""
     mass = 0.0
@@ -195,7 +195,7 @@ def oldest(t: Any, L: int, top: float, p: Array) -> float:
     return mass
 
 
-@core
+@shared
 def least_risk(loss: Array, p: Array, mass: float, risk: Array) -> int:
     """The event of least risk R_k = sum_e L[e, k] p_e among those with p_k > 0, the lowest on ties; p becomes p / mass,
     and risk R.
@@ -212,7 +212,7 @@ def least_risk(loss: Array, p: Array, mass: float, risk: Array) -> int:
     return best
 
 
-@core
+@shared
 def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi: Array) -> bool:
     """Whether the oldest event is decided now: at full depth, where its risk is small, or where waiting does not pay,
     R* <= c + ER.
@@ -228,7 +228,7 @@ def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi
     return wait > 0.0 and (risk <= wait or risk <= wait + expected_risk(t, L, top, mass, phi))  # type: ignore[no-any-return]
 
 
-@core
+@shared
 def number(group: Array, L: int, order: Array) -> int:
     """Groups of single leaves in their order."""
     G = 0

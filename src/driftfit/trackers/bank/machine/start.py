@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, core
+from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.leaves.lags import push
 from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.layout import (
@@ -30,7 +30,7 @@ GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
 
 
-@core
+@shared
 def wait(t: Any) -> None:
     """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
     counters, sample = t.counters, t.sample
@@ -44,7 +44,7 @@ def wait(t: Any) -> None:
         begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
 
 
-@core
+@shared
 def begin(t: Any, nu: float, squares: float) -> None:
     """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
     B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
@@ -64,7 +64,7 @@ def begin(t: Any, nu: float, squares: float) -> None:
     counters[LEAVES], counters[GROUPS], counters[EXPANDED], counters[SETTLED] = 1, 1, 1, 1
 
 
-@core
+@shared
 def trace(P: Array) -> float:
     total = 0.0
     for i in range(len(P)):

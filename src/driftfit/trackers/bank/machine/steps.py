@@ -9,6 +9,7 @@ from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothi
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.machine.advance import bank
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.bank.machine.layout import (
     COUNT,
@@ -40,7 +41,8 @@ from driftfit.trackers.bank.machine.layout import (
     Y_HAT,
     R,
 )
-from driftfit.trackers.parts.diffuse import MACHINES, enter, measurement, spanned_variance, wander
+from driftfit.trackers.parts.coordinates import FRAME, whiten_within
+from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
 
@@ -83,12 +85,13 @@ def only_drifted(s: State, l: int) -> None:
 @kernel
 def point(s: State) -> None:
     """Write where the arrays are into the table."""
+    framed = s.framed[0] > 0
     s.table[MEMORY_AT, 0, 0] = s.memory.ctypes.data
     s.table[REPORT_AT, 0, 0] = s.report.ctypes.data
-    s.table[PHI_AT, 0, 0] = s.phi.ctypes.data
-    s.table[POWERS_AT, 0, 0] = s.c.ctypes.data
-    s.table[THETA_AT, 0, 0] = s.theta.ctypes.data
-    s.table[COV_AT, 0, 0] = s.P.ctypes.data
+    s.table[PHI_AT, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
+    s.table[POWERS_AT, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
+    s.table[THETA_AT, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
+    s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
     s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
     s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
 
@@ -108,7 +111,7 @@ def run(s: State, l: int) -> None:
 @kernel
 def among(s: State, l: int) -> None:
     """The same for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
-    n, N, size = s.theta.shape[0], s.memory.shape[0], s.report.shape[0]
+    n, N, size, framed = s.theta.shape[0], s.memory.shape[0], s.report.shape[0], s.framed[l] > 0
     memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
     vectors = report + 8 * size
     P = vectors + 24 * n
@@ -125,11 +128,11 @@ def among(s: State, l: int) -> None:
     for k in range(N):
         floats(memory, 1, N)[0, k] = s.memory[k, l]
     for i in range(n):
-        floats(vectors, 3, n)[0, i] = s.phi[i, l]
-        floats(vectors, 3, n)[1, i] = s.c[i, l]
-        floats(vectors, 3, n)[2, i] = s.theta[i, l]
+        floats(vectors, 3, n)[0, i] = s.x[i, l] if framed else s.phi[i, l]
+        floats(vectors, 3, n)[1, i] = 0.0 if framed else s.c[i, l]
+        floats(vectors, 3, n)[2, i] = s.d[i, l] if framed else s.theta[i, l]
         for j in range(n):
-            floats(P, n, n)[i, j] = s.P[i, j, l]
+            floats(P, n, n)[i, j] = s.Pz[i, j, l] if framed else s.P[i, j, l]
     for k in range(SIZE):
         floats(sample, 1, SIZE)[0, k] = s.sample[k, l]
     for k in range(COUNT):
@@ -139,14 +142,16 @@ def among(s: State, l: int) -> None:
         s.memory[k, l] = floats(memory, 1, N)[0, k]
     for k in range(size):
         s.report[k, l] = floats(report, 1, size)[0, k]
-    for i in range(n):
-        s.theta[i, l] = floats(vectors, 3, n)[2, i]
-        for j in range(n):
-            s.P[i, j, l] = floats(P, n, n)[i, j]
     for k in range(SIZE):
         s.sample[k, l] = floats(sample, 1, SIZE)[0, k]
     for k in range(COUNT):
         s.counters[k, l] = wholes(counters, 1, COUNT)[0, k]
+    for i in range(n):
+        theta = floats(vectors, 3, n)[2, i]
+        s.d[i, l], s.theta[i, l] = theta if framed else s.d[i, l], s.theta[i, l] if framed else theta
+        for j in range(n):
+            entry = floats(P, n, n)[i, j]
+            s.Pz[i, j, l], s.P[i, j, l] = entry if framed else s.Pz[i, j, l], s.P[i, j, l] if framed else entry
 
 
 @kernel
@@ -177,10 +182,37 @@ def correct(s: State, l: int) -> None:
 @kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
-    only_drifted(s, l)
-    enter(s, l)
-    alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-    spanned_variance(s, l)
+    if s.counters[SETTLED, l] > 0:
+        in_coordinates(s, l)
+    else:
+        only_drifted(s, l)
+        enter(s, l)
+        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
+        if s.framed[l] > 0:
+            read_framed(s, l)
+        else:
+            spanned_variance(s, l)
+
+
+@kernel
+def in_coordinates(s: State, l: int) -> None:
+    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
+    column, y_hat = whiten_within(s, l), prediction(s, l)
+    tell_walks(s, l)
+    hand_over(s, l)
+    if column >= 0:
+        s.sample[IN_OK, l] = 0.0
+    run(s, l)
+    if column >= 0:
+        s.y_hat[l], s.s[l] = y_hat, np.inf
+        if s.ok[l] > 0.0:
+            enter_bank(s, column, l)
+    else:
+        s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+        s.ok[l], s.seen[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]
+    s.e[l] = s.y[l] - s.y_hat[l]
+    learn_scales(s, l)
+    read_framed(s, l)
 
 
 @kernel
@@ -189,10 +221,14 @@ def alone(s: State, l: int, counts: bool) -> None:
     learn_scales(s, l)
     if counts:
         learn_start(s, l)
+    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
     s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
-    ready = s.root[l] == 0 and (s.unknown[l] == 0 or s.count[l] >= RESIDUALS)
+    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
+        begin_framed(s, l)
+    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
     s.counters[SETTLED, l] = READY if ready else WAITING
     run(s, l)
     if ready:
@@ -223,4 +259,4 @@ def told(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=MACHINES)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=(*FRAME, *FRAMED))

@@ -10,6 +10,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, SETTLED
 
@@ -62,8 +63,9 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
         covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
+    means, covs = in_theta(lane, B[FIRST : FIRST + n].T.copy(), covs)
     ages = np.where(B[AGE] < NEVER, B[AGE], np.inf)
-    return Mixture(B[WEIGHT].copy(), B[FIRST : FIRST + n].T.copy(), covs, ages)
+    return Mixture(B[WEIGHT].copy(), means, covs, ages)
 
 
 def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:

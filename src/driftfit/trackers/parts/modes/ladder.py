@@ -70,6 +70,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
         "C": np.zeros((n, n, K)),
         "rare": 1.0,
         "leapt": 0.0,
+        "gained": 0.0,
     }
 
 
@@ -118,11 +119,13 @@ def leap(s: State, l: int, noise: float) -> None:
         unit += own * s.phi[i, l] * s.phi[i, l]
     wide = max(v, min(square, most * most * s.spread[l]))
     better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
-    s.rare[l], s.leapt[l] = 1.0, 0.0
+    s.rare[l], s.leapt[l], s.gained[l] = 1.0, 0.0, 0.0
     if better and unit > 0.0:
-        s.rare[l], s.leapt[l] = RARE, (wide - v) / unit
+        s.rare[l], s.leapt[l], s.gained[l] = RARE, (wide - v) / unit, wide - v
         for i in range(s.theta.shape[0]):
             own = s.leapt[l] * s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-            s.C[i, i, TOP, l] += own
-            s.gain[i, TOP, l] += own * s.phi[i, l]
-        s.h[TOP, l] += wide - v
+            for a in range(i + 1):
+                s.gain[a, TOP, l] += own * s.S[a, i, l] * s.phi[i, l]
+                for b in range(a + 1):
+                    s.C[a, b, TOP, l] += own * s.S[a, i, l] * s.S[b, i, l]
+        s.h[TOP, l] += s.gained[l]

@@ -39,8 +39,7 @@ class Window:
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
         if getattr(model, "output_noise", None) is not None:
             raise ValueError(
-                "Live: lag= does not know what the measurement noise of the model adds to each sample; smooth the "
-                "record, or leave output_noise out."
+                "Live: lag= does not support the output_noise of a model; smooth the record, or leave output_noise out."
             )
         prior = tracker.random_walk(model)
         n, r = model.n, 1.0 if prior.r is None else prior.r

@@ -1,29 +1,34 @@
 """K random-walk filters side by side: what each does with a sample, and what they say together.
 
-    e_k = y - phi' m_k,     g_k = C_k phi,     h_k = phi' g_k,     s_kj = h_k + v_j
+    e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_j
     p_kj  proportional to c_k nu_j N(e_k; 0, s_kj),
     a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
 with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
 levels. An outlier's level is as wide as the innovation where that is more than it would be: however far off, its
-influence does not grow. Until the regressors have spanned all directions the filters are those of an exact diffuse
-start (`driftfit.trackers.parts.diffuse`): a regressor outside the span is taken in by all of them, and says nothing
-about which one is right. Cost per sample: O(K n^2 + K J) for K filters and J levels.
+influence does not grow. The filters stand in the coordinates z = M theta of their start, in which the regressor is x
+(`driftfit.trackers.parts.coordinates`): any units, any offset, and directions that nothing is known of yet. A regressor
+that enters one of those is taken in by all filters, and says nothing about which one is right.
+
+The log density of a sample given those before it is that of the mixture as it was predicted,
+
+    log sum_k c_k (sum_{j<J} nu_j N(e_k; 0, s_kj) + nu_J Cauchy(e_k; s_kJ^(1/2)))
+
+The Cauchy distribution stands for an outlier, since the level that fits each one best has no density that integrates
+to 1. Cost per sample: O(K n^2 + K J) for K filters and J levels, and O(K n^3 / 6) for the drift.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import State, exp, kernel
-from driftfit.trackers.parts.diffuse import LEFT, SIZE, hand_over, take_in
-from driftfit.trackers.parts.drift_ladder import TOP, leap
+from driftfit.engine.kernel import State, exp, kernel, log
+from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
+from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.noise_levels import OUTLIER
 from driftfit.trackers.parts.resolution import lasting
-
-WIDE = 1e10
-"""Variance of the prediction in a direction of which nothing was known, beside all other variance of it."""
 
 LEAST = 1e-100
 """Probability that a filter is never below."""
@@ -35,10 +40,14 @@ def predict(s: State, l: int) -> None:
     if s.settled[l] > 0 and s.dt[l] > 0.0:
         for k in range(s.mu.shape[0]):
             s.prior[k, l] = s.mu[k, l]
-        for i in range(s.theta.shape[0]):
+        n = s.theta.shape[0]
+        for i in range(n):
             unit = s.r[l] * time / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-            for k in range(s.mu.shape[0]):
-                s.C[i, i, k, l] += s.ratio[i, k, l] * unit
+            for a in range(i + 1):
+                for b in range(a + 1):
+                    moved = unit * s.S[a, i, l] * s.S[b, i, l]
+                    for k in range(s.mu.shape[0]):
+                        s.C[a, b, k, l] += s.ratio[i, k, l] * moved
 
 
 @kernel
@@ -50,16 +59,16 @@ def innovate(s: State, l: int) -> None:
         s.h[k, l] = 0.0
     for i in range(n):
         for k in range(K):
-            s.e_k[k, l] += s.phi[i, l] * s.m[i, k, l]
+            s.e_k[k, l] += s.x[i, l] * s.m[i, k, l]
             s.gain[i, k, l] = 0.0
         for j in range(i + 1):
             for k in range(K):
-                s.gain[i, k, l] += s.C[i, j, k, l] * s.phi[j, l]
+                s.gain[i, k, l] += s.C[i, j, k, l] * s.x[j, l]
         for j in range(i + 1, n):
             for k in range(K):
-                s.gain[i, k, l] += s.C[j, i, k, l] * s.phi[j, l]
+                s.gain[i, k, l] += s.C[j, i, k, l] * s.x[j, l]
         for k in range(K):
-            s.h[k, l] += s.phi[i, l] * s.gain[i, k, l]
+            s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
     mean = 0.0
     for k in range(K):
         mean += s.prior[k, l] * s.e_k[k, l]
@@ -77,8 +86,8 @@ def innovate(s: State, l: int) -> None:
 
 
 @kernel
-def weigh(s: State, l: int) -> None:
-    """Joint probabilities of drift modes and noise levels after the sample."""
+def likelihoods(s: State, l: int) -> float:
+    """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest, factor = np.inf, s.noise[l] * s.leverage[l]
     more = lasting(s, l)
@@ -91,14 +100,47 @@ def weigh(s: State, l: int) -> None:
             v = s.h[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
             nearest = min(nearest, square / v)
-    total = 0.0
     for j in range(J):
         for k in range(K):
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
             p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l]) * exp(-0.5 * far)
-            p *= s.rare[l] if k == TOP else 1.0
-            s.joint[j, k, l] = p
-            total += p
+            s.joint[j, k, l] = p * (s.rare[l] if k == TOP else 1.0)
+    return nearest
+
+
+@kernel
+def predictive_density(s: State, nearest: float, l: int) -> None:
+    """The log density of the sample as it was predicted: without a leap, and with a tail that integrates to 1."""
+    K, J = s.mu.shape[0], s.nu.shape[0]
+    factor, more = s.noise[l] * s.leverage[l], lasting(s, l)
+    leapt = s.rare[l] < 1.0
+    ordinary, outlier = 0.0, 0.0
+    for j in range(J - 1):
+        for k in range(K):
+            ordinary += s.joint[j, k, l] if k != TOP or not leapt else 0.0
+        if leapt:
+            v = s.h[TOP, l] - s.gained[l] + factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
+            far = s.e_k[TOP, l] * s.e_k[TOP, l] / v - nearest
+            ordinary += s.prior[TOP, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
+    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l]) + more
+    for k in range(K):
+        v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+        outlier += s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+    tail = log(outlier / np.pi)
+    body = log(ordinary / np.sqrt(2.0 * np.pi)) - 0.5 * nearest if ordinary > 0.0 else -np.inf
+    s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
+
+
+@kernel
+def weigh(s: State, l: int) -> None:
+    """Joint probabilities of drift modes and noise levels after the sample, and its density before it."""
+    K, J = s.mu.shape[0], s.nu.shape[0]
+    nearest = likelihoods(s, l)
+    predictive_density(s, nearest, l)
+    total = 0.0
+    for j in range(J):
+        for k in range(K):
+            total += s.joint[j, k, l]
     for k in range(K):
         s.mu[k, l] = 0.0
     for j in range(J):
@@ -144,87 +186,51 @@ def update_filters(s: State, l: int) -> None:
 
 
 @kernel
+def outgrown(s: State, l: int) -> int:
+    """The first coordinate of which this sample tells `OUTGROWN` times as much as all before it, or -1."""
+    others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
+    for j in range(s.theta.shape[0]):
+        own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
+        if own > OUTGROWN * others:
+            return j
+        others += own
+    return -1
+
+
+@kernel
+def enter_filters(s: State, j: int, l: int) -> None:
+    """Row j of M becomes what is left of phi; all filters take in z_j from what is left of the innovation."""
+    n, K = s.theta.shape[0], s.mu.shape[0]
+    y_hat, e, v = s.y_hat[l], s.e[l], s.s[l]
+    for i in range(j, n):
+        s.x[i, l] = 0.0
+    innovate(s, l)
+    noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
+    sign = new_row(s, j, l)
+    for k in range(K):
+        for i in range(n):
+            s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]
+        s.C[j, j, k, l] = s.h[k, l] + noise
+        s.m[j, k, l] = sign * s.e_k[k, l]
+        s.mu[k, l] = s.prior[k, l]
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+    s.density[l] = -0.5 * (log(2.0 * np.pi * v) + e * e / v)
+
+
+@kernel
 def mixture(s: State, l: int) -> None:
-    """theta and its covariance from the filters; without a sample theta keeps its bits."""
+    """Mean d of the filters, and the covariance of theta; without a sample d keeps its bits."""
     for i in range(s.theta.shape[0]):
         mean = 0.0
         for k in range(s.mu.shape[0]):
             mean += s.mu[k, l] * s.m[i, k, l]
-        s.theta[i, l] = mean if s.ok[l] > 0.0 else s.theta[i, l]
+        s.d[i, l] = mean if s.ok[l] > 0.0 else s.d[i, l]
         for j in range(i + 1):
             total = 0.0
             for k in range(s.mu.shape[0]):
-                away = (s.m[i, k, l] - s.theta[i, l]) * (s.m[j, k, l] - s.theta[j, l])
+                away = (s.m[i, k, l] - s.d[i, l]) * (s.m[j, k, l] - s.d[j, l])
                 total += s.mu[k, l] * (s.C[i, j, k, l] + away)
             s.P[i, j, l] = total
-        s.var[i, l] = s.P[i, i, l]
-
-
-@kernel
-def determined(s: State, l: int) -> bool:
-    """Whether what the start has spanned is determined well enough for covariances to hold it."""
-    worst = 0.0
+    in_units_of_theta(s, l)
     for i in range(s.theta.shape[0]):
-        inflation = s.P[i, i, l] * s.work[SIZE, i, l] * s.work[SIZE, i, l]
-        worst = max(worst, inflation if s.S[i, i, l] > 0.0 else 0.0)
-    return worst <= s.worst[l]  # type: ignore[no-any-return]
-
-
-@kernel
-def enter_filters(s: State, l: int) -> bool:
-    """Take the sample into the square root of the start, and a regressor outside its span into all filters.
-
-    With N the vector of the free column that u = phi' N ends, C_k becomes C_k + w N N' before its correction, w so
-    large that what was known before has no say. An infinite w would divide by u, which may be all but rounding.
-
-    Returns whether the regressor was one.
-    """
-    n, K, v = s.theta.shape[0], s.mu.shape[0], s.s[l]
-    for j in range(n):
-        s.pivot[j, l] = 1.0 if s.S[j, j, l] == 0.0 else 0.0
-        for i in range(j + 1):
-            s.H[i, j, l] = s.R[i, j, l]
-    take_in(s, l)
-    hand_over(s, l)
-    innovated(s, l)
-    if s.s[l] < np.inf:
-        s.s[l] = v
-        return False
-    noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
-    for j in range(n):
-        if s.ok[l] > 0.0 and s.pivot[j, l] > 0.0 and s.S[j, j, l] > 0.0:
-            u, size = 0.0, 0.0
-            for i in range(j + 1):
-                u += s.phi[i, l] * s.H[i, j, l]
-                size += abs(s.phi[i, l] * s.H[i, j, l])
-            for k in range(K):
-                wide = WIDE * (s.h[k, l] + noise) / (size * size)
-                total = s.h[k, l] + wide * u * u + noise
-                for a in range(n):
-                    s.gain[a, k, l] += wide * u * s.H[a, j, l] if a <= j else 0.0
-                    s.m[a, k, l] += s.gain[a, k, l] / total * s.e_k[k, l]
-                    for b in range(a + 1):
-                        s.C[a, b, k, l] += wide * s.H[a, j, l] * s.H[b, j, l] if a <= j else 0.0
-                        s.C[a, b, k, l] -= s.gain[a, k, l] * s.gain[b, k, l] / total
-                s.mu[k, l] = s.prior[k, l]
-    return True
-
-
-@kernel
-def innovated(s: State, l: int) -> None:
-    """The prediction of the mixture and the innovation, after the start has written its own."""
-    mean = 0.0
-    for k in range(s.mu.shape[0]):
-        mean += s.prior[k, l] * (s.y[l] - s.e_k[k, l])
-    s.y_hat[l] = mean
-    s.e[l] = s.y[l] - mean
-
-
-@kernel
-def unseen_variance(s: State, l: int) -> None:
-    """An infinite variance for what no sample has told apart yet."""
-    n = s.theta.shape[0]
-    for i in range(n):
-        for j in range(i, n):
-            if s.S[j, j, l] == 0.0 and s.R[i, j, l] != 0.0:
-                s.var[i, l] = np.inf
+        s.var[i, l] = s.P[i, i, l]

@@ -117,7 +117,7 @@ def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
         raise ValueError(f"detect: {kind} carries no covariance, so no band can be judged.")
     if rule.kind == "innovation" and not tracker.covariance:
         raise ValueError(
-            f"detect: {kind} carries no covariance, so how large an innovation may be is not known; use FLS or Kalman."
+            f"detect: {kind} carries no covariance, so the size of an innovation cannot be judged; use FLS or Kalman."
         )
     if rule.kind == "probability" and not {CHANGE, REPORT} & set(tracker.outputs):
         raise ValueError(

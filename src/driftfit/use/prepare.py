@@ -26,7 +26,7 @@ import numpy as np
 from scipy import signal, stats
 
 from driftfit.data.clock import Clock, instants
-from driftfit.data.signals import as_numbers
+from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.run.result import Track
@@ -76,7 +76,7 @@ def _finite(before: Prepared, first: int | None) -> tuple[Array, int]:
     count = len(before) if first is None else whole("prepare", "first", first, 1)
     places = np.flatnonzero(np.isfinite(before.values[:count]))
     if not places.size:
-        raise ValueError(f"prepare: the first {count} samples hold no value.")
+        raise ValueError(f"prepare: the first {count} samples contain no value.")
     return places, count
 
 
@@ -110,7 +110,7 @@ def remove_trend(values: Any, first: int) -> Prepared:
     before = prepared(values)
     places, count = _finite(before, first)
     if places.size < 2:
-        raise ValueError(f"prepare: a trend needs two values; the first {count} samples hold one.")
+        raise ValueError(f"prepare: a trend needs two values; the first {count} samples contain one.")
     slope, level = np.polyfit(places, before.values[places], 1)
     line = level + slope * np.arange(len(before))
     return _shift(before, line, f"line {level:g} + {slope:g} t, fitted to the first {count}, removed")
@@ -123,7 +123,7 @@ def scale(values: Any, *, by: float | None = None, first: int | None = None) -> 
     """
     before = prepared(values)
     if (by is None) == (first is None):
-        raise ValueError("prepare: a scale is by= a number, or that of the first= samples; give one of the two.")
+        raise ValueError("prepare: give either by=, a number, or first=, the samples that determine the scale.")
     if by is None:
         places, _ = _finite(before, first)
         by = float(before.values[places].std())
@@ -155,7 +155,7 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
     one_of("resample", "how", how, ("mean", "last"))
     (axis, _), array, clock = instants(time), as_numbers("values", values), Clock.of(dt)
     if clock.kind not in ("number", "duration"):
-        raise ValueError(f"resample: a grid has a fixed interval, such as 10 or '1h'; got dt={dt!r}.")
+        raise ValueError(f"resample: a grid needs a fixed interval, such as 10 or '1h'; got dt={dt!r}.")
     columns = array.reshape(len(array), -1)
     steps = clock.between(axis[0], axis)
     if not (np.diff(steps) > 0.0).all():
@@ -299,7 +299,7 @@ def restore(run: Track, y: Any, u: Any = ()) -> Restored:
     inputs = [prepared(one) for one in (u if several else [u])]
     dimensions = run.model.dimensions
     if dimensions is None or run.names != run.model.names:
-        raise ValueError(f"restore: {run.model!r} cannot say in which units its parameters are.")
+        raise ValueError(f"restore: {run.model!r} does not declare the units of its parameters.")
     if len(inputs) != run.model.m:
         raise ValueError(f"restore: the model has {run.model.m} inputs, but {len(inputs)} were given.")
     factors = np.array([output.factor**p / (1.0 if j is None else inputs[j].factor) for p, j in dimensions])

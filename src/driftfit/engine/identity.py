@@ -1,0 +1,63 @@
+"""Names for functions that change when their code, or anything that they use, changes."""
+
+from __future__ import annotations
+
+import dis
+import hashlib
+import math
+from types import CodeType, FunctionType
+from typing import Any
+
+import numpy as np
+
+
+def identity(function: FunctionType) -> str:
+    """A name for a function that changes when its code, or anything that it uses, changes.
+
+    Numba's cache looks at the time stamp of the one file that holds the driver; steps live in other files. Giving every
+    step an identity made of its code and the identities of what it refers to lets drivers that are closures over steps
+    be found on disk by a second process, and recompiles them when a step was edited. The code is what was compiled, not
+    its text: the file may have been edited since it was imported, and at a prompt there is none.
+    """
+    used = used_globals(function)
+    used |= dict(zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True))
+    used |= {"defaults": (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).items())}
+    parts = [function.__module__, function.__qualname__, _code(function.__code__)]
+    parts += [f"{name}={_identity_of(value, function, name)}" for name, value in sorted(used.items())]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def used_globals(function: FunctionType) -> dict[str, Any]:
+    """The globals that a function reads."""
+    names = _globals(function.__code__) & function.__globals__.keys()
+    return {name: function.__globals__[name] for name in names}
+
+
+def _globals(code: CodeType) -> set[str]:
+    """Global names that code reads, also in the functions and comprehensions inside it; not those of attributes."""
+    names = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
+    return names.union(*(_globals(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
+
+
+def _code(code: CodeType) -> str:
+    """What code does, without the places where its text stands."""
+    constants = [_code(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return repr((code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
+
+
+def _identity_of(value: Any, function: FunctionType, name: str) -> str:
+    if isinstance(value, tuple):
+        return f"({', '.join(_identity_of(v, function, name) for v in value)})"
+    if value is np or value is math:  # what hangs on any other module may be edited unseen
+        return str(value.__name__)
+    if isinstance(value, bool | int | float | str | type(None) | np.generic):
+        return repr(value)
+    if isinstance(value, np.ndarray):  # a constant to the compiler
+        return f"{value.dtype}{value.shape}{value.tobytes().hex()}"
+    if hasattr(value, "identity"):
+        return str(value.identity)
+    raise TypeError(
+        f"the kernel {function.__qualname__} uses {name!r}, a {type(value).__name__}; a kernel may use numpy, math, "
+        "numbers, strings, tuples of these, and other kernels, each imported by its own name. Pass anything else "
+        "through a field of the record."
+    )

@@ -1,0 +1,428 @@
+"""All that leans on the private side of Numba and llvmlite. No other module imports `numba.core` or llvmlite.
+
+Each section says what it leans on and why. `tests/contract/test_numba_internals.py` has a canary for each, which says
+in a sentence what broke. Tried with the versions in `TRIED`.
+
+    lock           numba.core.compiler_lock         one lock for all that compiles, so that threads cannot mix
+    identity       Dispatcher._set_uuid             other processes find closures over compiled functions
+    stored         numba.core.caching._Cache,       one file for each function and signature, without Numba's index
+                   CompileResult._reduce, _rebuild
+    code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted
+                   codegen's factories
+    memory         _reset_overloads,                what the compiler made of a part is let go
+                   remove_user_function, _dispose
+    object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
+                   numba._dynfunc, environments
+    symbols        add_symbol, llvm_cfunc_wrapper   machines are called by name
+    arrays         context.make_array,              an array at an address without reference counts
+                   populate_array
+    fields         AttributeTemplate                fields of a table by name; see `driftfit.engine.table`
+    vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
+
+What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,
+`numba.extending`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from types import FunctionType
+from typing import Any, NamedTuple
+from weakref import ref
+
+import llvmlite
+import llvmlite.binding as llvm
+import numba
+from llvmlite import ir
+from llvmlite.binding import newpassmanagers as passes
+from numba import _dynfunc, njit, types
+from numba.core.caching import _Cache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.environment import lookup_environment
+from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
+
+__all__ = ["AttributeTemplate", "dumps", "ir"]
+
+TRIED = {"numba": ("0.68.1",), "llvmlite": ("0.50.0",)}
+"""Versions that the canary tests passed with."""
+
+
+# ---- lock -----------------------------------------------------------------------------------------------------------
+
+compiler_lock = global_compiler_lock
+"""Held by whoever compiles. It is Numba's own: with a second lock, a thread that compiles a user's function which calls
+ours, and one that compiles ours, would take the two in opposite orders."""
+
+
+# ---- identity -------------------------------------------------------------------------------------------------------
+
+
+def name_for_pickle(compiled: Any, name: str) -> None:
+    """Let a compiled function or an intrinsic be known by a name that is the same in every process.
+
+    Numba numbers functions at random in each process, and the number is part of all that refers to them.
+    """
+    compiled.identity = name
+    compiled._set_uuid(name)
+
+
+# ---- compile options ------------------------------------------------------------------------------------------------
+
+LINKED = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True, "_nrt": False}
+"""Options of code that only compiled code calls, and that owns no memory: wrappers and reference counts of slices took
+nine tenths of the time of compiling a bank, and half of that of compiling a step."""
+
+
+def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
+    """Compile as everything here is: division as in IEEE 754, no fast-math, without the GIL."""
+    return njit(error_model="numpy", nogil=True, **options)(function)
+
+
+# ---- stored ---------------------------------------------------------------------------------------------------------
+
+
+def processor() -> str:
+    """What code is made for."""
+    return f"{sys.byteorder}{cpu_target.target_context.codegen().magic_tuple()}"
+
+
+def versions() -> tuple[str, str]:
+    """Of what makes code."""
+    return numba.__version__, llvmlite.__version__
+
+
+class Stored(_Cache):
+    """The cache that a dispatcher asks: ``read(sig)`` gives what was kept, ``write(sig, data)`` keeps it."""
+
+    def __init__(self, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
+        self._read, self._write = read, write
+
+    @property
+    def cache_path(self) -> str:
+        return ""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        target_context.refresh()
+        found = self._read(sig)
+        return None if found is None else CompileResult._rebuild(target_context, *found)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if not data.lifted and not data.library.has_dynamic_globals:
+            self._write(sig, data._reduce())
+
+    def enable(self) -> None:
+        """Always."""
+
+    def disable(self) -> None:
+        """Never."""
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+
+def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
+    """Keep what a dispatcher compiles where ``read`` and ``write`` find and put it."""
+    dispatcher._cache = Stored(read, write)
+
+
+# ---- code to link ---------------------------------------------------------------------------------------------------
+
+
+class Fragment(JITCodeLibrary):
+    """Code for others to take in: neither optimised nor emitted, which those who take it in do."""
+
+    def _optimize_final_module(self) -> None:
+        """Left to those who take it in."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """There is none: nothing was emitted."""
+        return 0
+
+    def serialize_using_object_code(self) -> Any:
+        """What is kept on disk: there is no object code."""
+        return self.serialize_using_bitcode()
+
+
+class OptimizedFragment(Fragment):
+    """Code that is optimised here: what the compiler sees of a step inside a loop over lanes depends on it (5 %)."""
+
+    def _optimize_final_module(self) -> None:
+        JITCodeLibrary._optimize_final_module(self)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """None yet; asking for it is how Numba says that nothing more will be added."""
+        self._ensure_finalized()
+        return 0
+
+
+class PartDispatcher(CPUDispatcher):
+    """A function that Numba compiles for others to take in."""
+
+    library: type[Fragment] = Fragment
+
+    def __call__(self, *arguments: Any) -> Any:
+        raise TypeError(
+            f"{self.py_func.__qualname__} is a part of a compiled routine, which has no code of its own; to see what "
+            "it does from Python call its py_func."
+        )
+
+    def compile(self, signature: Any) -> Any:
+        """The types and code of one signature."""
+        with compiler_lock, _library_of(self.py_func.__qualname__, self.library):
+            made = super().compile(signature)
+            _note_use(self, signature)
+        return made
+
+
+class StepDispatcher(PartDispatcher):
+    """A step: taken in by drivers; for Python it is compiled once more, into code that can be called."""
+
+    library = OptimizedFragment
+
+    def __call__(self, *arguments: Any) -> Any:
+        if "callable" not in vars(self):
+            self.callable = under_ieee(self.py_func)
+        return self.callable(*arguments)
+
+
+class WholeDispatcher(PartDispatcher):
+    """A function that takes in all that it calls."""
+
+    library = OptimizedFragment
+
+
+def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any:
+    """Let a function that Numba compiles be linked into others and nothing else."""
+    dispatcher.__class__ = kind
+    return dispatcher
+
+
+@contextmanager
+def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
+    """While it lasts, what is compiled under this name becomes a fragment; of nested ones the inner stands.
+
+    Only for whoever holds `compiler_lock`: Numba's factories are replaced for all threads.
+    """
+    codegen = cpu_target.target_context.codegen()
+    create, restore, set_env = codegen.create_library, codegen.unserialize_library, codegen.set_env
+    build = codegen._pass_builder
+
+    def create_fragment(called: str, **options: Any) -> Any:
+        return kind(codegen, called, **options) if called == name else create(called, **options)
+
+    def restore_fragment(stored: Any) -> Any:
+        return kind._unserialize(codegen, stored) if stored[0] == name else restore(stored)
+
+    def set_env_of_emitted(env_name: str, env: Any) -> None:
+        if codegen._engine.is_symbol_defined(env_name):
+            set_env(env_name, env)
+
+    def build_once(**options: Any) -> Any:
+        key = tuple(sorted(options.items()))
+        if key not in _builders:
+            _builders[key] = build(**options)
+        return _builders[key]
+
+    ours = {
+        "create_library": create_fragment, "unserialize_library": restore_fragment, "set_env": set_env_of_emitted,
+        "_pass_builder": build_once,
+    }  # fmt: skip
+    before = {key: vars(codegen)[key] for key in ours if key in vars(codegen)}
+    try:
+        vars(codegen).update(ours)
+        yield
+    finally:
+        for key in ours:
+            del vars(codegen)[key]
+        vars(codegen).update(before)
+
+
+_builders: dict[Any, Any] = {}
+"""What makes LLVM's passes, by its options: Numba makes one for every function, and LLVM does not free all of it."""
+
+
+# ---- memory ---------------------------------------------------------------------------------------------------------
+
+# llvmlite 0.50 frees no pass manager: both classes inherit the `_dispose` that does nothing. They were three fifths of
+# all memory that a compilation left behind.
+for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
+    if _manager._dispose is passes.ffi.ObjectRef._dispose:
+        _manager._dispose = passes.NewPassManager._dispose
+
+_recent: OrderedDict[Any, None] = OrderedDict()
+"""(dispatcher, types of the arguments) of what was compiled only to be linked, those used last at the end."""
+
+
+def _note_use(dispatcher: Any, signature: Any) -> None:
+    key = ref(dispatcher), tuple(getattr(signature, "args", signature))
+    _recent[key] = None
+    _recent.move_to_end(key)
+
+
+def forget(most: int) -> None:
+    """Let go of all but the ``most`` parts used last; while nothing is compiled, which may take them in."""
+    while len(_recent) > most:
+        (place, arguments), _ = _recent.popitem(last=False)
+        dispatcher = place()
+        if dispatcher is not None and arguments in dispatcher.overloads:
+            dispatcher.targetctx.remove_user_function(dispatcher.overloads.pop(arguments).entry_point)
+            rest = list(dispatcher.overloads.values())
+            dispatcher._reset_overloads()  # the table in C, which has no way to drop one of its rows
+            for one in rest:
+                dispatcher.add_overload(one)
+
+
+# ---- object code ----------------------------------------------------------------------------------------------------
+
+ENVIRONMENT = "_ZN08NumbaEnv"
+"""Beginning of the names of the variables through which compiled code finds the environment of a function."""
+
+OWN_ADDRESSES = "numba.dynamic.globals"
+"""Beginning of the names of variables that hold addresses of this process."""
+
+
+class Code(NamedTuple):
+    """A compiled function that Python calls, as it is kept on disk."""
+
+    data: bytes
+    """Object code."""
+    module: str
+    name: str
+    wrapper: str
+    """Symbol of what Python calls."""
+    outside: tuple[str, ...]
+    """Symbols that it calls and does not have."""
+    environments: tuple[tuple[str, Any], ...]
+    """Symbols of environments, its own first, and the environments."""
+    lasting: bool
+    """Whether it means the same in another process."""
+
+
+def emit(function: FunctionType, arguments: tuple[Any, ...]) -> Code:
+    """Compile a function for one signature, with all that it calls, to object code."""
+    with compiler_lock:
+        dispatcher = as_part(under_ieee(function, no_cfunc_wrapper=True), WholeDispatcher)
+        dispatcher.compile(arguments)
+        made = dispatcher.overloads[arguments]
+        module = made.library._final_module
+        variables = [v.name for v in module.global_variables if not v.is_declaration]
+        own = cpu_target.target_context.get_env_name(made.fndesc)
+        names = [own, *(name for name in variables if name.startswith(ENVIRONMENT) and name != own)]
+        environments = {name: lookup_environment(name) for name in names if name in variables}
+        absent = [f.name for f in (*module.functions, *module.global_variables) if f.is_declaration]
+        return Code(
+            made.library.codegen._tm.emit_object(module), made.fndesc.modname, function.__name__,
+            made.fndesc.llvm_cpython_wrapper_name, tuple(name for name in absent if not name.startswith("llvm.")),
+            ((own, made.environment), *((name, env) for name, env in environments.items() if name != own and env)),
+            all(env is None or env.can_cache() for env in environments.values())
+            and not any(name.startswith(OWN_ADDRESSES) for name in variables),
+        )  # fmt: skip
+
+
+def load(code: Code) -> Any:
+    """The entry point of code. Numba's loader never frees anything; this one does with the last reference to it."""
+    library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.wrapper)
+    loader = _loader()
+    for name in code.outside:
+        address = llvm.address_of_symbol(name)
+        if address is not None:
+            library.import_symbol(name, address)
+    for name, _ in code.environments:
+        library.export_symbol(name)
+    tracker = library.link(loader, f"driftfit{next(_numbers)}")
+    for name, environment in code.environments:
+        ctypes.c_void_p.from_address(tracker[name]).value = id(environment)
+    kept = (tracker, *(environment for _, environment in code.environments))
+    module, own = sys.modules.get(code.module), code.environments[0][1]
+    return _dynfunc.make_function(module, code.name, code.name, tracker[code.wrapper], own, kept)
+
+
+_numbers = itertools.count()
+
+
+@cache
+def _loader() -> Any:
+    """The loader; what compiled code calls of Numba's own is there after this."""
+    cpu_target.target_context.refresh()
+    rtsys.initialize(cpu_target.target_context)
+    return llvm.create_lljit_compiler()
+
+
+# ---- symbols --------------------------------------------------------------------------------------------------------
+
+
+def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
+    """Compile a function, or find it on disk, and let code call it by a symbol; returns the owner of the code."""
+    dispatcher.compile(arguments)
+    made = next(iter(dispatcher.overloads.values()))
+    llvm.add_symbol(symbol, made.library.get_pointer_to_function(made.fndesc.llvm_cfunc_wrapper_name))
+    return made.library
+
+
+# ---- arrays ---------------------------------------------------------------------------------------------------------
+
+
+def _array(dtype: Any, *shape: Any) -> Any:
+    """The typed half of an intrinsic ``f(address, *shape)``: the C array of this shape that begins at an address.
+
+    `numba.carray` does the same by two functions of its own for every caller, and counts references.
+    """
+    array = types.Array(dtype, len(shape), "C")
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return array_at(context, builder, array, given[0], given[1:])
+
+    return array(types.intp, *(types.intp for _ in shape)), build
+
+
+def array_at(context: Any, builder: Any, array: Any, address: Any, shape: Any) -> Any:
+    """The C array of a type and shape that begins at an address, while code is built."""
+    made = context.make_array(array)(context, builder)
+    kind = context.get_data_type(array.dtype)
+    strides = [context.get_constant(types.intp, context.get_abi_sizeof(kind))]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    data = builder.inttoptr(address, kind.as_pointer())
+    populate_array(made, data=data, shape=list(shape), strides=strides, itemsize=strides[-1], meminfo=None)
+    return made._getvalue()
+
+
+def matrix_at(name: str, dtype: Any) -> Any:
+    """An intrinsic ``f(address, rows, columns)``: the array that begins at an address."""
+
+    def matrix(context: Any, address: Any, rows: Any, columns: Any) -> Any:
+        return _array(dtype, rows, columns)
+
+    return named_intrinsic(name, matrix)
+
+
+def cube_at(name: str, dtype: Any) -> Any:
+    """An intrinsic ``f(address, rows, columns, lanes)``: the array that begins at an address."""
+
+    def cube(context: Any, address: Any, rows: Any, columns: Any, lanes: Any) -> Any:
+        return _array(dtype, rows, columns, lanes)
+
+    return named_intrinsic(name, cube)
+
+
+def named_intrinsic(name: str, typed: Any) -> Any:
+    """An intrinsic with a name that is the same in every process."""
+    made = intrinsic(typed)
+    name_for_pickle(made, name)
+    return made

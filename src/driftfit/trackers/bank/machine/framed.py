@@ -1,0 +1,194 @@
+"""A bank in the coordinates of its start: for offsets that a covariance cannot hold, and directions not seen yet.
+
+The machine is told x and z where it is otherwise told phi and theta (`driftfit.trackers.parts.coordinates`), and needs
+to know no more: what it does to means and covariances is the same in all coordinates, as long as changes are walks and
+no leaf has output lags of its own. Change i then adds
+
+    M (Q_i + diag(sizes_i r / c)) M'
+
+to a covariance. A regressor that leaves the span of those before it enters every leaf by column j, in what is left of
+its innovation; it moves no weight. What else may have happened since the last used sample, and the mixture, are the
+same linear map of what they were: C_j. = -C x and C_jj = x' C x + v.
+
+A bank is run so where its start is not determined well enough for a covariance by the time there are residuals; the
+others are told phi and theta, at less cost. Cost per sample: O(n^3) for each change.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
+from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.machine.layout import LEAVES, ROW, ROWS
+from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
+from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
+
+WALKS, FIXED, RELATIVE, COLUMNS, GAP = (ROW[f] for f in ("walks", "fixed_walks", "relative_walks", "leaves", "gap"))
+"""Rows of the table."""
+
+
+@shared
+def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float, W: Array) -> None:
+    """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are where it goes, where Q is and where sizes are, or
+    -1 where there are none."""
+    n = len(S)
+    to, fixed, sizes = places
+    for a in range(n):
+        for b in range(n):
+            total = 0.0
+            for k in range(a, n):
+                q = M[fixed + (k * (k + 1) // 2 + b if b <= k else b * (b + 1) // 2 + k)]
+                if k == b and sizes >= 0 and c[k] > 0.0:
+                    q += M[sizes + k] * unit / c[k]
+                total += S[a, k] * q
+            W[a, b] = total
+    for a in range(n):
+        for b in range(a + 1):
+            total = 0.0
+            for k in range(b, n):
+                total += W[a, k] * S[b, k]
+            M[to + a * (a + 1) // 2 + b] = total
+
+
+@shared
+def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, noise: float, g: Array) -> None:
+    """Row j of a covariance whose lower triangle lies from ``at`` on, ``step`` apart."""
+    n, h = len(x), noise
+    for a in range(n):
+        g[a] = 0.0
+        for b in range(n):
+            k = a * (a + 1) // 2 + b if b <= a else b * (b + 1) // 2 + a
+            g[a] += M[at + k * step] * x[b]
+        h += x[a] * g[a]
+    for b in range(n):
+        k = j * (j + 1) // 2 + b if b <= j else b * (b + 1) // 2 + j
+        M[at + k * step] = h if b == j else -sign * g[b]
+
+
+@shared
+def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
+    """All leaves, and what may have happened since the last used sample; returns the mean noise variance."""
+    n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
+    B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
+    for leaf in range(many[LEAVES]):
+        at, e = B + leaf, now[Y]
+        for i in range(n):
+            e -= x[i] * M[at + (FIRST + i) * columns]
+        enter_packed(M, at + (FIRST + n) * columns, columns, x, j, sign, noise, g)
+        M[at + (FIRST + j) * columns] = sign * e
+        each = M[at + S * columns] / (M[at + NU * columns] - 2.0) if unknown else 1.0
+        mean += M[at + WEIGHT * columns] * each * noise
+    gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
+    for i in range(1, table[3 * GAP + 1]):
+        enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
+    return mean
+
+
+@shared
+def enter_mixture(z: Array, P: Array, x: Array, now: Array, noise: float, g: Array) -> None:
+    n, j, sign = len(x), int(now[ENTERING]), now[OK]
+    h, e = noise, now[Y]
+    for a in range(n):
+        g[a] = 0.0
+        for b in range(n):
+            g[a] += (P[a, b] if b <= a else P[b, a]) * x[b]
+        h += x[a] * g[a]
+        e -= x[a] * z[a]
+    for b in range(n):
+        P[max(j, b), min(j, b)] = h if b == j else -sign * g[b]
+    z[j] = sign * e
+
+
+@machine
+def machine_walks(
+    memory: int, table: int, M: int, c: int, W: int, unit: float, size: int, n: int, L: int, l: int
+) -> None:
+    """Q of every change for lane l of L, from the addresses of fields."""
+    t, m = wholes(table, 3 * ROWS, L)[:, l], floats(memory, size, L)[:, l]
+    wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
+    for i in range(t[3 * WALKS + 1]):
+        of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
+        places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
+        walk(m, places, cubes(M, n, n, L)[:, :, l], floats(c, n, L)[:, l], unit, cubes(W, n, n, L)[:, :, l])
+
+
+@machine
+def machine_enter(
+    memory: int, table: int, many: int, x: int, z: int, P: int, g: int, now: int, unknown: int, size: int,
+    counters: int, n: int, L: int, l: int,
+) -> None:  # fmt: skip
+    """`enter_leaves` and `enter_mixture` for lane l of L, from the addresses of fields."""
+    told, x_l, g_l = floats(now, NOW, L)[:, l], floats(x, n, L)[:, l], floats(g, n, L)[:, l]
+    noise = enter_leaves(
+        floats(memory, size, L)[:, l], wholes(table, 3 * ROWS, L)[:, l], wholes(many, counters, L)[:, l], x_l, told,
+        unknown > 0, g_l,
+    )  # fmt: skip
+    enter_mixture(floats(z, n, L)[:, l], cubes(P, n, n, L)[:, :, l], x_l, told, noise, g_l)
+
+
+FRAMED = (machine_walks, machine_enter)
+"""What the steps here call, beside those of the coordinates."""
+
+
+@kernel
+def begin_framed(s: State, l: int) -> None:
+    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance or of what it was told."""
+    n = s.theta.shape[0]
+    s.framed[l] = 1
+    frame(s, l)
+    s.root[l] = 1
+    for i in range(n):
+        for j in range(i + 1):
+            s.Pz[i, j, l] = 1.0 if i == j and s.S[i, i, l] > 0.0 else 0.0
+
+
+@kernel
+def tell_walks(s: State, l: int) -> None:
+    """What the changes of the next sample add, in these coordinates."""
+    n, L = s.d.shape
+    unit = 1.0 if s.unknown[l] > 0 else s.r[l]
+    machine_walks(
+        s.memory.ctypes.data, s.table.ctypes.data, s.S.ctypes.data, s.c.ctypes.data, s.W.ctypes.data, unit,
+        s.memory.shape[0], n, L, l,
+    )  # fmt: skip
+
+
+@kernel
+def enter_bank(s: State, column: int, l: int) -> None:
+    """Take a regressor in by the column by which it leaves the span; the machine has let time pass."""
+    n, L = s.d.shape
+    for i in range(column, n):
+        s.x[i, l] = 0.0
+    sign = new_row(s, column, l)
+    s.root[l] = 1
+    noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
+    s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
+    machine_enter(
+        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
+        s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.memory.shape[0],
+        s.counters.shape[0], n, L, l,
+    )  # fmt: skip
+
+
+@kernel
+def read_framed(s: State, l: int) -> None:
+    """theta and its covariance from the mixture."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            s.P[i, j, l] = s.Pz[i, j, l]
+    in_units_of_theta(s, l)
+    if s.ok[l] > 0.0:
+        located_within(s, l)
+    for i in range(n):
+        s.var[i, l] = s.P[i, i, l]
+    unseen_variance(s, l)
+
+
+def in_theta(lane: dict[str, Array], means: Array, covs: Array) -> tuple[Array, Array]:
+    """means (L, n) and covs (L, n, n) of z as those of theta; they stay what they are where the bank is not framed."""
+    if not lane["framed"]:
+        return means, covs
+    R = lane["R"]
+    return lane["theta"] + (means - lane["d"]) @ R.T, np.asarray(R @ covs @ R.T)

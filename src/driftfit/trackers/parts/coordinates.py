@@ -1,0 +1,186 @@
+"""Coordinates in which several filters run side by side: what the start has learned is white in them.
+
+    z = M theta,    x = M^-T phi,    phi' theta = x' z
+
+M is the square root of information S of the diffuse start (`driftfit.trackers.parts.diffuse`) as it was when the
+filters began, with a 1 on the diagonal of each column that was free. So z begins with the covariance r I, however far
+apart the units are and however large offsets beside an intercept. A covariance of theta has the square of such an
+offset for its condition, and loses as many digits; x has only the rounding of the readings themselves. A random walk
+of theta with covariance diag(q) is one of z with covariance M diag(q) M'.
+
+A free column has x_j = 0: what no sample has told apart takes no part. A regressor that leaves the span of those before
+it does so by its first free column j with a share rho_j that is not 0. Then row j of M becomes rho, the rest of phi,
+
+    rho = phi - sum_{i<j} x_i M_i.,    z_j = rho' theta,    y = sum_{i<j} x_i z_i + z_j + v
+
+and every filter takes z_j in by what remains of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
+limit of any prior of z_j that grows without end, also for a rho_j that is all but rounding: nothing is divided by it.
+The same serves where a sample tells of z_j so much more than all before it that a covariance would keep no digits of
+the difference (`outgrown`).
+
+Source: the square-root form is Bierman's (1977); filters in fixed coordinates of it are ours. Cost per sample: O(n^2)
+for x; O(n^3) where a column enters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, machine, shared
+from driftfit.trackers.parts.diffuse import (
+    ENTERING,
+    MACHINES,
+    NOW,
+    ROW,
+    SQUARE,
+    VOLUME,
+    WORK,
+    estimate,
+    outside,
+    refresh,
+    unseen,
+)
+
+OUTGROWN = 1e12
+"""Information that one sample may add to what is known of a coordinate, as a multiple of it: what is known before is
+dropped above it, which moves an estimate by less than a millionth of its standard deviation."""
+
+
+@shared
+def place(phi: Array, S: Array, work: Array, now: Array) -> None:
+    """x in ``work[ROW]``, up to the column by which phi leaves the span, if it does."""
+    entering, u, _ = outside(phi, S, work)
+    now[ENTERING], now[SQUARE] = entering, u * u
+    for i in range(entering if entering >= 0 else len(S), len(S)):
+        work[ROW, i] = 0.0
+
+
+@machine
+def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int) -> None:
+    """`place` for lane l of L, from the addresses of fields."""
+    place(
+        floats(phi, n, L)[:, l], cubes(S, n, n, L)[:, :, l], cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l]
+    )
+
+
+@machine
+def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l: int) -> None:
+    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has told apart."""
+    S_l, R_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l]
+    refresh(S_l, R_l, cubes(work, WORK, n, L)[:, :, l])
+    floats(now, NOW, L)[VOLUME, l] = unseen(S_l, R_l, cubes(Q, n, n, L)[:, :, l], 0.0)
+
+
+@machine
+def machine_estimate(S: int, z: int, Q: int, theta: int, work: int, n: int, L: int, l: int) -> None:
+    """theta for lane l of L: M^-1 z, and what it was in the directions of Q."""
+    estimate(
+        cubes(S, n, n, L)[:, :, l], floats(z, n, L)[:, l], cubes(Q, n, n, L)[:, :, l], floats(theta, n, L)[:, l],
+        cubes(work, WORK, n, L)[ROW, :, l], 0.0,
+    )  # fmt: skip
+
+
+FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
+"""What the steps of a tracker in these coordinates call."""
+
+
+@kernel
+def whiten(s: State, l: int) -> None:
+    """x = M^-T phi, where no column is free."""
+    for j in range(s.theta.shape[0]):
+        u = s.phi[j, l]
+        for i in range(j):
+            u -= s.S[i, j, l] * s.x[i, l]
+        s.x[j, l] = u / s.S[j, j, l]
+
+
+@kernel
+def whiten_within(s: State, l: int) -> int:
+    """x where columns are free; returns the one by which phi leaves the span of what was seen, or -1."""
+    n, L = s.d.shape
+    machine_place(s.S.ctypes.data, s.phi.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
+    for i in range(n):
+        s.x[i, l] = s.work[ROW, i, l]
+    return int(s.at_start[ENTERING, l])
+
+
+@kernel
+def frame(s: State, l: int) -> None:
+    """After a change of M: its inverse R, and s.H, a basis of what is not told apart."""
+    n, L = s.d.shape
+    machine_frame(
+        s.S.ctypes.data, s.R.ctypes.data, s.H.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l
+    )
+    s.root[l] = 1 if s.rank[l] < n else 0
+
+
+@kernel
+def new_row(s: State, j: int, l: int) -> float:
+    """Let the rest of phi be row j of M; returns its sign there, which the row does not have."""
+    n = s.theta.shape[0]
+    rest = s.phi[j, l]
+    for i in range(j):
+        rest -= s.x[i, l] * s.S[i, j, l]
+    sign = 1.0 if rest > 0.0 else -1.0
+    fresh = s.S[j, j, l] == 0.0
+    s.S[j, j, l] = abs(rest)
+    for k in range(j + 1, n):
+        rest = s.phi[k, l]
+        for i in range(j):
+            rest -= s.x[i, l] * s.S[i, k, l]
+        s.S[j, k, l] = sign * rest
+    frame(s, l)
+    if fresh:
+        s.F[s.rank[l], l] = s.at_start[SQUARE, l] * exp(s.at_start[VOLUME, l] - s.volume[l])
+        s.rank[l] += 1
+        s.volume[l] = s.at_start[VOLUME, l]
+        s.root[l] = 1 if s.rank[l] < n else 0
+    return sign
+
+
+@kernel
+def located(s: State, l: int) -> None:
+    """theta = M^-1 d, where no column is free."""
+    n = s.theta.shape[0]
+    for i in range(n - 1, -1, -1):
+        t = s.d[i, l]
+        for j in range(i + 1, n):
+            t -= s.S[i, j, l] * s.theta[j, l]
+        s.theta[i, l] = t / s.S[i, i, l]
+
+
+@kernel
+def located_within(s: State, l: int) -> None:
+    """theta = M^-1 d where columns are free: it stays where it was in the directions that nothing is known of."""
+    n, L = s.d.shape
+    machine_estimate(
+        s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.theta.ctypes.data, s.work.ctypes.data, n, L, l
+    )
+
+
+@kernel
+def in_units_of_theta(s: State, l: int) -> None:
+    """The lower triangle of P = R P R'."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for b in range(n):
+            total = 0.0
+            for a in range(i, n):
+                total += s.R[i, a, l] * (s.P[a, b, l] if b <= a else s.P[b, a, l])
+            s.W[i, b, l] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for b in range(j, n):
+                total += s.W[i, b, l] * s.R[j, b, l]
+            s.P[i, j, l] = total
+
+
+@kernel
+def unseen_variance(s: State, l: int) -> None:
+    """An infinite variance for what no sample has told apart yet."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            if s.S[j, j, l] == 0.0 and s.R[i, j, l] != 0.0:
+                s.var[i, l] = np.inf
