@@ -46,11 +46,7 @@ from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves import forget, square_root_form
-from driftfit.trackers.bank.leaves.factored import factorise, widened
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
-from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.layout import (
+from driftfit.trackers.bank.layout import (
     COUNT,
     FADE,
     FAULTS,
@@ -64,6 +60,10 @@ from driftfit.trackers.bank.machine.layout import (
     WHOLE,
     R,
 )
+from driftfit.trackers.bank.leaves import forget, square_root_form
+from driftfit.trackers.bank.leaves.factored import factorise, widened
+from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
+from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.machine.start import GROWTH, begin
 from driftfit.trackers.bank.machine.steps import STEPS

@@ -8,8 +8,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
+from driftfit.trackers.bank.layout import ALIKE, IN_NOISE, LAST, R
 from driftfit.trackers.bank.leaves.leaves import WEIGHT, total
-from driftfit.trackers.bank.machine.layout import ALIKE, IN_NOISE, LAST, R
 
 FACTOR, VALUE, FROZEN, STUCK, CLEANS = range(5)
 """Columns of the table of sensors."""

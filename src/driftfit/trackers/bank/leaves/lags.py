@@ -19,8 +19,8 @@ import math
 from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
+from driftfit.trackers.bank.layout import IN_Y, MOST, R
 from driftfit.trackers.bank.leaves.leaves import FIRST
-from driftfit.trackers.bank.machine.layout import IN_Y, MOST, R
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
 """Square of a prediction in mean squares of the outputs, and its variance in variances of the noise, beyond which it is

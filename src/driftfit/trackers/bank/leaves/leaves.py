@@ -36,7 +36,7 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
-from driftfit.trackers.bank.machine.layout import ALIKE, FLIPPED, R
+from driftfit.trackers.bank.layout import ALIKE, FLIPPED, R
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""

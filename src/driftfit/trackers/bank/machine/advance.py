@@ -11,25 +11,7 @@ import math
 from typing import Any
 
 from driftfit.engine.kernel import Array, machine, shared
-from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
-from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
-from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
-from driftfit.trackers.bank.leaves.leaves import (
-    FIRST,
-    increments,
-    later,
-    mixture,
-    normalise,
-    priors,
-    ready,
-    regressors,
-    standstill,
-    variance_factor,
-)
-from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
-from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
-from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.layout import (
+from driftfit.trackers.bank.layout import (
     AGAIN,
     ALIKE,
     BESIDE,
@@ -67,6 +49,24 @@ from driftfit.trackers.bank.machine.layout import (
     first,
     table_at,
 )
+from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
+from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
+from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
+from driftfit.trackers.bank.leaves.leaves import (
+    FIRST,
+    increments,
+    later,
+    mixture,
+    normalise,
+    priors,
+    ready,
+    regressors,
+    standstill,
+    variance_factor,
+)
+from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
+from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
+from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.merge import combine, mix, sort, take
 from driftfit.trackers.bank.machine.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.trackers.bank.machine.selection import (

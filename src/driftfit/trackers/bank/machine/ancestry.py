@@ -16,8 +16,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
+from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
 from driftfit.trackers.bank.leaves.leaves import WEIGHT
-from driftfit.trackers.bank.machine.layout import EXPANDED, FLIPPED, PARENTS, flip
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:

@@ -22,11 +22,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
+from driftfit.trackers.bank.layout import ALIKE, FADE, LEAST, MOST, R
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
-from driftfit.trackers.bank.machine.layout import ALIKE, FADE, LEAST, MOST, R
 from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)

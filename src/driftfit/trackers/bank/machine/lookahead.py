@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
+from driftfit.trackers.bank.layout import CHAINED, LAST, R
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
-from driftfit.trackers.bank.machine.layout import CHAINED, LAST, R
 
 NODES = 33
 """Nodes for every distinct component."""

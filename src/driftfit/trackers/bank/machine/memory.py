@@ -10,13 +10,13 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
 from driftfit.trackers.bank.machine import selection
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
-from driftfit.trackers.bank.machine.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
 from driftfit.trackers.bank.machine.lookahead import NODES
 from driftfit.trackers.bank.reduction import Reduction
 from driftfit.trackers.bank.sensor import Sensor
@@ -45,7 +45,7 @@ class Settings(Protocol):
 
 
 def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
-    """The arrays of `driftfit.trackers.bank.machine.layout` before the first sample, but for fields of the state and
+    """The arrays of `driftfit.trackers.bank.layout` before the first sample, but for fields of the state and
     windows of the scratch; covariances are multiplied by ``unit``.
     """
     Hd, Hm = len(bank.all_changes), len(bank.all_sensors)

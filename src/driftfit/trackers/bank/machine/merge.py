@@ -20,10 +20,10 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
+from driftfit.trackers.bank.layout import FLIPPED, flip
 from driftfit.trackers.bank.leaves.lags import merge_covariance
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.trackers.bank.machine.ancestry import average
-from driftfit.trackers.bank.machine.layout import FLIPPED, flip
 
 
 @shared

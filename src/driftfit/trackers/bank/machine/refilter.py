@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import Array, shared
+from driftfit.trackers.bank.layout import FLIPPED
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.layout import FLIPPED
 from driftfit.trackers.bank.machine.selection import DEPTH, PRIOR
 
 Y, NOISE, TIME = 0, 1, 2

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, shared
-from driftfit.trackers.bank.leaves.lags import push
-from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
-from driftfit.trackers.bank.machine.layout import (
+from driftfit.trackers.bank.layout import (
     CLOCK,
     EXPANDED,
     GROUPS,
@@ -25,6 +23,8 @@ from driftfit.trackers.bank.machine.layout import (
     TIMES,
     Y_HAT,
 )  # fmt: skip
+from driftfit.trackers.bank.leaves.lags import push
+from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
 
 GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""

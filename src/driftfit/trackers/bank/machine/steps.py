@@ -7,11 +7,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
-from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
-from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
-from driftfit.trackers.bank.machine.grow import FLOOR
-from driftfit.trackers.bank.machine.layout import (
+from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
     COV_AT,
@@ -41,6 +37,10 @@ from driftfit.trackers.bank.machine.layout import (
     Y_HAT,
     R,
 )
+from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
+from driftfit.trackers.bank.machine.advance import bank
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
+from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales

@@ -8,11 +8,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, SETTLED
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gap import SINCE
-from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, SETTLED
 
 if TYPE_CHECKING:
     from driftfit.trackers.bank.bank import Bank
