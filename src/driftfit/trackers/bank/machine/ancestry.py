@@ -22,7 +22,7 @@ from driftfit.trackers.bank.leaves.leaves import WEIGHT
 
 def news_of(H: int, Hm: int, width: int) -> Array:
     """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
-    is what an eight may reach into.
+    is what a SIMD vector may reach into.
     """
     news = np.zeros((H + 3, width))
     news[range(H), range(H)] = 1.0

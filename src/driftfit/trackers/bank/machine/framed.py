@@ -1,6 +1,6 @@
 """A bank in the coordinates of its start: for offsets that a covariance cannot hold, and directions not seen yet.
 
-The machine is told x and z where it is otherwise told phi and theta (`driftfit.trackers.parts.coordinates`), and needs
+The compiled routine is given x and z in the place of phi and theta (`driftfit.trackers.parts.coordinates`), and needs
 to know no more: what it does to means and covariances is the same in all coordinates, as long as changes are walks and
 no leaf has output lags of its own. Change i then adds
 
@@ -11,7 +11,7 @@ its innovation; it moves no weight. What else may have happened since the last u
 same linear map of what they were: C_j. = -C x and C_jj = x' C x + v.
 
 A bank is run so where its start is not determined well enough for a covariance by the time there are residuals; the
-others are told phi and theta, at less cost. Cost per sample: O(n^3) for each change.
+others are given phi and theta, at less cost. Cost per sample: O(n^3) for each change.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ FRAMED = (machine_walks, machine_enter)
 
 @kernel
 def begin_framed(s: State, l: int) -> None:
-    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance or of what it was told."""
+    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
     s.framed[l] = 1
     frame(s, l)
@@ -144,7 +144,7 @@ def begin_framed(s: State, l: int) -> None:
 
 
 @kernel
-def tell_walks(s: State, l: int) -> None:
+def write_walks(s: State, l: int) -> None:
     """What the changes of the next sample add, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
@@ -156,7 +156,7 @@ def tell_walks(s: State, l: int) -> None:
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Take a regressor in by the column by which it leaves the span; the machine has let time pass."""
+    """Take a regressor in by the column by which it leaves the span; the compiled routine has let time pass."""
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0

@@ -57,7 +57,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     parents, children = _room(max(shape.parents, K // H), Hd, Hm)
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
-    remembered, links = _eights(W * (H + 1)), _eights(K + 1)
+    remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
     refilters, waits = shape.knobs[selection.KIND] == selection.REFILTER, shape.knobs[selection.WAIT] > 0.0
     return _of_changes(bank, n, unit, theta0) | {
         "parents": np.zeros((rows, parents)), "leaves": np.zeros((rows, children + WIDTH)),
@@ -78,7 +78,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
 def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
     """Those that say what may happen to theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
-    steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _eights(tri)
+    steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
     scaled, forgets = any(sizes.any() for _, sizes in steps), any(one.forgets for one in changes)
     places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
     places[forget.MEAN], places[forget.CAP] = theta0, np.inf
@@ -150,15 +150,15 @@ def _closed(Hd: int, wide: int) -> Array:
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
-    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
+    """Columns for leaves and for their children, with room for SIMD vectors that begin at every block of them."""
     blocks = (parents, parents * Hd, parents * Hd * Hm)
-    up = [_eights(size) for size in blocks]
+    up = [_whole_vectors(size) for size in blocks]
     most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
-    return up[0], _eights(most)
+    return up[0], _whole_vectors(most)
 
 
-def _eights(size: int) -> int:
-    """The next multiple of eight."""
+def _whole_vectors(size: int) -> int:
+    """The next multiple of the width of a SIMD vector."""
     return -(-size // WIDTH) * WIDTH
 
 

@@ -1,7 +1,7 @@
 """Which leaves go on, and which of them become one: a group for every leaf, -1 for those that are dropped.
 
-The plan is made when a sample has been taken in and carried out before the next one that can be used: a sample that is
-not used leaves the mixture as it is.
+Groups are chosen when a sample has been taken in, and carried out before the next one that can be used: a sample that
+is not used leaves the mixture as it is.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
 @shared
 def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. What follows in the row, up to the next eight, must be zero; ``ranks`` (1, count) is overwritten.
+    many. What follows in the row, up to the end of a SIMD vector, must be zero; ``ranks`` (1, count) is overwritten.
     """
     value, over, G = V[row], 0, 0
     if count <= FEW:
@@ -89,7 +89,7 @@ def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array,
 
 @kernel
 def clear(V: Array, row: int, count: int) -> None:
-    """Zeros after the first entries, up to the next eight."""
+    """Zeros after the first entries, up to the end of a SIMD vector."""
     for l in range(count, min(count + WIDTH, V.shape[1])):
         V[row, l] = 0.0
 

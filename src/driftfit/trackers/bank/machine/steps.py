@@ -39,7 +39,7 @@ from driftfit.trackers.bank.layout import (
 )
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, write_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
@@ -198,7 +198,7 @@ def begin(s: State, l: int) -> None:
 def in_coordinates(s: State, l: int) -> None:
     """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
     column, y_hat = whiten_within(s, l), prediction(s, l)
-    tell_walks(s, l)
+    write_walks(s, l)
     hand_over(s, l)
     if column >= 0:
         s.sample[IN_OK, l] = 0.0
@@ -249,7 +249,7 @@ def keep(o: State, s: State, l: int) -> None:
 
 
 @kernel
-def told(s: State, known: Array, t: int, l: int) -> None:
+def take_known(s: State, known: Array, t: int, l: int) -> None:
     """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
     row, column = t if known.shape[0] > 1 else 0, 3
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):
@@ -259,4 +259,4 @@ def told(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=(*FRAME, *FRAMED))
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED))
