@@ -249,7 +249,7 @@ def test_names_and_refusals():
     assert np.isnan(found.std.b).all()
     with pytest.raises(ValueError, match="method must be one of"):
         run.blocks("pca")
-    with pytest.raises(ValueError, match="Regression has none"):
+    with pytest.raises(ValueError, match="Regression has no blocks"):
         track(Regression(1), AugmentedFLS(1.0), s.y, s.u).blocks()
     with pytest.raises(ValueError, match="output must be one of"):
         run.blocks(output="c1")

@@ -11,6 +11,7 @@ HOME = Path(driftfit.__file__).parent
 LINES, ARGUMENTS = 60, 8
 SOURCES = sorted(HOME.rglob("*.py"))
 KNOWN = {
+    "engine/callback.py": ["_call"],
     "engine/drivers.py": ["drivers"],
     "judge/statistics/noise.py": ["_segments"],
     "models/hammerstein_wiener/separation/least_squares.py": ["refine"],

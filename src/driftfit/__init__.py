@@ -4,6 +4,7 @@ from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
 from driftfit.fleets import Fleet
 from driftfit.judge.segment import segment
+from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
@@ -46,6 +47,7 @@ __all__ = [
     "Hybrid",
     "Kalman",
     "Live",
+    "LiveSelection",
     "OutputError",
     "Regression",
     "Sensor",

@@ -16,7 +16,7 @@ in a sentence what broke. Tried with the versions in `TRIED`.
     symbols        add_symbol, llvm_cfunc_wrapper   machines are called by name
     arrays         context.make_array,              an array at an address without reference counts
                    populate_array
-    fields         AttributeTemplate                fields of a table by name; see `driftfit.engine.table`
+    fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
 What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,

@@ -8,8 +8,10 @@ Two questions that have different answers:
   variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
   do not enter. Where constants are true, "they move" is said with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
-  constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`).
+* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
+  same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
+  (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, which a drifting parameter does as well: so
+  following pays where the run beats the better of constants without lags and with them.
 
 The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
 rejects, its own still does when what was named before it is taken into account
@@ -40,7 +42,7 @@ from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, facts, table_of
 
-RIVALS = ("persistence", "constant LS", "constant ARX")
+RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
 """Below this p-value of whiteness the residuals of segments are said to be correlated."""
 
@@ -78,8 +80,8 @@ class Verdict(Printed):
     drifts : bool or None
         The parameters move: ``p`` is below ``level``. None where the record cannot tell.
     pays : bool or None
-        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
-        where there are too few samples to compare.
+        The run predicts better than constant least squares on the past, without lags or with them, whichever is the
+        better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
         Joint test of all parameters; NaN where the record cannot tell.
     statistic : float
@@ -90,7 +92,7 @@ class Verdict(Printed):
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
-        The same of persistence, constant LS and constant ARX, with paired tests.
+        The same of persistence, constant LS, LS with lags and constant ARX, with paired tests.
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
@@ -114,6 +116,11 @@ class Verdict(Printed):
     correlated: bool
     lags: int
     burn: int
+
+    @property
+    def constants(self) -> Paired:
+        """The rival that decides whether following pays: constant least squares, or with lags where that is better."""
+        return better_constants(self.rivals)
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -157,18 +164,25 @@ class Verdict(Printed):
         return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
-        steady = self.rivals[1]
+        steady = self.constants
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
         change = 100.0 * (self.rms / steady.rms - 1.0)
+        who = "constants" if steady is self.rivals[1] else "constants with lags"
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            return f"Tracking them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
+        if self.rivals[1].p < self.level:
+            return (
+                "Tracking them predicts better than constants, but not than constants with two more lags of "
+                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). "
+                "Lags may be all that is missing."
+            )
         return (
-            f"Tracking them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"Tracking them does not clearly pay here: the one-step error is {size} than that of {who} "
             f"({p_equals(steady.p)})."
         )
 
@@ -198,6 +212,11 @@ class Verdict(Printed):
             table.add_row(rival.name, f"{rival.rms:.5g}", f"{rival.t:.2f}", p_text(rival.p))
         yield table
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
+
+
+def better_constants(rivals: tuple[Paired, ...]) -> Paired:
+    """Of constant least squares without lags and with them, the one with the smaller error."""
+    return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
 def _told(moved: Moved) -> str:
@@ -253,7 +272,7 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
-        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
+        pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
         p=test.p_joint,
         statistic=test.joint,
         level=level,

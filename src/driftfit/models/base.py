@@ -16,9 +16,15 @@ from driftfit.engine.settings import Settings
 class Model(Settings, ABC):
     """How signals become ``y_t = phi_t' theta_t + v_t``.
 
-    A model is *bound* once the number (and perhaps the names) of its inputs is known; `bind` returns the bound model,
-    and everything else needs one.
+    Beside its regression a model declares what else it is: the properties and methods that have a default here, which
+    `driftfit.checks.check_model` tests. A model is *bound* once the number (and perhaps the names) of its inputs is
+    known; `bind` returns the bound model, and everything else needs one.
     """
+
+    intercept: bool = False
+    """Whether the last regressor is the constant 1."""
+    ny: Any = 1
+    """Outputs: how many, or their names."""
 
     @abstractmethod
     def bind(self, inputs: int | Sequence[str]) -> Model:
@@ -95,6 +101,43 @@ class Model(Settings, ABC):
         """Response of y to one noise, now and at the h - 1 samples after it; 1, 0, 0, .. without output lags."""
         response: Array = np.eye(1, h)[0]
         return response
+
+    @property
+    def implicit(self) -> bool:
+        """Whether the regressors hold the present output, so that innovations are not those of y: `log_jacobian`."""
+        return False
+
+    def log_jacobian(self, theta: Array, y: Array) -> Array:
+        """Logarithm (T,) of the slope of the innovation against y, at theta (T, n) after each sample and y (T,).
+
+        It turns the density of the innovation into that of y; 0 unless the model is `implicit`.
+        """
+        return np.zeros(len(y))
+
+    @property
+    def output_lags(self) -> int | None:
+        """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
+
+        None where past outputs stand elsewhere, or in functions of theirs.
+        """
+        return None
+
+    def touched(self, t: int, signal: str) -> range | None:
+        """Samples that cannot be used when "y" or "u" is missing at t; None where missing outputs are filled in."""
+        return None
+
+    def expand(self, theta: Array) -> Array | None:
+        """theta (.., n) from parameters (.., k) that a tracker follows instead; None where they do not define it."""
+        return None
+
+    def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
+        """A(z) and B(z) at theta (.., n) in powers of z^-1; ValueError for a model that has none."""
+        raise ValueError(f"polynomials: {type(self).__name__} has no polynomials; use ARX.")
+
+    @property
+    def noise_varies(self) -> bool:
+        """Whether `noise_factor` is anything but 1."""
+        return False
 
     @property
     def reach(self) -> int:

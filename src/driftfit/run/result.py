@@ -213,7 +213,7 @@ class Track(Plain):
         with np.errstate(invalid="ignore", divide="ignore"):
             gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
         terms = np.where(counted, gaussian if own is None else own[:, self._lane.lane], np.nan)
-        if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
+        if self.model.implicit and not self.tracker.output_error:
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
 
@@ -263,11 +263,7 @@ class Track(Plain):
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
-        convert = getattr(self.model, "polynomials", None)
-        if convert is None:
-            raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
-        A, B = convert(self.theta)
-        return A, B
+        return self.model.polynomials(self.theta)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file, without pickle; complete or not at all."""

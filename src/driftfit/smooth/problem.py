@@ -56,7 +56,7 @@ def replay(run: Track) -> Array:
     Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
     """
     program = run.program
-    tile = program.tile(used_noise=1.0)
+    tile = program.tile()
     out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.noted)))
     program.drivers(steps=attentive(program.steps)).run(tile, *lane_of(run.record), out)
     return out

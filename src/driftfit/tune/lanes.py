@@ -130,7 +130,7 @@ class _Sums:
         y = self.record.y[a : a + len(out), None]
         counted = self._likelihood(out, ok)
         self._forecast(a, out, ok, y)
-        if hasattr(self.model, "log_jacobian"):
+        if self.model.implicit:
             terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
         self.power += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)

@@ -100,12 +100,12 @@ def systems(run: Track, theta: Array) -> Array:
     """Parameters of the regression (.., n) from what the tracker follows."""
     if run.names == run.model.names:
         return theta
-    structure = getattr(run.model, "structure", None)
-    if structure is None or theta.shape[-1] != structure.n_x:
+    found = run.model.expand(theta)
+    if found is None:
         raise ValueError(
             f"simulate: {type(run.tracker).__name__} follows {', '.join(run.names)}, which do not define a system."
         )
-    return np.asarray(structure.products(theta))
+    return found
 
 
 def drawn(mean: Array, cov: Array, D: int, seed: int) -> Array:

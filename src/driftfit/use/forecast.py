@@ -160,7 +160,7 @@ class LagErrors:
     @classmethod
     def of(cls, model: Model, n: int) -> LagErrors | None:
         """For a model whose regressors begin with past outputs; None for others."""
-        na = getattr(model, "output_lags", None)
+        na = model.output_lags
         return None if na is None else cls(len(model.outputs), na, n)
 
     def step(self, phi: Array, theta: Array, P: Array, s: Array) -> Array:

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import signal, stats
 
 from driftfit.data.clock import Clock, instants
 from driftfit.engine.arrays import as_numbers
@@ -196,6 +195,8 @@ def delay(y: Any, u: Any, max_lag: int = 50, order: int = 10) -> Delay:
     An autoregression of ``order`` makes u white, and the same filter is passed over y (0: neither is filtered). Without
     it the correlation of a slow input with itself smears the peak. Missing samples count as the mean.
     """
+    from scipy import signal  # with stats half of the time of importing the package
+
     signals = [_centred(y), _centred(u)]
     if len(signals[0]) != len(signals[1]):
         raise ValueError(f"delay: y has {len(signals[0])} samples, u has {len(signals[1])}.")
@@ -230,6 +231,8 @@ def feedback(y: Any, u: Any, lags: int = 5, level: float = 0.001) -> Feedback:
     u is regressed on its own ``lags`` and then on those of y too; UserWarning where the second explains it better with
     a probability by chance below ``level``.
     """
+    from scipy import stats
+
     out, inp = _centred(y), _centred(u)
     own = _past(inp, lags)
     both = np.column_stack([own, _past(out, lags)])

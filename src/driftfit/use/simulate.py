@@ -150,7 +150,7 @@ def noise_at(run: Track, at: int) -> float:
 
 def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
     """(na, the regressors (T, n - na) that inputs make); what is before the record is ``rest``."""
-    one = [np.ones((len(u), 1))] if getattr(model, "intercept", False) else []
+    one = [np.ones((len(u), 1))] if model.intercept else []
     if isinstance(model, Regression):
         return 0, np.hstack([u, *one])
     if not isinstance(model, ARX) or len(model.outputs) > 1:

@@ -169,11 +169,11 @@ def _titled(axis: Axes, title: str) -> None:
 def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95) -> Figure:
     """Free simulation of the model of one sample on data that it has not seen, beside what was measured.
 
-    The first outputs, as many as the model has lags, are given to the simulation. The fit, in per cent,
+    The first outputs, as many as its regressors reach back, are given to the simulation. The fit, in per cent,
     is that of `driftfit.use.simulate.fit`.
     """
     output = as_output(y)
-    lags = int(getattr(run.model, "na", 0))
+    lags = run.model.reach
     said = simulate(run, u, at, np.nan_to_num(output[:lags]))
     low, high = said.band(level)
     time = np.arange(len(output))

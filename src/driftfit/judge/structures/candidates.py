@@ -124,8 +124,8 @@ def pool_of(models: Sequence[Model], names: Sequence[str], record: Record) -> tu
 
 def _terms(model: Model) -> list[Term] | None:
     """What the columns of a model are; None for a model that is no ARX or Regression with one output."""
-    one: list[Term] = [("1", 0, 0)] if getattr(model, "intercept", False) else []
-    if len(model.outputs) > 1 or hasattr(model, "log_jacobian"):
+    one: list[Term] = [("1", 0, 0)] if model.intercept else []
+    if len(model.outputs) > 1 or model.implicit:
         return None
     if isinstance(model, Regression):
         return [*(("u", j, 0) for j in range(model.m)), *one]

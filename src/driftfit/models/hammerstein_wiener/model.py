@@ -284,6 +284,17 @@ class HammersteinWiener(Model):
         ends = [nb + nk for nb, nk in zip(self.structure.nb, self.delays, strict=True)]
         return range(t + min(self.delays), t + max(ends))
 
+    @property
+    def implicit(self) -> bool:
+        return True
+
+    def expand(self, theta: Array) -> Array | None:
+        return self.structure.products(theta) if theta.shape[-1] == self.structure.n_x else None
+
+    @property
+    def noise_varies(self) -> bool:
+        return self.output_noise is not None
+
     def output_weights(self, theta: Array) -> Array:
         """d (..., n_out) with d_1 = 1 from theta (..., n), or from the minimal xi (..., n_x)."""
         at = self.structure.starts[0]

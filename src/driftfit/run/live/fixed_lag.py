@@ -37,7 +37,7 @@ class Window:
     """The last ``lag`` + 1 samples of a stream, and what is known from before them."""
 
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
-        if getattr(model, "output_noise", None) is not None:
+        if model.noise_varies:
             raise ValueError(
                 "Live: lag= does not support the output_noise of a model; smooth the record, or leave output_noise out."
             )

@@ -60,13 +60,12 @@ from driftfit.trackers.bank.layout import (
     WHOLE,
     R,
 )
-from driftfit.trackers.bank.leaves import forget, square_root_form
+from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
-from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.machine.start import GROWTH, begin
-from driftfit.trackers.bank.machine.steps import STEPS
+from driftfit.trackers.bank.machine.variants import made
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
@@ -220,6 +219,13 @@ class Bank(Tracker):
         return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
 
     @property
+    def chained(self) -> bool:
+        """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
+        merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
+        walks = not any(one.forgets for one in self.all_changes)
+        return len(self.all_changes) > 1 and not self._apart and not merging and walks
+
+    @property
     def change_names(self) -> tuple[str, ...]:
         """Names of the changes."""
         named = [one.name or ("none" if i == 0 else f"change {i}") for i, one in enumerate(self.all_changes)]
@@ -261,7 +267,7 @@ class Bank(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         cleans = any(one.cleans for one in self.all_sensors)
-        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        state = self._state(model.n, (model.output_lags or 0) if cleans else 0)
         if len(model.outputs) == 1 or model.shared:
             return state
         sizes = [np.size(state[name]) for name in ("memory", "report", "sample", "counters", "table")]
@@ -417,7 +423,8 @@ class Bank(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        machine, steps = square_root_form.made() if self.form == "sqrt" else (bank, STEPS)
+        own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
+        machine, steps = made(self.form == "sqrt", own)
         machine.load()
         return steps
 

@@ -1,6 +1,6 @@
 """The table of a bank: where its arrays lie, and what its counters and the numbers of a sample are called.
 
-Every part of the compiled routine is given the table alone (`driftfit.engine.table`), and asks it for what it needs.
+Every part of the compiled routine is given the table alone (`driftfit.trackers.bank.table`), and asks for what it needs.
 Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaves`. With n
 parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
 
@@ -23,16 +23,17 @@ parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors,
     chain, row              of this sample: the chain, and the prior of the events that all leaves have in common
     loss, reduction, bases  losses of decisions; settings of the reduction; limits of the codes of leaves
     stamps, decided         when the undecided events were; what was decided at this sample
-    components              of the predictive density (`machine.lookahead`)
-    root, samples           for growing the tree again (`machine.refilter`)
+    components              of the predictive density (`reducing.lookahead`)
+    root, samples           for growing the tree again (`reducing.refilter`)
     ring                    recent samples for events of a stream
     new_events              what an event adds to a history
-    gap                     what may have happened since the last used sample (`machine.gap`)
+    gap, path               what may have happened since the last used sample (`machine.gap`, `machine.chain_gap`)
     lag_prob, newest        marginals of the events of all floors; of those that are reported
     C, m, z, g              of the columns that a sample meets: covariance, mean, regressor, C z
     expected                their z'C z and z'm
     scores                  their unit of covariance or log density; then two rows to spare
     scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
+    said                    what a likelihood of the user's own says (`leaves.own_sensor`)
     spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
@@ -41,17 +42,18 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import kernel
-from driftfit.engine.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
+from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
     LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, OPEN,
-    REFUSED, FAULTS, AGAIN, CHAINED, ALIKE, WIDE, COUNT,
-) = range(20)  # fmt: skip
+    REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, COUNT,
+) = range(22)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample. OPEN floors have passed since the last used sample
 (`driftfit.trackers.bank.machine.gap`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
-AGAIN says that the present one was just refused. Of the present sample: CHAINED that the user gave a chain of changes,
-ALIKE that all leaves have one prior, WIDE that its floor is another than that of one nominal interval.
+AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already. Of the
+present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its floor
+is another than that of one nominal interval, PARTED that leaves go on as two (`machine.chain_gap`).
 """
 WAITING, READY = 0, -1
 (
@@ -75,24 +77,25 @@ TOLD = 8
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
     "maps_nominal", "places", "sensors", "transition", "loss", "components", "root", "samples", "Q", "ring",
-    "new_events", "gap", "chain", "lag_prob", "scratch",
+    "new_events", "gap", "path", "chain", "lag_prob", "scratch",
 )  # fmt: skip
 VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "bases", "stamps")
 WHOLE = ("parent", "event", "start", "order", "group", "slots")
 """Arrays of whole numbers."""
 REPORTED = ("newest", "decided")
 """Arrays that lie in the report."""
-WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow")
+WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "said")
 """Rows of the scratch that have names."""
 OUTSIDE = {
     "report": VECTOR, "phi": VECTOR, "powers": VECTOR, "theta": VECTOR, "cov": MATRIX, "counters": COUNTS,
     "sample": VECTOR,
 }  # fmt: skip
 """Arrays that are fields of the state themselves."""
-NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart")
+NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods")
 """n; how many output lags of their own leaves have; whether the noise is unknown, events are independent; whether all
 leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all changes are
-walks; and whether what may have happened since the last used sample is one floor.
+walks; whether what may have happened since the last used sample is one floor; and the address of the user's own
+likelihoods, while the compiled routine runs.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
 """Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of many

@@ -3,6 +3,7 @@
     nominal, outlier    y = phi' theta + e,   e ~ N(0, factor r)
     offset              y = phi' theta + value + e
     frozen              y ~ N(last output seen, r_f), nothing learned
+    own                 a density of your own, of y given the forecast of a leaf (`Sensor.own`)
 
 An *innovation* outlier drives the plant: y stays in the regressors of later samples. An *additive* one is the sensor's
 alone: a leaf that believes it puts its own prediction into its output lags, and so does a frozen one. With
@@ -13,12 +14,19 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from types import FunctionType
+from typing import Any
 
+import numpy as np
+
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, numbers, one_of
 from driftfit.trackers.bank.change import probability
 
-KINDS = ("nominal", "outlier", "additive", "offset", "frozen")
+KINDS = ("nominal", "outlier", "additive", "offset", "frozen", "own")
 STUCK = 1e-4
 """Variance of a frozen sensor without a resolution, in units of r."""
 
@@ -37,6 +45,8 @@ class Sensor(Settings):
     nu: float = 4.0
     memory: float | None = 100.0
     limit: float | None = None
+    likelihood: Any = None
+    own_lags: bool = False
 
     def __post_init__(self) -> None:
         one_of("Sensor", "kind", self.kind, KINDS)
@@ -47,12 +57,18 @@ class Sensor(Settings):
         self._set("nu", numbers("Sensor", "nu", self.nu, ndim=0, low=2.0, strict=True))
         if self.memory is not None:
             self._set("memory", numbers("Sensor", "memory", self.memory, ndim=0, low=3.0, strict=True))
+        if (self.kind == "own") != (self.likelihood is not None):
+            raise ValueError(f"Sensor: a likelihood of your own is Sensor.own(likelihood); got kind={self.kind!r}.")
+        if self.likelihood is not None:
+            self._set("likelihood", _function(self.likelihood))
         if self.prob is not None:
             self._set("prob", probability("Sensor", self.prob))
 
     @property
     def name(self) -> str:
         """What tables call it."""
+        if self.kind == "own":
+            return str(self.likelihood.__name__)
         return f"offset {self.value:g}" if self.kind == "offset" else self.kind
 
     @classmethod
@@ -117,13 +133,77 @@ class Sensor(Settings):
             )
         return cls("frozen", prob=prob, resolution=resolution)
 
+    @classmethod
+    def own(
+        cls, likelihood: Callable[..., Any], prob: float = 0.01, scale: float = 1.0, cleans: bool = False
+    ) -> Sensor:
+        """A likelihood of your own: a plain function ``likelihood(y, y_hat, h, r, last)`` of numbers, which Numba
+        compiles, returning three: ``log_p, noise, clean``.
+
+        Parameters
+        ----------
+        likelihood : function of the module, of
+            y : the reading; y_hat, h : mean and variance of what a leaf expects of the output, before any noise;
+            r : noise variance of the nominal sensor; last : the last reading that was seen (NaN: none),
+            all in units of y. It returns
+            log_p : log density of y, -inf where it cannot be;
+            noise : the variance of the measurement y as which the leaf is updated (``np.inf``: nothing is learned);
+            clean : what the output was, for the lags of a leaf that believes it, with ``cleans=True``.
+            It may use numbers, `math` and other such functions, and has no state.
+        prob : float
+            Prior probability.
+        scale : float
+            Standard deviations of its noise in those of the nominal one, as far as forecasts are concerned.
+        cleans : bool
+            Whether ``clean`` takes the place of y in the leaf's output lags.
+
+        Cost: the function twice for every leaf and sample (thrice where it cleans); about a minute of compiling on each
+        computer. Saved runs keep the function's name, and import it again.
+        """
+        scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)
+        return cls("own", prob=prob, factor=scale * scale, likelihood=likelihood, own_lags=bool(cleans))
+
+    def settings(self) -> dict[str, Any]:
+        plain = super().settings()
+        if self.likelihood is not None:
+            plain["likelihood"] = f"{self.likelihood.__module__}:{self.likelihood.__qualname__}"
+        return plain
+
     def row(self) -> list[float]:
-        """What compiled code knows of it: the columns of `driftfit.trackers.bank.leaves.forecast`."""
+        """What compiled code knows of it: the columns of `driftfit.trackers.bank.leaves.forecast`, but for its number
+        among the user's own.
+        """
         width = -STUCK if self.resolution is None else self.resolution**2 / (2.0 * math.pi)
-        own = self.kind in ("additive", "frozen")
+        own = self.kind in ("additive", "frozen") or self.own_lags
         return [self.factor, self.value, float(self.kind == "frozen"), width, float(own)]
 
     @property
     def cleans(self) -> bool:
         """Whether a leaf that believes it puts something other than y into its output lags."""
-        return self.kind in ("additive", "offset", "frozen")
+        return self.kind in ("additive", "offset", "frozen") or self.own_lags
+
+
+def table_of(sensors: Sequence[Sensor]) -> Array:
+    """What compiled code knows of the sensors of a bank, one a row."""
+    number = np.cumsum([sensor.kind == "own" for sensor in sensors])
+    numbered = zip(sensors, number, strict=True)
+    return np.array([[*sensor.row(), float(k) if sensor.kind == "own" else 0.0] for sensor, k in numbered])
+
+
+def _function(given: Any) -> Any:
+    """A function of a module, or where it is."""
+    if isinstance(given, str):
+        module, _, name = given.partition(":")
+        given = getattr(import_module(module), name)
+    inner = getattr(given, "py_func", given)
+    if not isinstance(inner, FunctionType) or "<" in inner.__qualname__:
+        raise ValueError(
+            f"Sensor.own: likelihood must be a function that a module defines by name, so that it can be found again; "
+            f"got {given!r}."
+        )
+    if inner.__code__.co_argcount != 5:
+        raise ValueError(
+            "Sensor.own: likelihood takes (y, y_hat, h, r, last) and returns (log_p, noise, clean); "
+            f"{inner.__name__} takes {inner.__code__.co_argcount} arguments."
+        )
+    return inner

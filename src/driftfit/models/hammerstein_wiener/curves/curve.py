@@ -14,7 +14,6 @@ from importlib import import_module
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
 from driftfit.engine.kernel import Array, Driver, kernel
 from driftfit.engine.settings import Settings, numbers, whole
@@ -218,6 +217,6 @@ def _imported(function: Any) -> Any:
             return getattr(import_module(module), name)
         except (ImportError, AttributeError):
             raise ValueError(f"Functions: {function!r} cannot be imported; define it in a module.") from None
-    if not (callable(function) or isinstance(function, Dispatcher)):
+    if not callable(function):
         raise ValueError(f"Functions: values and slopes must be functions (x, p, out); got {function!r}.")
     return function

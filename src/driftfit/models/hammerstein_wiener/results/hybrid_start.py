@@ -75,8 +75,7 @@ def hand_off(
     found = blocks_of(before, "gls")
     assert found.cov is not None
     bound = before.model
-    assert isinstance(bound, HammersteinWiener)
-    head = np.abs(found.c[-1, bound.structure.leads]).min()
+    head = min(abs(found.of_input(i)[1][-1, 0]) for i in range(bound.m))
     if head < WEAK:
         raise ValueError(
             f"hand_off: {type(then).__name__} has c_1 = 1, but with |c| = 1 the curve has c_1 = {head:.1g}; order the "

@@ -45,7 +45,7 @@ def blocks_of(
 
 
 def _intercept(run: Track) -> Array | None:
-    return run.theta[:, -1].copy() if getattr(run.model, "intercept", False) else None
+    return run.theta[:, -1].copy() if run.model.intercept else None
 
 
 def _warn(found: Blocks, run: Track, input: str | None) -> None:

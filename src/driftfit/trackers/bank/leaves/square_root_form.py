@@ -1,7 +1,7 @@
-"""The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
+"""The compiled routine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the machine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
-that everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
+It is the routine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
+that everything else, as growing, weighing, choosing and remembering, is one source for both. The operations are in
 `driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
 are factorised once a sample.
 
@@ -11,18 +11,16 @@ distances from the mean. Until the tree begins, the one filter keeps a covarianc
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
-from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, Machine, shared
+from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
-from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import advance, grow, lookahead, merge, refilter, start, steps
+from driftfit.trackers.bank.machine import chain_gap, grow, start
+from driftfit.trackers.bank.reducing import lookahead, merge, refilter
 
 covariance_begin = start.begin
 
@@ -102,7 +100,7 @@ def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> No
 
 @shared
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
-    """`grow.ahead`. An eight may reach into the columns of the next change, which are written after it."""
+    """`grow.ahead`. A SIMD vector may reach into the columns of the next change, which are written after it."""
     A, V, Hd, Hm = t.parents, t.narrow, len(t.walks), len(t.sensors)
     columns = K if own else K * Hd
     for c in range(Hd):
@@ -175,6 +173,19 @@ def widen(t: Any, weight: Array, X: Array) -> None:
 
 
 @shared
+def widen_leaf(t: Any, k: int, q: Array) -> None:
+    """`chain_gap.widen_leaf`; q is factorised."""
+    A, W, n = t.parents, t.narrow, t.n
+    tri = n * (n + 1) // 2
+    factorise(q, n, 0.0)
+    for i in range(tri):
+        store(W, i, 0, fill(A[FIRST + n + i, k]))
+    raised(W, n, 0, q, fill(1.0), W[tri:])
+    for i in range(tri):
+        A[FIRST + n + i, k] = W[i, 0]
+
+
+@shared
 def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) -> float:
     """`lookahead.width`."""
     lags, wide, at = FIRST + n + n * (n + 1) // 2, 0.0, 0
@@ -190,14 +201,9 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
     return wide
 
 
-@cache
-def made() -> tuple[Machine, TrackerSteps]:
-    """The machine and the steps that run it."""
-    others = {
-        leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
-        forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
-        refilter.widen: widen, lookahead.width: width,
-    }  # fmt: skip
-    (machine,) = substituted([advance.bank], others)
-    correct_step, begin_step = substituted([steps.STEPS.correct, steps.STEPS.begin], {advance.bank: machine})
-    return machine, steps.STEPS._replace(correct=correct_step, begin=begin_step)
+PARTS = {
+    leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
+    forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
+    refilter.widen: widen, chain_gap.widen_leaf: widen_leaf, lookahead.width: width,
+}  # fmt: skip
+"""What takes whose place."""

@@ -39,10 +39,12 @@ from driftfit.trackers.bank.layout import (
     MOST,
     OPEN,
     PARENTS,
+    PARTED,
     REFUSED,
     S2,
     SETTLED,
     STORED,
+    TAKEN,
     WIDE,
     WINDOW,
     Y_HAT,
@@ -65,11 +67,13 @@ from driftfit.trackers.bank.leaves.leaves import (
     variance_factor,
 )
 from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
+from driftfit.trackers.bank.machine.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.merge import combine, mix, sort, take
-from driftfit.trackers.bank.machine.refilter import NOISE, TIME, Y, histories, refilter
-from driftfit.trackers.bank.machine.selection import (
+from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
+from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
+from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
+from driftfit.trackers.bank.reducing.selection import (
     BEAM,
     CUT,
     DEPTH,
@@ -85,12 +89,9 @@ from driftfit.trackers.bank.machine.selection import (
     merge,
     number,
 )
-from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
 
 FAULTS_IN_A_ROW = 3
 """As many samples in a row may be taken for fault codes."""
-MOST_STEPS = 1000
-"""Steps of a chain of events that an interval may have."""
 
 
 @machine
@@ -133,7 +134,9 @@ def advance(t: Any) -> None:
     counters[CLOCK] += 1
     L = counters[LEAVES]
     mixture(t.n, t, L)
-    if counters[OPEN] > 0:
+    if counters[OPEN] > 0 and counters[PARTED] > 0:
+        add_covariance(t, L)
+    elif counters[OPEN] > 0:
         variance_factor(t, t.scratch, 0, L)
         widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
     sample[WINDOW] = marginals(t, L)
@@ -157,8 +160,12 @@ def prepare(t: Any) -> None:
         t.row[e] = source[e]
     alike = given or first(t) or (t.independent > 0 and counters[CHAINED] == 0)
     wide = t.apart > 0 and (counters[OPEN] > 0 or dt != 1.0 or not used)
-    counters[ALIKE], counters[WIDE] = 1 if alike else 0, 1 if wide else 0
+    parted = len(t.path) > 0 and not first(t) and (counters[OPEN] + counters[TAKEN] > 0 or counters[EXPANDED] == 0)
+    parted = parted and (counters[OPEN] > 0 or not used or further(dt) > 0)
+    counters[ALIKE], counters[WIDE], counters[PARTED] = 1 if alike else 0, 1 if wide else 0, 1 if parted else 0
     increments_now(t)
+    if parted:
+        go_on(t, dt, used)
     if wide:
         odds(t.gap, t.row, Hm, dt, given)
         covariances(t.gap, dt, used, t.Q)
@@ -190,7 +197,8 @@ def forecast(t: Any, L: int) -> None:
     """
     counters, sample = t.counters, t.sample
     used, interacts = sample[IN_OK] > 0.0, int(t.reduction[KIND]) == INTERACT
-    plain = t.plain > 0 and counters[OPEN] == 0  # in a gap the mixture has more in it than its leaves
+    parted = counters[PARTED] > 0
+    plain = t.plain > 0 and counters[OPEN] == 0 and not parted  # in a gap the mixture has more in it than its leaves
     one_for_all = plain and counters[ALIKE] > 0 and used and not interacts
     outlook(t, 1 if one_for_all else L, counters[EXPANDED] > 0, True)
     variance_factor(t, t.scores, 0, L)
@@ -200,6 +208,8 @@ def forecast(t: Any, L: int) -> None:
         regressors(t.n, t, t.leaves, L, min(L, 1), t.phi)
         foresee(t, L, len(t.walks), len(t.sensors), used)
         widen_by_lags(t, t.leaves, L, L)
+        if parted:
+            add_variance(t, L)
     if not plain:
         sample[Y_HAT], sample[S2] = expect(t, L)
 
@@ -212,7 +222,7 @@ def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
     if dt == 0.0:
         standstill(t.prior, L, Hm)
     elif dt > 1.0 and t.apart == 0 and t.counters[ALIKE] == 0:
-        later(t.prior, L, t.chain, int(min(dt, MOST_STEPS) - 0.5), t.spare)
+        later(t.prior, L, t.chain, further(dt), t.spare)
     if wide:
         chances(t.prior, L, Hm, t.gap, whole)
 
@@ -233,9 +243,12 @@ def take_in(t: Any) -> None:
         for e in range(len(prior)):
             for l in range(K):
                 prior[e, l] = 1.0 if e == l else 0.0
+    elif counters[PARTED] > 0:
+        origins(t, counters[LEAVES], K)
+        K = split(t, K)
     elif counters[ALIKE] == 0 or again:
         outlook(t, K, True, True)
-    if counters[OPEN] > 0:
+    if counters[OPEN] > 0 and t.apart > 0:
         take_back(
             t.history_2 if counters[FLIPPED] > 0 else t.history,
             K,
@@ -271,6 +284,7 @@ def accept(t: Any, gone: float) -> None:
     if counters[OPEN] > 0:
         counters[OPEN] = 0
         close(t.gap)
+    counters[TAKEN] = 0
 
 
 @shared
@@ -278,6 +292,7 @@ def reject(t: Any, K: int) -> None:
     """No leaf allows what was seen: go on as if it had not been."""
     counters = t.counters
     counters[IMPOSSIBLE] += 1
+    counters[OPEN], counters[TAKEN] = counters[OPEN] if t.apart > 0 else 0, 0
     L = recover(t.parents, K, t.leaves, len(t.parents))
     counters[LEAVES], counters[EXPANDED] = L, 1
     shift_covariance(t, t.leaves, L, 0, L, False)
@@ -299,6 +314,9 @@ def let_pass(t: Any, L: int) -> None:
     if apart:
         outlook(t, L, True, False)
     shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
+    if counters[PARTED] > 0:
+        counters[OPEN] += 1
+        counters[TAKEN] = 0
     if apart:  # leaves take in the ordinary course only
         certain(t.prior, L)
         foresee(t, L, 1, 1, False)
@@ -308,7 +326,7 @@ def let_pass(t: Any, L: int) -> None:
         t.places[BEFORE, k] = 0.0
         for l in range(L):
             B[FIRST + k, l] = t.m[k, l]
-    for k in range(n * (n + 1) // 2):
+    for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
         for l in range(L):
             B[FIRST + n + k, l] = t.C[k, l]
     counters[FLOORS] += 1

@@ -24,7 +24,8 @@ from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 
-WALKS, FIXED, RELATIVE, COLUMNS, GAP = (ROW[f] for f in ("walks", "fixed_walks", "relative_walks", "leaves", "gap"))
+FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
+WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
 """Rows of the table."""
 
 
@@ -82,6 +83,9 @@ def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unkn
     gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
     for i in range(1, table[3 * GAP + 1]):
         enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
+    path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
+    for i in range(2 * H, table[3 * PATH + 1] - 1):
+        enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
     return mean
 
 

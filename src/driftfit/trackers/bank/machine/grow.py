@@ -23,10 +23,11 @@ import numpy as np
 from driftfit.engine.kernel import Array, log, part, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, log_of, minus, over, plus, store, times
 from driftfit.trackers.bank.layout import ALIKE, FADE, LEAST, MOST, R
-from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
 from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
@@ -180,6 +181,10 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         if sensors[j, FROZEN] > 0.0:
             leave(t, at, columns)
             frozen(t, at, columns, y, last, sensors[j, STUCK])
+        elif sensors[j, OWN] > 0.0:
+            judge_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+            correct(t.n, t, at, columns, y, 0.0)
+            weigh_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
         else:
             correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.sample[R] * noise)
             if t.unknown > 0:
@@ -189,6 +194,8 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         if t.output_lags > 0:
             own_lags = sensors[j, CLEANS] > 0.0
             remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
+            if own_lags and sensors[j, OWN] > 0.0:
+                clean_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

@@ -14,12 +14,12 @@ from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED,
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
-from driftfit.trackers.bank.machine import selection
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
-from driftfit.trackers.bank.machine.lookahead import NODES
+from driftfit.trackers.bank.reducing import selection
+from driftfit.trackers.bank.reducing.lookahead import NODES
 from driftfit.trackers.bank.reduction import Reduction
-from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -39,6 +39,8 @@ class Settings(Protocol):
     @property
     def event_probabilities(self) -> tuple[Array, Array]: ...
     @property
+    def chained(self) -> bool: ...
+    @property
     def lag_variance(self) -> bool: ...
     @property
     def form(self) -> str: ...
@@ -48,13 +50,13 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     """The arrays of `driftfit.trackers.bank.layout` before the first sample, but for fields of the state and
     windows of the scratch; covariances are multiplied by ``unit``.
     """
-    Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
+    Hd, Hm, twice = len(bank.all_changes), len(bank.all_sensors), 2 if bank.chained else 1
     shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
-    tri, K, W = n * (n + 1) // 2, shape.children, shape.floors
+    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.floors
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
-    parents, children = _room(max(shape.parents, K // H), Hd, Hm)
+    parents, children = _room(most := max(shape.parents * twice, K // H), Hd, Hm)
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
@@ -65,11 +67,12 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "scratch": np.zeros((_named_rows(n) + 5 + max(H, Hm) + more, children)),
         **{name: np.zeros(links, int) for name in ("parent", "event", "start", "order")}, "group": np.zeros(K, int),
         "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, children)),
-        "sensors": np.array([sensor.row() for sensor in bank.all_sensors]), "given": np.full(H, np.nan),
+        "sensors": table_of(bank.all_sensors), "given": np.full(H, np.nan),
         "row": np.zeros(H), "loss": bank.reduction.losses(H), "reduction": shape.knobs,
         "bases": shape.bases, "stamps": np.zeros(shape.held),
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
+        "path": path_of(H, Hd, _whole_vectors(tri), most if bank.chained else 0),
         "ring": np.zeros((RING, BESIDE + H)), "new_events": news_of(H, Hm, remembered), "lag_prob": np.zeros((W, H)),
         "newest": np.zeros((min(W, TOLD), H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
@@ -108,7 +111,7 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     return {
         "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
         "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3),
+        "narrow": (scores + 3, rows - scores - 3), "said": (rows - 1, 1),
     }  # fmt: skip
 
 
@@ -140,6 +143,13 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
         table[ROW[name], 0] = value
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+
+
+def path_of(H: int, Hd: int, wide: int, room: int) -> Array:
+    """The table of `driftfit.trackers.bank.machine.chain_gap`, with room for so many leaves; empty for none."""
+    table = np.zeros((3 * H + Hd + 1 if room else 0, max(H, wide) + 1))
+    table[-1:, -1] = room
+    return table
 
 
 def _closed(Hd: int, wide: int) -> Array:

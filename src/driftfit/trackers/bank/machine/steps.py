@@ -38,6 +38,7 @@ from driftfit.trackers.bank.layout import (
     R,
 )
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
+from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
 from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, write_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
@@ -46,7 +47,7 @@ from driftfit.trackers.parts.diffuse import enter, measurement, prediction, span
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
 
-GIVEN, GIVEN_CHAIN, DRIFT = ROW["given"], ROW["given_chain"], ROW["drift"]
+GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 
 
 @kernel
@@ -94,6 +95,7 @@ def point(s: State) -> None:
     s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
     s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
     s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
+    s.table[OWN_AT, 0, 0] = own_address(s)
 
 
 @kernel
@@ -106,6 +108,7 @@ def run(s: State, l: int) -> None:
         bank(s.table.ctypes.data)
         for k in range(MEMORY_AT, SAMPLE_AT + 1):
             s.table[k, 0, 0] = 0
+        s.table[OWN_AT, 0, 0] = 0
 
 
 @kernel
@@ -124,7 +127,7 @@ def among(s: State, l: int) -> None:
             table[k, i] = s.table[k, i, l]
     table[MEMORY_AT, 0], table[REPORT_AT, 0], table[PHI_AT, 0] = memory, report, vectors
     table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
-    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0] = counters, sample
+    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0], table[OWN_AT, 0] = counters, sample, own_address(s)
     for k in range(N):
         floats(memory, 1, N)[0, k] = s.memory[k, l]
     for i in range(n):

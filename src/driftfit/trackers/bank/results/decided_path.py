@@ -7,6 +7,11 @@ Samples at which the sensor was at fault count with the noise of their fault, or
 sensor; in ARX then also the samples whose regressors hold them). Bands are conditional on the events. A diffuse start
 is a prior of 1e6 times what a sample tells. Cost: O(T n^3).
 
+The drift of a bank that was given no changes is a guess, too small where parameters walk all the time: between events
+the path would be taken for certain. So it is scaled, by the factor f >= 1 of greatest likelihood given the events
+
+    max_f sum_t log N(y_t; phi_t' m_t, s_t),   Q_t = f Q_0 between events
+
 Source: Rauch, Tung and Striebel (1965); the covariance of an increment from the lag-one covariance G C_s(t+1).
 """
 
@@ -25,6 +30,8 @@ from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.leaves.leaves import NU, WEIGHT, S
 from driftfit.trackers.bank.results.events import Event
 
+WIDER, CLOSE = 1e7, 0.05
+"""Largest factor of a drift that is fitted, and how closely, in its natural logarithm."""
 WIDE = 1e6
 """Variance of the start of a diffuse run, in units of what one sample tells."""
 
@@ -40,17 +47,21 @@ class Problem(NamedTuple):
     """(T, n, n): covariance of the step before each sample."""
     m0: Array
     C0: Array
+    widened: float = 1.0
+    """What the drift was multiplied by."""
 
 
 class EventSmoothed:
     """Parameters of a record, each from all of it, given the events.
 
-    ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on.
+    ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on; ``widened`` is the
+    factor of the drift between them, 1 where the changes of the bank were given.
     """
 
     def __init__(self, run: Track, events: list[Event]) -> None:
         self.run, self.events, self.names, self.time = run, events, run.names, run.time
         self.problem = problem_of(run, events)
+        self.widened = self.problem.widened
         self.theta, self.covs, self.gains = solve(self.problem)
 
     @property
@@ -87,7 +98,25 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
     steps = np.array(steps_of(run, measured))[which] * drift[:, None, None]
     C0 = np.diag(WIDE * measured.unit) if bank.p0 is None else np.asarray(_full(bank, n)) * measured.relative
     m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
-    return Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
+    problem = Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
+    return problem if bank.changes is not None else with_drift(problem, which == 0)
+
+
+def with_drift(problem: Problem, quiet: Array) -> Problem:
+    """The same with the steps of ``quiet`` samples scaled by the factor of greatest likelihood."""
+    from scipy.optimize import minimize_scalar
+
+    def wider(log_factor: float) -> Problem:
+        factor = np.exp(log_factor)
+        return problem._replace(Q=problem.Q * np.where(quiet, factor, 1.0)[:, None, None], widened=float(factor))
+
+    def unlikely(log_factor: float) -> float:
+        tried, shape = wider(log_factor), problem.phi.shape
+        m, C = np.empty(shape), np.empty((*shape, shape[1]))
+        return -float(forward(tried.phi, tried.y, tried.r, tried.Q, tried.m0, tried.C0.copy(), m, C))
+
+    best = minimize_scalar(unlikely, bounds=(0.0, np.log(WIDER)), method="bounded", options={"xatol": CLOSE})
+    return wider(best.x) if best.fun < unlikely(0.0) else problem
 
 
 class Measured(NamedTuple):
@@ -143,12 +172,12 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
     """Factors of the noise variance, inf where the sensor said nothing."""
     factor = np.ones(len(run))
     sensors = {sensor.name: sensor for sensor in bank.all_sensors}
-    reach = getattr(run.model, "output_lags", 0)
+    reach = run.model.output_lags or 0
     for event in events:
         if event.kind == "sensor":
             sensor = sensors[event.name]
-            away = sensor.kind in ("additive", "frozen")
-            last = event.span.last + 1 + (reach if away else 0)
+            away = sensor.kind in ("additive", "frozen", "own")
+            last = event.span.last + 1 + (reach if sensor.cleans and sensor.kind != "offset" else 0)
             first = event.span.first
             factor[first:last] = np.inf if away else np.maximum(factor[first:last], sensor.factor)
     return factor
@@ -178,9 +207,10 @@ def solve(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 @shared
-def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> None:
-    """The filter; m (T, n) and C (T, n, n) after each sample."""
+def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> float:
+    """The filter; m (T, n) and C (T, n, n) after each sample. Returns the log-likelihood, but for its constant."""
     T, n = phi.shape
+    likely = 0.0
     theta = m0.copy()
     g = np.empty(n)
     for t in range(T):
@@ -195,6 +225,7 @@ def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Ar
                     g[i] += P[i, j] * phi[t, j]
                 s += phi[t, i] * g[i]
                 e -= phi[t, i] * theta[i]
+            likely -= 0.5 * (np.log(s) + e * e / s)
             for i in range(n):
                 theta[i] += g[i] / s * e
             for i in range(n):
@@ -205,3 +236,4 @@ def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Ar
             m[t, i] = theta[i]
             for j in range(n):
                 C[t, i, j] = P[i, j]
+    return likely

@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
-from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, SETTLED
+from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
@@ -60,6 +60,12 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     if since.any():  # what else may have happened since the last used sample
         more = np.zeros((n, n))
         more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
+        covs = covs + more
+    path = tracker.array(place.model, lane, "path")
+    if len(path) and lane["counters"][OPEN] > 0:
+        last = tracker.array(place.model, lane, "event")[0, : B.shape[1]]  # events before the gap
+        more = np.zeros((B.shape[1], n, n))
+        more[:, i, j] = more[:, j, i] = path[-1 - tracker._count :][last, : len(i)]
         covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]

@@ -1,9 +1,4 @@
-"""The promises of a tracker as code, for trackers that stand outside this package as well.
-
-    from driftfit.checks import check_tracker
-
-    for sentence in check_tracker(MyTracker(gain=0.1)):
-        print(sentence)
+"""The promises of a tracker: `check_tracker`.
 
 Every check drives the tracker over a small simulated record and says in a sentence what is broken and where to look.
 It takes about as long as compiling the tracker three times. Keeping all promises does not make a tracker good: compare

@@ -15,7 +15,7 @@ from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.layout import FLIPPED
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.selection import DEPTH, PRIOR
+from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
 
 Y, NOISE, TIME = 0, 1, 2
 """Columns of a stored sample before its regressor."""

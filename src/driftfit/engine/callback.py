@@ -1,0 +1,42 @@
+"""Functions that a compiled machine calls by their address, which a step finds by their symbol.
+
+A machine is compiled once for all; a function of the user's that it calls is not known then. So the function becomes a
+machine of its own, a step asks for its address where it runs, and `call` goes there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+
+from driftfit.engine.numba_internals import ir, named_intrinsic
+
+NUMBERS = 6
+"""Numbers that a function called by its address takes, before the address of its results."""
+_KIND = ir.FunctionType(ir.VoidType(), [ir.DoubleType()] * NUMBERS + [ir.IntType(64)])
+
+
+def _address_of(context: Any, machine: Any) -> Any:
+    """The address of a machine in this process."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        known = builder.module.globals.get(machine.symbol)
+        function = known or ir.Function(builder.module, _KIND, machine.symbol)
+        return builder.ptrtoint(function, ir.IntType(64))
+
+    return types.intp(machine), build
+
+
+def _call(context: Any, address: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, out: Any) -> Any:
+    """Call the function at an address with six numbers and the address of its results."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.call(builder.inttoptr(arguments[0], _KIND.as_pointer()), arguments[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, *[types.float64] * NUMBERS, types.intp), build
+
+
+address_of = named_intrinsic("callback.address_of", _address_of)
+call = named_intrinsic("callback.call", _call)

@@ -1,0 +1,123 @@
+"""Sensors with a likelihood of the user's own: `driftfit.Sensor.own`.
+
+A plain function of numbers says, for one leaf, what a reading y is worth,
+
+    log p(y),  a,  clean = likelihood(y, y_hat, h, r, last)
+
+y_hat = z'm and h = z'C z being the leaf's forecast without noise, r the noise variance of the nominal sensor (of this
+leaf, where it is unknown) and last the last output seen. The leaf is updated as by a measurement with noise variance a,
+
+    K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
+
+so that C stays a covariance whatever the function says; a = inf learns nothing of theta (it counts as `LARGEST` times
+h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
+
+The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
+(`driftfit.engine.callback`); the routine is not compiled anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.callback import address_of, call
+from driftfit.engine.kernel import State, floats, kernel, machine, shared
+from driftfit.trackers.bank.layout import LAST
+from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
+
+LARGEST = 1e12
+"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing."""
+LOG_P, NOISE, CLEAN = range(3)
+"""What a function says."""
+
+
+@shared
+def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
+    """What function ``which`` says of the leaf in column at + l, its noise variance in the units of C; r is that of the
+    nominal sensor.
+    """
+    B, expected, said = t.leaves, t.expected, t.said[0]
+    unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
+    h = expected[0, l]
+    call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
+    most = LARGEST * (h + r)
+    said[NOISE] = max(said[NOISE] / unit, 0.0) if said[NOISE] < most * unit else most
+    said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf
+    said[CLEAN] = said[CLEAN] if abs(said[CLEAN]) < np.inf else y
+
+
+@shared
+def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+    """h + a in the place of h, which is kept in the first row of `scores`."""
+    for l in range(columns):
+        judge(t, which, at, l, y, r)
+        t.scores[0, l] = t.expected[0, l]
+        t.expected[0, l] += t.said[0, NOISE]
+
+
+@shared
+def weigh_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+    """The log densities in the place of what `judge_all` kept, which is given back."""
+    for l in range(columns):
+        t.expected[0, l] = t.scores[0, l]
+        judge(t, which, at, l, y, r)
+        t.scores[0, l] = t.said[0, LOG_P]
+
+
+@shared
+def clean_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+    """The newest output lag as the function has it."""
+    lag = FIRST + t.n + t.n * (t.n + 1) // 2
+    for l in range(columns):
+        judge(t, which, at, l, y, r)
+        t.leaves[lag, at + l] = t.said[0, CLEAN]
+
+
+@kernel
+def own_address(s: State) -> int:
+    """Where the functions of a bank are: nowhere, in most."""
+    return 0
+
+
+@cache
+def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
+    """The functions, numbered from 1, as a machine; and what takes the place of `own_address`."""
+    chosen = _chosen(functions)
+
+    def likelihoods(which: float, y: float, y_hat: float, h: float, r: float, last: float, out: int) -> None:
+        said = floats(out, 1, 3)
+        said[0, 0], said[0, 1], said[0, 2] = chosen(which, y, y_hat, h, r, last)
+
+    likelihoods.__annotations__ = {name: "float" for name in ("which", "y", "y_hat", "h", "r", "last")}
+    entry = machine(likelihoods)
+
+    @kernel
+    def address(s: State) -> int:
+        return address_of(entry)  # type: ignore[no-any-return]
+
+    return entry, address
+
+
+def _chosen(functions: Sequence[Callable[..., Any]]) -> Any:
+    """One of several functions, by its number."""
+    first = kernel(functions[0])
+    if len(functions) == 1:
+
+        @kernel
+        def one(which: float, y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
+            return first(y, y_hat, h, r, last)  # type: ignore[no-any-return]
+
+        return one
+    others = _chosen(functions[1:])
+
+    @kernel
+    def either(which: float, y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
+        if which == 1.0:
+            return first(y, y_hat, h, r, last)  # type: ignore[no-any-return]
+        return others(which - 1.0, y, y_hat, h, r, last)  # type: ignore[no-any-return]
+
+    return either

@@ -1,0 +1,272 @@
+"""Gaps under a Markov chain of changes: each leaf goes on twice, with the mode that likely lasted and with all else.
+
+While nothing is seen the chain goes on. For a leaf whose last event is s,
+
+    reach[s, e]    p(last event of the gap is e)
+    stay[s, e]     the part of it in which the change was that of e at every sample of the gap
+    held[c]        sum Q_c over the gap, mean[s] = E sum Q over the gap
+
+A sample that can be used after k others that could not finds each leaf, weight w, split into two:
+
+    one mode c       w kappa,         C + held[c],                                    stay[s, .] / kappa
+    all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
+
+(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a floor as always, with the chain
+from the events that they end in. So a jump in the gap, after which all is as before, is a leaf of its own, and so is a
+mode that lasted. That is exact in the probabilities of both courses and of what they end in, and in the first two
+moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
+interval of dt nominal samples is a gap of dt - 1 and a floor.
+
+Only random walks; where there is no room for two (`Decide`, whose branches may still hold those of an earlier gap) one
+leaf has the moments of both. Cost: O(H^3 + H n^2) for each sample that is not used, and twice the leaves for the one
+that ends the gap.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from driftfit.engine.kernel import Array, kernel, shared
+from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
+from driftfit.trackers.bank.leaves.leaves import FIRST, LOG, WEIGHT, variance_factor
+
+SURE = 1e-12
+"""A course less likely than this is left out."""
+MOST_STEPS = 1000
+"""Steps of a chain of events that an interval may have."""
+
+
+@kernel
+def further(dt: float) -> int:
+    """Steps of the chain in an interval before its last."""
+    return int(min(dt, MOST_STEPS) - 0.5) if dt > 1.0 else 0
+
+
+@shared
+def go_on(t: Any, dt: float, used: bool) -> None:
+    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
+
+    A sample that is refused after all comes here twice.
+    """
+    counters, Q = t.counters, t.Q
+    if counters[OPEN] == 0 and counters[TAKEN] == 0:
+        open_gap(t.path, len(t.row))
+    steps = further(dt) + 1 if dt > 0.0 else 0
+    share = 1.0 / max(steps, 1)
+    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
+        lengthen(t, share)
+    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
+    for c in range(len(t.walks)):
+        for k in range(Q.shape[1]):
+            Q[c, k] *= share if used else 0.0
+
+
+@shared
+def open_gap(path: Array, H: int) -> None:
+    """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare, whose last entry
+    says how many leaves there is room for.
+    """
+    for row in range(len(path) - 1):
+        for k in range(path.shape[1]):
+            path[row, k] = 1.0 if row < 2 * H and k == row % H else 0.0
+
+
+@shared
+def step(t: Any, e: int, to: int) -> float:
+    """p(next event is ``to`` | e): one row for all where they are alike."""
+    return t.row[to] if t.counters[ALIKE] > 0 else t.chain[e, to]  # type: ignore[no-any-return]
+
+
+@shared
+def lengthen(t: Any, share: float) -> None:
+    """One more sample of which nothing is known, in which change c adds ``share`` of Q[c]."""
+    path, Q, X, H, Hd, Hm = t.path, t.Q, t.scratch, len(t.row), len(t.walks), len(t.sensors)
+    for s in range(H):
+        for e in range(H):
+            total, same = 0.0, 0.0
+            for last in range(H):
+                p = step(t, last, e)
+                total += path[s, last] * p
+                same += path[H + s, last] * p if last // Hm == e // Hm or path[2 * H, path.shape[1] - 1] == 0.0 else 0.0
+            X[0, e], X[1, e] = total, same
+        for e in range(H):
+            path[s, e], path[H + s, e] = X[0, e], X[1, e]
+        for c in range(Hd):
+            chance = 0.0
+            for e in range(c * Hm, (c + 1) * Hm):
+                chance += path[s, e]
+            for k in range(Q.shape[1]):
+                path[2 * H + Hd + s, k] += chance * share * Q[c, k]
+    for c in range(Hd):
+        for k in range(Q.shape[1]):
+            path[2 * H + c, k] += share * Q[c, k]
+    path[2 * H, path.shape[1] - 1] = 1.0  # the first sample may lead from any event into a mode
+
+
+@shared
+def add_variance(t: Any, L: int) -> None:
+    """h <- h + z' mean[s] z, for leaves whose last events are s."""
+    h, z, path, first = t.expected[0], t.z, t.path, 2 * len(t.row) + len(t.walks)
+    for l in range(L):
+        k, at, row = l if t.output_lags > 0 else 0, 0, first + t.event[l]
+        for i in range(t.n):
+            for j in range(i + 1):
+                h[l] += (1.0 if i == j else 2.0) * z[i, k] * z[j, k] * path[row, at]
+                at += 1
+
+
+@shared
+def add_covariance(t: Any, L: int) -> None:
+    """The covariance of the mixture with what the gap adds on average."""
+    P, B, X, path, H, Hd = t.cov, t.leaves, t.scratch, t.path, len(t.row), len(t.walks)
+    variance_factor(t, X, 0, L)
+    for s in range(H):
+        weight, at = 0.0, 0
+        for l in range(L):
+            weight += B[WEIGHT, l] * X[0, l] if t.event[l] == s else 0.0
+        if weight > 0.0:
+            for i in range(len(P)):
+                for j in range(i + 1):
+                    P[i, j] += weight * path[2 * H + Hd + s, at]
+                    at += 1
+
+
+@shared
+def widen_leaf(t: Any, k: int, q: Array) -> None:
+    """C + q of one parent, q being a lower triangle."""
+    for i in range(t.n * (t.n + 1) // 2):
+        t.parents[FIRST + t.n + i, k] += q[i]
+
+
+@shared
+def origins(t: Any, L: int, K: int) -> None:
+    """prior[s, k]: share of the weight of group k that had s as its last event before the gap."""
+    group, event, origin = t.group, t.event, t.prior
+    for s in range(len(origin)):
+        for k in range(K):
+            origin[s, k] = 0.0
+    for l in range(L):
+        if group[l] >= 0:
+            origin[event[l], group[l]] += t.leaves[WEIGHT, l]
+    for k in range(K):
+        total = 0.0
+        for s in range(len(origin)):
+            total += origin[s, k]
+        for s in range(len(origin)):
+            origin[s, k] /= total
+
+
+@shared
+def split(t: Any, K: int) -> int:
+    """The parents twice; returns how many there are now.
+
+    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
+    """
+    A, T, path, prior = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history, t.path, t.prior
+    H, Hd, Hm, last, wide, count = len(t.row), len(t.walks), len(t.sensors), len(path) - 1, path.shape[1] - 1, K
+    room, floors, standing = int(path[last, wide]), t.counters[OPEN], t.sample[IN_DT] == 0.0
+    reach, stay, q = t.scratch[0], t.scratch[1], path[last]
+    for k in range(K):
+        for e in range(H):
+            reach[e], stay[e] = 0.0, 0.0
+            for s in range(H):
+                reach[e] += prior[s, k] * path[s, e]
+                stay[e] += prior[s, k] * path[H + s, e]
+        best, kappa = 0, -1.0
+        for c in range(Hd):
+            mass = 0.0
+            for e in range(c * Hm, (c + 1) * Hm):
+                mass += stay[e]
+            best, kappa = (c, mass) if mass > kappa else (best, kappa)
+        rest = 1.0 - kappa
+        both = rest > SURE and kappa > SURE and count < room
+        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
+        for i in range(wide):
+            mean = 0.0
+            for s in range(H):
+                mean += prior[s, k] * path[2 * H + Hd + s, i]
+            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
+        for e in range(H):
+            own = stay[e] if e // Hm == best else 0.0
+            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
+            stay[e] = own / kappa if kappa > 0.0 else 0.0
+        if both:
+            for i in range(len(A)):
+                A[i, count] = A[i, k]
+            for i in range(T.shape[1]):
+                T[count, i] = T[k, i]
+            A[LOG, count] += math.log(rest)
+            widen_leaf(t, count, q)
+            remember_other(T, count, floors, H, Hm, best, kappa)
+            remember_one(T, k, floors, H, Hm, best)
+            next_event(t, standing, reach, count)
+            next_event(t, standing, stay, k)
+            A[LOG, k] += math.log(kappa)
+            for i in range(wide):
+                q[i] = path[2 * H + best, i]
+            widen_leaf(t, k, q)
+            count += 1
+        else:
+            next_event(t, standing, reach if rest > 0.0 else stay, k)
+            widen_leaf(t, k, q)
+    return count
+
+
+@shared
+def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
+    """The prior of the floor to come of a leaf whose last event has the probabilities p. Where no time passes
+    (``standing``) nothing changes.
+    """
+    prior, H, Hm = t.prior, len(t.row), len(t.sensors)
+    for e in range(H):
+        prior[e, k] = 0.0
+        for last in range(H):
+            prior[e, k] += p[last] * step(t, last, e)
+    if standing:
+        for j in range(Hm):
+            for e in range(Hm + j, H, Hm):
+                prior[j, k] += prior[e, k]
+                prior[e, k] = 0.0
+
+
+@shared
+def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> None:
+    """What the leaf of one mode remembers: that mode at every floor of the gap, and sensors as they were likely."""
+    block = H + 1
+    known = min(floors, T.shape[1] // block)
+    quiet = T[k, (known - 1) * block + H] if known > 0 else 1.0
+    for at in range(0, T.shape[1] - block + 1, block):
+        if at < known * block:
+            for j in range(Hm):
+                share = 0.0
+                for e in range(j, H, Hm):
+                    share += T[k, at + e]
+                    T[k, at + e] = 0.0
+                T[k, at + best * Hm + j] = share
+            T[k, at + H] = 1.0 if best == 0 else 0.0
+        elif best > 0:
+            T[k, at + H] = 0.0
+        elif known > 0:
+            T[k, at + H] = T[k, at + H] / quiet if quiet > 0.0 else 0.0
+
+
+@shared
+def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, kappa: float) -> None:
+    """What the leaf of all other courses remembers: the mean without the course of one mode."""
+    block = H + 1
+    for at in range(0, T.shape[1] - block + 1, block):
+        if at < floors * block:
+            for j in range(Hm):
+                share = 0.0
+                for e in range(j, H, Hm):
+                    share += T[k, at + e]
+                e = best * Hm + j
+                T[k, at + e] = max(T[k, at + e] - kappa * share, 0.0)
+            total = 0.0
+            for e in range(H):
+                total += T[k, at + e]
+            for e in range(H):
+                T[k, at + e] /= total
+        if best == 0 and at >= (floors - 1) * block:
+            T[k, at + H] = 0.0  # something changed
