@@ -81,7 +81,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
     instead of raising, the GIL is released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
 
 
@@ -93,7 +93,8 @@ def shared(function: Callable[..., Any]) -> Any:
     what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
     times as long.
     """
-    return _again(internals.as_part(_compiled(function, cache=True, forceinline=False, **internals.LINKED)), shared)
+    compiled = _compiled(function, cache=True, forceinline=False, **internals.STEP)  # it may own arrays
+    return _again(internals.as_part(compiled), shared)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:

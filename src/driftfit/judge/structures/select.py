@@ -1,10 +1,12 @@
 """Select: orders, delays and regressors by how well each structure predicted, and averages over structures in time.
 
-    loglik of a structure = sum over scored samples of -1/2 (log 2 pi s_t + e_t^2 / s_t),   e_t, s_t one step ahead
+    loglik of a structure = sum over t > m of log p(y_t | past) - (n / 2) log m
 
-Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them
-without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. All
-structures are scored on the same samples: those after max(50, 5 n) of the largest that every one could predict.
+Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them without
+a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. log p is the
+tracker's predictive density, a mixture where it has several modes. All structures are scored on the same samples: those
+after the first m that every one could predict, m = max(50, 5 n of the largest, min(100, T / 2)). What learning n
+parameters costs in the first m samples, which are nobody's, is (n / 2) log m (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
   columns of one regression, the union of their regressors: it is built once, its rows are shared, and structures with
@@ -17,8 +19,8 @@ The table gives for each structure the loglik, its distance from the best with a
 the root mean square error. ``best`` has the highest; ``simplest`` has the fewest parameters of those that are within
 one standard error of it. `Selection.average` is dynamic model averaging: see there.
 
-Source: Dawid (1984); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the recursion of the
-weights in closed form. Cost: one run a structure.
+Source: Dawid (1984); Rissanen (1986); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the
+recursion of the weights in closed form. Cost: one run a structure.
 """
 
 from __future__ import annotations
@@ -39,11 +41,10 @@ from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price, unscored
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.run.result import burn_in
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -266,11 +267,12 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    judged = np.arange(len(pool.y)) >= burn_in(max(s.n for s in structures))
+    start = unscored(len(pool.y), max(s.n for s in structures))
+    judged = np.arange(len(pool.y)) >= start
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]
-    totals = np.array([float(np.sum(term)) for term in terms])
+    totals = np.array([float(np.sum(term)) - price(s.n, start) for s, term in zip(structures, terms, strict=True)])
     top, count = int(np.argmax(totals)), int(judged.sum())
     rows = []
     for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):
