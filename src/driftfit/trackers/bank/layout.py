@@ -27,7 +27,7 @@ parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors,
     root, samples           for growing the tree again (`reducing.refilter`)
     ring                    recent samples for events of a stream
     new_events              what an event adds to a history
-    gap, path               what may have happened since the last used sample (`machine.gap`, `machine.chain_gap`)
+    gap, path               what may have happened since the last used sample (`machine.gaps`)
     lag_prob, newest        marginals of the events of all floors; of those that are reported
     C, m, z, g              of the columns that a sample meets: covariance, mean, regressor, C z
     expected                their z'C z and z'm
@@ -50,10 +50,10 @@ from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 ) = range(22)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample. OPEN floors have passed since the last used sample
-(`driftfit.trackers.bank.machine.gap`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
+(`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
 AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already. Of the
 present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its floor
-is another than that of one nominal interval, PARTED that leaves go on as two (`machine.chain_gap`).
+is another than that of one nominal interval, PARTED that leaves go on as two (`machine.gaps.chain_gap`).
 """
 WAITING, READY = 0, -1
 (

@@ -19,7 +19,8 @@ from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import chain_gap, grow, start
+from driftfit.trackers.bank.machine import grow, start
+from driftfit.trackers.bank.machine.gaps import chain_gap
 from driftfit.trackers.bank.reducing import lookahead, merge, refilter
 
 covariance_begin = start.begin
