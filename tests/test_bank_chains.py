@@ -66,7 +66,7 @@ def test_a_gap_is_weighed_as_all_courses_of_the_chain(name, form):
             y, z = np.r_[0.1, 0.0, np.full(gap - 1, np.nan), off, off], np.tile(Z, (gap + 3, 1))
             z[-1] = 0.3, 1.0
             run = track(Regression(N), bank, y, z)
-            exact = every_course(P, bank._events[1], q, z, y)
+            exact = every_course(P, bank.event_probabilities[1], q, z, y)
             for k in (-2, -1):
                 log_p, modes, mean = exact[k]
                 assert told(run, "evidence")[k] == pytest.approx(log_p, abs=close)
@@ -150,7 +150,7 @@ def test_transitions_that_vary_in_time_are_summed_over():
     Pt = np.stack([np.array([[1.0 - r, r / 2, r / 2], *P[1:]]) for r in rate])
     bank = bank_of("both", Beam(1200))
     run = track(Regression(N), bank, y, z, prob=Pt)
-    exact = every_course(Pt, bank._events[1], q, z, y)
+    exact = every_course(Pt, bank.event_probabilities[1], q, z, y)
     assert told(run, "evidence").sum() == pytest.approx(sum(one[0] for one in exact), abs=0.02)
     np.testing.assert_allclose(told(run, "lag_prob")[-1, 0], exact[-1][1], atol=0.01)
     constant = track(Regression(N), bank, y, z)

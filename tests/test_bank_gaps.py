@@ -246,7 +246,7 @@ def test_one_fault_code_is_survived(code):
 
 def test_the_bound_of_a_beam_is_found_among_large_numbers():
     """The bits of two numbers above 2 overflow when they are added."""
-    from driftfit.trackers.bank.machine import selection
+    from driftfit.trackers.bank.reducing import selection
 
     values = np.zeros((1, 72))
     values[0, :66] = np.r_[np.full(40, 4.0), np.linspace(2.0, 3.0, 26)]

@@ -161,7 +161,7 @@ def noise_variance(bank: Bank, run: Track) -> float:
     if r is not None:
         return float(r)
     lane = run.lane(-1)
-    B = bank.array(run.model, lane, "B")
+    B = bank.array(run.model, lane, "leaves")
     mass = B[WEIGHT] > 0.0
     if not mass.any():
         return float(lane["scale"])
