@@ -168,7 +168,7 @@ def _machine(symbol: str) -> Machine:
 def machine(function: Callable[..., Any]) -> Machine:
     """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
-    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True, _nrt=False)
+    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
