@@ -91,7 +91,8 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that.
     """
-    return _again(internals.as_part(_compiled(function, cache=True, **internals.LINKED)), shared)
+    compiled = _compiled(function, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)  # it may own arrays
+    return _again(internals.as_part(compiled), shared)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
