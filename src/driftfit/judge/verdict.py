@@ -1,12 +1,12 @@
-"""Verdict: is the time variation real, which parameters move, by how much and when, and does following them pay?
+"""Verdict: is the time variation real, which parameters move, by how much and when, and does tracking them pay?
 
-Two questions that have different answers:
+The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
-  variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
-  do not enter. Where constants are true, "they move" is said with probability ``level``, as
+  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
+  do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
 * *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
   same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
@@ -45,19 +45,19 @@ from driftfit.show.parts.text import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
-"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
+"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What the record says of one parameter.
+    """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
-    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
-    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
-    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
-    after the last step, which is ``before`` again after a fault that passed. ``earliest``, ``latest``: first and last
-    sample of an interval that holds the date of its clearest step with 95 %.
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which separates
+    parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
+    moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
+    first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
+    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first and
+    last sample of an interval that contains the date of its clearest step with 95 % confidence.
     """
 
     name: str
@@ -77,21 +77,21 @@ class Moved:
 
 @dataclass(frozen=True)
 class Verdict(Printed):
-    """What `Track.verdict` returns; printing it shows it.
+    """The result of `Track.verdict`; printing it shows the sentences and tables.
 
     Attributes
     ----------
     drifts : bool or None
-        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+        Whether the parameters move: ``p`` is below ``level``. None if the record does not determine it.
     pays : bool or None
         The run predicts better than constant least squares on the past, without lags or with them, whichever is the
         better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
-        Joint test of all parameters; NaN where the record cannot tell.
+        p-value of the joint test of all parameters; NaN if the record does not determine it.
     statistic : float
-        Its part that is Nyblom's.
+        Nyblom's statistic of all parameters.
     level : float
-        Error rate: how often constants are said to move.
+        Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
     alike : tuple of str
         Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
@@ -105,7 +105,7 @@ class Verdict(Printed):
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        The residuals are correlated, also within segments of constant coefficients.
+        Whether the residuals are correlated, even within segments of constant coefficients.
     lags : int
         Lags of correlation that were allowed for.
     burn : int
@@ -238,7 +238,7 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
 
 
 def _told(moved: Moved) -> str:
-    """What one parameter did, in words."""
+    """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:
         return text
@@ -247,7 +247,7 @@ def _told(moved: Moved) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value as it is written."""
+    """A p-value as text."""
     return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -264,12 +264,12 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     run : Track
         What `track` returned.
     level : number
-        Error rate of "the parameters move".
+        Error rate of the statement that the parameters move.
     lags : int or None
-        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        Lags of correlation of the noise to allow for; None estimates them from the record, and 0 is for a model whose
         one-step errors are known to be white.
     burn : int or None
-        So many samples at the beginning are not scored; max(50, 5 n) by default.
+        Number of samples at the beginning that are not scored; max(50, 5 n) by default.
 
     Raises
     ------

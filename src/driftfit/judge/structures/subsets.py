@@ -1,4 +1,4 @@
-"""The best subset of the regressors of one model: all subsets of a few, a search among many.
+"""The best subset of the regressors of one model: all subsets of a few regressors, a search among many.
 
 The search adds the regressor that helps most and drops what no longer helps, until neither raises the log-likelihood
 less its price: p runs a round instead of 2^p. Every subset is run once, and subsets of one size run side by side.
@@ -68,7 +68,7 @@ class Tried:
 
 
 def _search(tried: Tried, kept: frozenset[int], free: Sequence[int], largest: int) -> None:
-    """Add what helps most, drop what no longer helps, until neither raises the loglik."""
+    """Add the regressor that helps most, drop those that no longer help, until neither raises the loglik."""
     chosen = kept
     best = float(tried([chosen])[0]) if chosen else -np.inf
     while True:
