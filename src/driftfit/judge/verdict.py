@@ -56,8 +56,8 @@ class Moved:
     parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
     moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
     first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
-    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first and
-    last sample of an interval that contains the date of its clearest step with 95 % confidence.
+    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
+    and last sample of an interval that contains the date of its clearest step with 95 % confidence.
     """
 
     name: str
