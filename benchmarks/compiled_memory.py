@@ -26,10 +26,11 @@ def worker(way: str, count: int) -> None:
     import numpy as np
     from llvmlite.binding import newpassmanagers as passes
 
-    from driftfit import ARX, Kalman, kernel, linked, track
+    from driftfit import ARX, Kalman, track
+    from driftfit.engine import kernel
 
     if way == "all kept":
-        linked.KEPT = kernel.MOST_ENTRIES = 10**9
+        kernel.KEPT = kernel.MOST_ENTRIES = 10**9
         for manager in (passes.ModulePassManager, passes.FunctionPassManager):
             manager._dispose = passes.ffi.ObjectRef._dispose
     y, u = np.random.default_rng(0).normal(size=(2, 60))

@@ -57,8 +57,8 @@ def main(T: int = T, names: tuple[str, ...] = tuple(MODELS)) -> None:
     tracker = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
     stage, *_ = [beside_regression(name, MODELS[name], s.y, s.u, tracker) for name in names]
     run = track(CUBIC, tracker, s.y, s.u)
-    *groups, quality = empty(CUBIC, T)
-    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, tuple(groups), quality)
+    groups, quality = empty(CUBIC, T)
+    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, groups, quality)
     for place, method in enumerate(METHODS[:3]):
         cost = least(partial(separate, theta, (CUBIC.na, CUBIC.out.n, place), *parts), T)
         print(f"{method:10s} {cost:5.0f} ns a sample, {cost / stage:.2f} filter steps")

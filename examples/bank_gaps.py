@@ -9,8 +9,7 @@ from math import comb
 
 import numpy as np
 
-from driftfit import Bank, Change, Regression, Sensor, track
-from driftfit.trackers.bank.reduction import GPB
+from driftfit import GPB, Bank, Change, Regression, Sensor, track
 
 P, DRIFT, JUMP, R, OFF = 0.01, 1e-4, 1.0, 0.04, 0.6
 

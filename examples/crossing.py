@@ -9,9 +9,8 @@ import sys
 
 import numpy as np
 
-from driftfit import FLS, AdaptiveKalman, Kalman, Regression, track
-from driftfit.engine.kernel import Array
-from driftfit.results import Track
+from driftfit import FLS, AdaptiveKalman, Kalman, Regression, Track, track
+from driftfit.extend import Array
 
 T, HORIZON, NOISE = 150, 300, 0.2
 AWAY = 0.5

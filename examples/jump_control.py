@@ -11,8 +11,7 @@ sample as the reference. Run: python examples/jump_control.py
 
 import numpy as np
 
-from driftfit import ARX, Bank, Change, Kalman, Live, Sensor
-from driftfit.trackers.bank.reduction import GPB
+from driftfit import ARX, GPB, Bank, Change, Kalman, Live, Sensor
 
 NOISE, T, RUNS = 0.1, 180, 30
 CHANGES, KNOWN = [Change(1e-6), Change(1.0, prob=0.01, which=[1], name="gain")], [Sensor.nominal(NOISE**2)]

@@ -10,9 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from driftfit import ARX, Bank, Change, Decide, Live, Sensor, track
-from driftfit.smooth.piecewise import piecewise
-from driftfit.trackers.bank.results.pictures import plot_tree
+from driftfit import ARX, Bank, Change, Decide, Live, Sensor, piecewise, plot_tree, track
 
 
 def simulate(T: int = 400, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:

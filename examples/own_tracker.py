@@ -10,12 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit import ARX, RLS, Live, track
-from driftfit.checks import check_tracker
-from driftfit.engine.drivers import TrackerSteps, unknown
-from driftfit.engine.kernel import State, kernel, nothing
-from driftfit.engine.settings import numbers
-from driftfit.trackers.base import Tracker
+from driftfit import ARX, RLS, Live, Tracker, check_tracker, track
+from driftfit.extend import State, TrackerSteps, kernel, nothing, numbers, unknown
 from driftfit.trackers.parts.diffuse import prediction
 
 

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from driftfit import RLS, Bank, Kalman, Regression, Track, track, tune
-from driftfit.trackers.bank.reduction import Beam
+from driftfit import RLS, Bank, Beam, Kalman, Regression, Track, track, tune
 
 REGRESSORS = ["pressure_bar", "current_A"]
 TUNING, REACH = 200, 60

@@ -18,10 +18,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from driftfit import ARX, RLS, Kalman, Regression, Track, track
-from driftfit.data.files import read_columns
+from driftfit import ARX, RLS, Kalman, Model, Regression, Track, track
+from driftfit.data import read_columns
 from driftfit.judge.compare import persistence
-from driftfit.models.base import Model
 from driftfit.run.result import root_mean_square
 
 RATIOS = (0.0, *(10.0 ** np.arange(-7.0, 2.1, 0.5)).tolist())

@@ -10,11 +10,9 @@ import warnings
 
 import numpy as np
 
-from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
-from driftfit.engine.kernel import Array
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, Track, Tracker, track
+from driftfit.extend import Array
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.base import Tracker
-from driftfit.trackers.rls import RLS
 
 T = 2000
 FORGET, WALK = RLS(0.98), Kalman(q=1e-4, r=0.01)

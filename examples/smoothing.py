@@ -11,10 +11,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, track, tune
-from driftfit.smooth.augmented import augmented
-from driftfit.smooth.huber import huber
-from driftfit.smooth.total_variation import total_variation
+from driftfit import FLS, AugmentedFLS, Kalman, Live, Regression, augmented, huber, total_variation, track, tune
 
 BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
 SEEDS = 20

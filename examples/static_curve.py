@@ -9,10 +9,9 @@ import warnings
 
 import numpy as np
 
-from driftfit import FLS, track, tune
+from driftfit import FLS, static_curve, track, tune
 from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems.time_varying import hammerstein
-from driftfit.use.recover import static_curve
 
 
 def main(picture: str | None = None) -> None:

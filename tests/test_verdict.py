@@ -240,6 +240,22 @@ def test_the_parameter_that_moves_is_named_where_regressors_are_correlated():
     assert said.parameters[0].p < 0.05  # Hansen's own statistic sees the move in all scores
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_parameters_that_are_not_told_apart_are_named_as_a_group(seed):
+    """Regressors with correlation 0.999: one of the two moves, and which one nobody can tell."""
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(400, 3)) @ [[1.0, 0.999, 0.0], [0.0, 0.045, 0.0], [0.0, 0.0, 1.0]]
+    y = u.sum(axis=1) + 0.5 * u[:, 0] * (np.arange(400) >= 250) + 0.5 * rng.normal(size=400)
+    said = track(Regression(3), Kalman(q=1e-3, r=0.25), y, u).verdict()
+    assert said.drifts
+    assert said.moving == ()
+    assert said.alike == ("theta1", "theta2")
+    assert abs(int(said.since) - 250) < 15
+    assert f"It is one of theta1, theta2, from about {said.since}" in said.sentences[1]
+    still = track(Regression(3), Kalman(q=1e-3, r=0.25), y[:250], u[:250]).verdict()
+    assert still.alike == ()
+
+
 def test_steps_are_found_one_after_the_other_with_their_sizes():
     """A large move of one gain of an ARX system makes others look moved; two steps of two parameters are told apart."""
     phi, y = record(600, 8)

@@ -81,7 +81,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
     instead of raising, the GIL is released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
 
 
@@ -91,7 +91,8 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that.
     """
-    return _again(internals.as_part(_compiled(function, cache=True, **internals.LINKED)), shared)
+    compiled = _compiled(function, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)  # it may own arrays
+    return _again(internals.as_part(compiled), shared)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:

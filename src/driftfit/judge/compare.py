@@ -91,6 +91,7 @@ def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
 
 def compare(run: Track) -> Comparison:
     """Score a run against persistence, constant least squares and constant ARX."""
-    tracked, last, ls, _, constant, scored = errors(run)
-    rms = [root_mean_square(error[scored]) for error in (tracked, last, ls, constant)]
-    return Comparison(rms[0], rms[1], rms[2], rms[3], int(scored.sum()))
+    made = errors(run)
+    shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
+    tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)
+    return Comparison(tracked, last, ls, constant, int(made.scored.sum()))

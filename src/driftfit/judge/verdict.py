@@ -34,7 +34,7 @@ from rich.text import Text
 from driftfit.engine.settings import whole
 from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
-from driftfit.judge.statistics.attribution import Attribution, attribute
+from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
@@ -89,6 +89,11 @@ class Verdict(Printed):
     level : float
         Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
+    alike : tuple of str
+        Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
+        which.
+    since : str
+        Time of the step that explains most of it.
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
@@ -109,6 +114,8 @@ class Verdict(Printed):
     statistic: float
     level: float
     parameters: tuple[Moved, ...]
+    alike: tuple[str, ...]
+    since: str
     rms: float
     rivals: tuple[Paired, ...]
     samples: int
@@ -129,7 +136,7 @@ class Verdict(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words."""
+        """The verdict in sentences."""
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
@@ -159,6 +166,13 @@ class Verdict(Printed):
     def _which(self) -> str:
         if not self.drifts:
             return ""
+        if not self.moving and len(self.alike) == 1:
+            return f"It probably is {self.alike[0]}, from about {self.since}; its own test alone does not show it."
+        if not self.moving and len(self.alike) < len(self.parameters):
+            return (
+                f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
+                "tell which."
+            )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
         return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
@@ -202,7 +216,7 @@ class Verdict(Printed):
             yield Text(f" {sentence}")
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
-            shown = (f"{m.statistic:.3g}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            shown = (f"{m.statistic:.2f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
             change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
             table.add_row(Text(m.name), *shown, *change)
         yield table
@@ -268,6 +282,8 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     test = constancy(rows.phi, rows.y, lags)
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
+    moved = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
+    at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
     own, *others, scored = errors(run, burn)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
@@ -276,7 +292,9 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
         p=test.p_joint,
         statistic=test.joint,
         level=level,
-        parameters=tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p))),
+        parameters=moved,
+        alike=tuple(run.model.names[i] for i in similar),
+        since=run.time_text(int(rows.at[at])) if similar else "",
         rms=root_mean_square(own[scored]),
         rivals=rivals,
         samples=len(rows.y),

@@ -168,6 +168,11 @@ class Fleet(Many):
         """Names of the parameters."""
         return self._programs[0].names
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of what was written for all series."""
+        return sum(out.nbytes for out in {id(lane.out): lane.out for lane in self._lanes if lane}.values())
+
 
 def run_fleet(
     programs: Sequence[Program],

@@ -41,7 +41,7 @@ def track(
         raise ValueError("track: prob= is for one series and one tracker.")
     if len(model.outputs) > 1:
         return track_outputs(model, tracker, y, u, data, by, reading, keep, warm_start)
-    records, failed = _records(y, u, data, by, reading)
+    records, failed = records_of(y, u, reading, data, by)
     records = records.for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
@@ -74,12 +74,13 @@ def track_one(
     return run
 
 
-def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Records, dict[Hashable, str]]:
-    """The records to be run, and the reasons of those that cannot be."""
+def records_of(
+    y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
+) -> tuple[Records, dict[Hashable, str]]:
+    """The records to be run, from arrays or a table, and the reasons of those that cannot be."""
     if data is not None:
-        from driftfit.data.tables import (
-            read_records,
-        )  # importing narwhals and polars takes as long as all other imports
+        # imported here, because narwhals and polars take as long to import as everything else
+        from driftfit.data.tables import read_records
 
         return read_records(data, y, u, by, reading)
     if by not in (None, "row"):

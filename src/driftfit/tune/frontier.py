@@ -45,13 +45,15 @@ class Frontier(NamedTuple):
         return _plot(self)
 
 
-def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, **known: Any) -> Frontier:
+def frontier(
+    model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, data: Any = None, **known: Any
+) -> Frontier:
     """The two costs of the smoothed path for every mu.
 
     Parameters
     ----------
-    model, y, u, and time, dt, weights, drift
-        As for `track`.
+    model, y, u, data, and time, dt, weights, drift
+        As for `track`: with ``data`` the others name its columns.
     mu : (S,) or None
         Weights, positive. None: four per decade, from 1e-4 to 1e5 (1e10 for second differences) times the mean of
         phi' phi.
@@ -68,18 +70,18 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
         raise ValueError("frontier: takes one output at a time: use run[name], and frontier(run[name].model, .y, .u).")
     reading = Reading(**known)
     if mu is None:
-        steady = _path(model, FLS(1.0), y, u, reading)
+        steady = _path(model, FLS(1.0), y, u, reading, data)
         used = steady.walk.weight > 0.0
         power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
-    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading) for m in weights]
+    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading, data) for m in weights]
     return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
 
 
-def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading) -> Smoothed:
+def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading, data: Any) -> Smoothed:
     """The smoothed path of a record."""
-    run = track(model, tracker, y, u, reading)
+    run = track(model, tracker, y, u, reading, data=data)
     if isinstance(run, Shared):
         return SmoothedShared.of_shared(run)
     assert isinstance(run, Track)

@@ -58,11 +58,13 @@ class TunedOutputs(Mapping[str, Tuned]):
         return {name: one.at_bound for name, one in self.items() if one.at_bound}
 
 
-def tune_outputs(model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], one: Callable[..., Any]) -> Any:
+def tune_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
+) -> Tuned | TunedOutputs:
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known))
+    run = track(model, STILL, y, u, Reading(**known), data=data)
     if isinstance(run, Shared):
         return one(Task(run.rows.model, run.rows.record))
     assert isinstance(run, Outputs)

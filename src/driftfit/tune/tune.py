@@ -24,9 +24,10 @@ from typing import Any, cast
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, one_series
+from driftfit.data.record import Reading
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
+from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.knobs import find_knobs
@@ -51,6 +52,7 @@ def tune(
     bounds: tuple[float, float] | None = None,
     level: float = 0.95,
     order_by: Any = None,
+    data: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -62,8 +64,8 @@ def tune(
 
     Parameters
     ----------
-    model, y, u, time, dt, weights, drift, limits, exclude
-        As for `track`.
+    model, y, u, data, time, dt, weights, drift, limits, exclude
+        As for `track`: with ``data`` the others name its columns.
     tracker : Tracker
         Settings that are None are estimated: mu, q, r, q and r, or forgetting. All others are kept. For a `Bank` these
         are the scales of its changes, as factors of their standard deviations, and their prior probabilities; the
@@ -110,10 +112,10 @@ def tune(
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        found = tune_outputs(model, tracker, y, u, known, lambda task: _tuned(task, tracker, *options))
+        found = tune_outputs(model, tracker, y, u, known, data, lambda task: _tuned(task, tracker, *options))
         return cast("Tuned", found)
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    return _tuned(_task(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
+    return _tuned(_task(model, tracker, y, u, reading, data), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
@@ -158,7 +160,7 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Task:
-    records = one_series(y, u, reading).for_model(model, reading)
+def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any) -> Task:
+    records = records_of(y, u, reading, data)[0].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))

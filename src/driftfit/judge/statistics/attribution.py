@@ -26,6 +26,8 @@ from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
+ALIKE = 4.0
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
@@ -101,15 +103,33 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
         return None
     Q = np.linalg.qr(X)[0]
     e = test.noise.held - Q @ (Q.T @ test.noise.held)
-    found = [_dated(Q, X[:, i], e, int(test.at[i])) for i in rejected]
+    reach = int(AROUND * len(X))
+    found = [_dated(Q, X[:, i], e, int(test.at[i]) - reach, int(test.at[i]) + reach) for i in rejected]
     most = int(np.argmax([gain for _, gain in found]))
     return Step(int(rejected[most]), found[most][0])
 
 
-def _dated(Q: Array, x: Array, e: Array, at: int) -> tuple[int, float]:
-    """The position near ``at`` where a step of x explains most of e, which is orthogonal to Q, and how much."""
+def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
+    """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
+    N, n = phi.shape
+    if test.noise is None:
+        return 0, ()
+    X, held = phi, test.noise.held
+    if len(test.noise.ar):
+        X, held = whitened(phi, held, test.noise.ar)
+    Q = np.linalg.qr(X)[0]
+    e = held - Q @ (Q.T @ held)
+    found = [_dated(Q, X[:, i], e, n, N - n) for i in range(n)]
+    best = max(range(n), key=lambda i: found[i][1])
+    at, gain = found[best]
+    noise = max(float(e @ e) - gain, 0.0) / N
+    return at, tuple(i for i in range(n) if gain - found[i][1] <= ALIKE * noise)
+
+
+def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:
+    """The position from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
     N = len(x)
-    places = np.arange(max(1, at - int(AROUND * N)), min(N - 1, at + int(AROUND * N)) + 1)
+    places = np.arange(max(1, first), min(N - 1, last) + 1)
     later = np.cumsum((x * e)[::-1])[::-1][places]
     inside = np.cumsum((x[:, None] * Q)[::-1], axis=0)[::-1][places]
     left = np.cumsum((x * x)[::-1])[::-1][places] - np.sum(inside * inside, axis=1)

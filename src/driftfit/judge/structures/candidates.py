@@ -24,7 +24,7 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program
-from driftfit.run.result import Track, track_record
+from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
 
 TOGETHER = 32
@@ -40,6 +40,16 @@ class Structure(NamedTuple):
     n: int
     model: Model | None
     columns: tuple[int, ...] | None
+
+
+def unscored(T: int, n: int) -> int:
+    """Samples at the beginning that score no structure, of at most n parameters: 100, or half of a short record."""
+    return max(burn_in(n), min(100, T // 2))
+
+
+def price(n: int, start: int) -> float:
+    """What n parameters cost in the log-likelihood of the first ``start`` samples, which is not scored."""
+    return 0.5 * n * float(np.log(start))
 
 
 class Predicted(NamedTuple):

@@ -1,10 +1,12 @@
 """Select: orders, delays and regressors by how well each structure predicted; and averages over structures.
 
-    loglik of a structure = sum over scored samples of -1/2 (log 2 pi s_t + e_t^2 / s_t),   e_t, s_t one step ahead
+    loglik of a structure = sum over t > m of log p(y_t | past) - (n / 2) log m
 
 Every term is a prediction made before the output was observed, so a structure with superfluous parameters pays for them
-without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the comparison. All
-structures are scored on the same samples: those after max(50, 5 n) of the largest that every one could predict.
+without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the comparison. log p
+is the tracker's predictive density, a mixture if it has several modes. All structures are scored on the same samples:
+those after the first m that all of them could predict, m = max(50, 5 n of the largest, min(100, T / 2)). The term
+(n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
   columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures with
@@ -18,8 +20,8 @@ The table gives for each structure the loglik, its distance from the best with a
 the root mean square error. ``best`` has the highest loglik; ``simplest`` has the fewest parameters of those within one
 standard error of it. `Selection.average` is dynamic model averaging.
 
-Source: Dawid (1984); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the recursion of the
-weights in closed form. Cost: one run per structure.
+Source: Dawid (1984); Rissanen (1986); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the
+recursion of the weights in closed form. Cost: one run per structure.
 """
 
 from __future__ import annotations
@@ -34,17 +36,17 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, one_series
+from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
 from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price, unscored
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.run.result import burn_in
+from driftfit.run.track import records_of
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -195,6 +197,7 @@ def select(
     tracker: Tracker | None = None,
     keep: Sequence[str] = (),
     most: int | None = None,
+    data: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -208,8 +211,8 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or one model whose regressors are to be selected, at most 30.
-    y, u, time, dt, weights, drift, limits, exclude
-        As for `track`; one number or (T,) for drift.
+    y, u, data, time, dt, weights, drift, limits, exclude
+        As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     tracker : Tracker
         Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
         q, not a vector.
@@ -234,8 +237,11 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    records = one_series(y, u, reading)
-    factor("drift", drift, len(records.y))
+    records, _ = records_of(y, u, reading, data)
+    if data is None:
+        factor("drift", drift, len(records.y))
+    elif records.drifts is not None:
+        raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
@@ -267,11 +273,12 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    judged = np.arange(len(pool.y)) >= burn_in(max(s.n for s in structures))
+    start = unscored(len(pool.y), max(s.n for s in structures))
+    judged = np.arange(len(pool.y)) >= start
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]
-    totals = np.array([float(np.sum(term)) for term in terms])
+    totals = np.array([float(np.sum(term)) - price(s.n, start) for s, term in zip(structures, terms, strict=True)])
     top, count = int(np.argmax(totals)), int(judged.sum())
     rows = []
     for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):

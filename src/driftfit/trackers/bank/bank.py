@@ -49,12 +49,12 @@ from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
 from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
-from driftfit.trackers.bank.machine.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.machine.start import GROWTH, begin
-from driftfit.trackers.bank.machine.variants import made
+from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.variants import made
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
 from driftfit.trackers.parts.excitation import window

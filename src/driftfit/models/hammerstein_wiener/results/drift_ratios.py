@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import numbers
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.run.fleet import Fleet
@@ -95,7 +95,7 @@ def _score(run: Any, fade: float) -> Array:
     return scores
 
 
-@shared
+@Driver
 def _discount(ok: Array, ratio: Array, size: Array, slope: Array, n: float, fade: float, scores: Array) -> None:
     """L_t from e^2 / s, log s and log F' of every sample."""
     total, weight, squares = 0.0, 0.0, 0.0

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver, shared
 
 STEPS = 30
 """Largest number of steps; three to ten are typical."""
@@ -129,7 +129,10 @@ def rescale(zeta: Array, na: int, sizes: Array) -> None:
     at_b, at_c = starts(na, sizes)
     for i in range(sizes.shape[1]):
         b, c = zeta[at_b : at_b + sizes[0, i]], zeta[at_c : at_c + sizes[1, i]]
-        size = np.sqrt(np.sum(c * c))
+        size = 0.0
+        for k in range(len(c)):
+            size += c[k] * c[k]
+        size = np.sqrt(size)
         for j in range(len(b)):
             b[j] *= size
         for k in range(len(c)):
@@ -205,7 +208,7 @@ def solve(N: Array, damping: float, right: Array, C: Array, step: Array) -> bool
     return True
 
 
-@shared
+@Driver
 def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: Array, cov: Array, cost: Array) -> None:
     """Refine zeta (T, n_z) in place; fill cov (T, n_z, n_z) and cost (T,), NaN where P is no finite covariance.
 

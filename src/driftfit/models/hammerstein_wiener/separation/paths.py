@@ -267,10 +267,16 @@ def deviations(model: HammersteinWiener, var: Array) -> Groups:
     return Groups(*np.split(std, np.cumsum([na, sum(nb), sum(n_in), n_out]), axis=1)[:4])
 
 
-def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Empty arrays of a, b, c, d and quality."""
+def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array]:
+    """Empty arrays of (a, b, c, d), one after the other, and of quality."""
     na, nb, n_in, n_out, _ = model.structure
-    return np.empty((T, na)), np.empty((T, sum(nb))), np.empty((T, sum(n_in))), np.empty((T, n_out)), np.empty((T, 2))
+    return np.empty((T, na + sum(nb) + sum(n_in) + n_out)), np.empty((T, 2))
+
+
+def apart(model: HammersteinWiener, groups: Array) -> list[Array]:
+    """Split (a, b, c, d) into its four arrays."""
+    na, nb, n_in, _, _ = model.structure
+    return np.split(groups, np.cumsum([na, sum(nb), sum(n_in)]), axis=1)
 
 
 class Separator:
@@ -280,7 +286,7 @@ class Separator:
         if not isinstance(model, HammersteinWiener):
             raise ValueError(f"blocks: {type(model).__name__} has no blocks; use a HammersteinWiener model.")
         self.model = model
-        self._theta, self._parts = np.empty((1, model.n)), empty(model, 1)
+        self._theta, (self._groups, self._quality) = np.empty((1, model.n)), empty(model, 1)
         self._sizes, self._rise = model.structure.sizes, model.rise
 
     def __call__(self, theta: Array, method: str) -> Groups:
@@ -290,19 +296,19 @@ class Separator:
         if method not in METHODS[:3]:
             one_of("blocks", "method", method, METHODS[:3])
         na, _, _, n_out, _ = self.model.structure
-        *groups, quality = self._parts
+        orders = (na, n_out, METHODS.index(method))
         self._theta[0] = theta
-        separate(self._theta, (na, n_out, METHODS.index(method)), self._sizes, self._rise, tuple(groups), quality)
-        return Groups(*(group[0].copy() for group in groups))
+        separate(self._theta, orders, self._sizes, self._rise, self._groups, self._quality)
+        return Groups(*(group[0].copy() for group in apart(self.model, self._groups)))
 
 
 def split(model: HammersteinWiener, theta: Array, method: str) -> tuple[Array, Array, Array, Array, Array]:
     """a, b, c, d and quality from theta (T, n) by one of the first three methods; gauge "unit" and "d1"."""
-    *groups, quality = empty(model, len(theta))
+    groups, quality = empty(model, len(theta))
     na, _, _, n_out, _ = model.structure
     orders, path = (na, n_out, METHODS.index(method)), np.ascontiguousarray(theta, dtype=float)
-    separate(path, orders, model.structure.sizes, model.rise, tuple(groups), quality)
-    a, b, c, d = groups
+    separate(path, orders, model.structure.sizes, model.rise, groups, quality)
+    a, b, c, d = apart(model, groups)
     return a, b, c, d, quality
 
 

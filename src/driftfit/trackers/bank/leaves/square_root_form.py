@@ -17,7 +17,8 @@ from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import average, blur, develop_eight, walked
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import chain_gap, grow, lookahead, merge, refilter, start
+from driftfit.trackers.bank.machine import grow, lookahead, merge, refilter, start
+from driftfit.trackers.bank.machine.gaps import chain_gap
 
 covariance_begin = start.begin
 

@@ -11,7 +11,7 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
-from driftfit.trackers.bank.machine.memory import SINGLE
+from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
 

@@ -11,7 +11,7 @@ from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
-from driftfit.trackers.bank.machine.gap import SINCE
+from driftfit.trackers.bank.machine.gaps.gap import SINCE
 from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 
 if TYPE_CHECKING:
