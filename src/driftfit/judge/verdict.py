@@ -94,8 +94,8 @@ class Verdict(Printed):
         Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
     alike : tuple of str
-        Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
-        which.
+        If parameters move and none is named: those of which one moves; their regressors are too similar to tell which
+        one.
     since : str
         Time of the step that explains most of it.
     rms : float
@@ -140,7 +140,7 @@ class Verdict(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words."""
+        """The verdict in sentences."""
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
@@ -171,11 +171,11 @@ class Verdict(Printed):
         if not self.drifts:
             return ""
         if not self.moving and len(self.alike) == 1:
-            return f"It probably is {self.alike[0]}, from about {self.since}; its own test alone does not show it."
+            return f"It probably is {self.alike[0]}, from about {self.since}; its own test does not confirm it."
         if not self.moving and len(self.alike) < len(self.parameters):
             return (
                 f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
-                "tell which."
+                "tell which one."
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."

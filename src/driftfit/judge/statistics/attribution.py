@@ -28,7 +28,7 @@ from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
 ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters are told apart by nothing."""
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
@@ -136,7 +136,7 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
 
 
 def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
-    """The date of the one step that explains most of y, and the parameters of which a step does so about as well."""
+    """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
     N, n = phi.shape
     if test.noise is None:
         return 0, ()
@@ -153,7 +153,7 @@ def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
 
 
 def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:
-    """The place from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
+    """The position from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
     N = len(x)
     places = np.arange(max(1, first), min(N - 1, last) + 1)
     later = np.cumsum((x * e)[::-1])[::-1][places]
