@@ -77,7 +77,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
     instead of raising, the GIL is released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, **internals.LINKED), internals.StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
 
 
