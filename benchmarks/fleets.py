@@ -25,7 +25,8 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman, Regression, track
 from driftfit.engine.kernel import Array
-from driftfit.run.fleet import Fleet, cores
+from driftfit.fleets import Fleet
+from driftfit.run.fleet import cores
 
 Q, R, P0 = 1e-4, 0.01, 10.0
 TRACKER = Kalman(q=Q, r=R, p0=P0)

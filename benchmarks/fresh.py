@@ -37,7 +37,7 @@ def main(T: int) -> None:
     seconds = perf_counter() - STARTED
     before = peak()
     run = track(ARX(2, 2), Kalman(q=1e-4, r=0.1), y, u)
-    extra = peak() - before - run._out.nbytes
+    extra = peak() - before - run._lane.out.nbytes
     functions = sum(record.is_start for _, record in compiled.buffer)
     print(json.dumps({"seconds": seconds, "numba": NUMBA - STARTED, "compiled": functions, "extra": extra}))
 

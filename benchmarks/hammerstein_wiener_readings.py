@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from driftfit.models.hammerstein_wiener.curves.basis import DeadZone
-from driftfit.run.track import track
 from driftfit.systems.arc_furnace import furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, Simulated, example
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 from lab.reproduce.hammerstein_wiener import runs
 from lab.reproduce.hammerstein_wiener.tables import BIAS, end
 

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import track as progress
 from rich.table import Table
 
-from driftfit.run.track import track
 from driftfit.systems.hammerstein_wiener import example
+from driftfit.tracking import track
 from lab.reproduce.hammerstein_wiener import runs
 
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)

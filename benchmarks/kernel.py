@@ -30,7 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, Live
-from driftfit.engine.drivers import drivers, known_factors, make_tile, output_type
+from driftfit.data.known import Known
+from driftfit.engine.drivers import drivers, make_tile, output_type
 from lab.bench.machine import installed, machine, times
 
 HERE = Path(__file__).parent
@@ -70,7 +71,7 @@ class Tile:
     def __init__(self, n: int, L: int, T: int) -> None:
         model, tracker = ARX(n // 2, n - n // 2).bind(1), Kalman(q=1e-4, r=0.01)
         self.y, self.u = signals(T, L)
-        self.known = np.ascontiguousarray(np.broadcast_to(known_factors()[:, :, None], (1, 3, L)))
+        self.known = np.ascontiguousarray(np.broadcast_to(Known.of().columns[:, :, None], (1, 3, L)))
         self.tile = make_tile(n, 1, model.memory(), [tracker.state_for(model)] * L)
         self.out = np.empty(T, output_type(self.tile))
         self._run = drivers(model.steps, tracker.steps_for(model)).run

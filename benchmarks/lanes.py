@@ -16,7 +16,8 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman
 from driftfit.engine.drivers import WIDTH, drivers, make_tile, output_type
-from driftfit.run.fleet import BLOCK, lanes
+from driftfit.run.fleet import BLOCK, width_of
+from driftfit.run.program import Program
 
 TRACKER = Kalman(q=1e-4, r=0.01)
 
@@ -44,7 +45,7 @@ def main(quick: bool) -> None:
         table.add_column(head, justify="right")
     for n in (2, 4) if quick else (2, 4, 6, 8, 10, 12):
         one, many = step_time(n, 1), step_time(n, WIDTH)
-        used = lanes(TRACKER, ARX(n // 2, n // 2).bind(1), 1000)
+        used = width_of(Program(ARX(n // 2, n // 2).bind(1), TRACKER), 1000)
         table.add_row(str(n), f"{one:.1f}", f"{many:.1f}", f"{many / one:.2f}", f"{used} lane{'s' * (used > 1)}")
     Console(width=96).print(table)
 

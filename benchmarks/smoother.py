@@ -55,7 +55,7 @@ def statsmodels(phi, y, run):
 
 
 def found_scale(run):
-    return run._tile["scale"][0, 0]
+    return run.state["scale"]
 
 
 def banded(phi, y, run):

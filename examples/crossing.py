@@ -11,7 +11,7 @@ import numpy as np
 
 from driftfit import FLS, AdaptiveKalman, Kalman, Regression, track
 from driftfit.engine.kernel import Array
-from driftfit.run.result import Track
+from driftfit.results import Track
 
 T, HORIZON, NOISE = 150, 300, 0.2
 AWAY = 0.5

@@ -43,11 +43,11 @@ PRIORS = {
 
 
 def told(run, name):
-    return run.tracker.told(run._written("report"), name)
+    return run.tracker.told(run.written("report"), name)
 
 
 def state(run, name):
-    return run.tracker.array(run.model, {"memory": run._tile["memory"][0, :, 0]}, name)
+    return run.tracker.array(run.model, {"memory": run.state["memory"]}, name)
 
 
 def compare(run, twin, y, u, atol=1e-10, lags=1):
@@ -75,7 +75,7 @@ def compare(run, twin, y, u, atol=1e-10, lags=1):
 def test_every_reduction_is_what_its_naive_twin_says(prior, reduce, naive, lags):
     transition, P, initial = PRIORS[prior]
     bank = Bank(changes(), SENSORS, transition, reduce, p0=2.0, initial=initial)
-    initial = bank._events[1]
+    initial = bank.event_probabilities[1]
     twin = naive_bank.Bank(Q, TABLE, P, initial, np.zeros(N), 2.0 * np.eye(N), naive)
     compare(track(Regression(N), bank, Y, U), twin, Y, U, lags=lags)
 
@@ -85,7 +85,7 @@ def test_without_reduction_it_is_the_joint_gaussian_of_every_sequence(prior):
     K = 3
     transition, P, initial = PRIORS[prior]
     bank = Bank(changes(), SENSORS, transition, Decide(K), p0=2.0, initial=initial)
-    initial = bank._events[1]
+    initial = bank.event_probabilities[1]
     run = track(Regression(N), bank, Y[:K], U[:K])
     logs = []
     for events in product(range(6), repeat=K):
@@ -124,7 +124,7 @@ def test_imm_mixes_as_in_the_book():
     run = track(Regression(N), bank, Y, U)
     m, C, mu = np.zeros((3, N)), np.tile(2.0 * np.eye(N), (3, 1, 1)), None
     for t in range(len(Y)):
-        c = bank._events[1] if mu is None else mu @ P3
+        c = bank.event_probabilities[1] if mu is None else mu @ P3
         if mu is not None:
             W = mu[:, None] * P3 / c
             mixed = W.T @ m

@@ -202,7 +202,7 @@ def test_transitions_may_vary_in_time():
     bank = Bank(changes(), KNOWN, reduce=GPB(2), p0=2.0)
     run, live = track(Regression(N), bank, y, u, prob=Pt), Live(Regression(N), bank)
     Q = np.array([change.increments(N)[0] for change in changes()])
-    initial = bank._events[1]
+    initial = bank.event_probabilities[1]
     twin = naive_bank.Bank(Q, [(R, 0.0, False)], None, initial, np.zeros(N), 2.0 * np.eye(N), naive_bank.gpb(2))
     for t in range(40):
         twin.P = Pt[t]

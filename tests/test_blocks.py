@@ -206,7 +206,7 @@ def test_a_weak_first_function_warns_of_the_gauge():
     xi = np.repeat([[-0.5, 1e-5, 2e-5, 1e5, 0.2]], 3, axis=0)
     s = record(T=40)
     run = track(SMALL, K, s.y, s.u)
-    run._out["theta"][..., 0] = SMALL.structure.products(xi[:1])
+    run.theta[:] = SMALL.structure.products(xi[:1])
     with pytest.warns(UserWarning, match='bad gauge here.*use input="unit"'):
         run.blocks(input="c1")
     assert_allclose(run.blocks().c, [[1e-5, 1.0]] * 40, rtol=1e-9)  # without a warning

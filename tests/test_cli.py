@@ -8,10 +8,10 @@ from typer.testing import CliRunner
 import driftfit
 from driftfit import ARX, Kalman, Regression, Track, cli, track, trackers
 from driftfit.cli.parts import arguments
-from driftfit.data.export import as_table
 from driftfit.data.files import read_columns
 from driftfit.models.hammerstein_wiener.curves.basis import BSpline, DeadZone, Legendre, PiecewiseLinear, Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.show.export import as_table
 
 runner = CliRunner()
 SETTINGS = ["--tracker", "kalman", "-p", "q=1e-4", "-p", "r=0.01"]

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
-from driftfit.run.outputs import Outputs
+from driftfit.fleets import Outputs
 
 OWN = '''
 from dataclasses import dataclass

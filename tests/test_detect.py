@@ -21,8 +21,8 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
-from driftfit.judge.alarms.rule import AlarmRule, normal_scores
 from driftfit.judge.statistics.scale import core
+from driftfit.run.live.rule import AlarmRule, normal_scores
 from driftfit.trackers.kalman import INDEPENDENT
 
 K = Kalman(q=1e-3, r=0.01)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
+from driftfit.data.known import Known
 from driftfit.data.record import Records
-from driftfit.data.storage import fields
 from driftfit.run import fleet as fleets
+from driftfit.run.program import Program
 
 KALMAN = Kalman(q=1e-3, r=0.1)
 MODEL = ARX(1, 1)
@@ -32,12 +33,10 @@ def rows(units: int, T: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def assert_same(one: Track, other: Track) -> None:
-    for name in one._out.dtype.names or ():
-        assert np.array_equal(one._written(name), other._written(name), equal_nan=True), name
-    for name in fields(one._tile):
-        assert np.array_equal(one._tile[name][..., one._lane], other._tile[name][..., other._lane], equal_nan=True), (
-            name
-        )
+    for name in one.stores():
+        assert np.array_equal(one.written(name), other.written(name), equal_nan=True), name
+    for name, value in one.state.items():
+        assert np.array_equal(value, other.state[name], equal_nan=True), name
     assert one.loglik == other.loglik or not one.tracker.covariance
 
 
@@ -54,8 +53,8 @@ def test_series_of_unequal_length_end_in_the_state_they_had_alone():
     y, u = rows(40, 600, seed=1)
     length = np.random.default_rng(2).integers(1, 600, 40)
     length[:3] = 600, 256, 1  # the longest, a whole block, one sample
-    records = Records(tuple(range(40)), np.arange(40) * 600, length, y.ravel(), u.reshape(-1, 1), np.ones((1, 3)))
-    fleet = fleets.run_fleet(MODEL.bind(1), [KALMAN] * 40, records)
+    records = Records(tuple(range(40)), np.arange(40) * 600, length, y.ravel(), u.reshape(-1, 1), Known.of())
+    fleet = fleets.run_fleet([Program(MODEL.bind(1), KALMAN)] * 40, records)
     for key in range(40):
         assert len(fleet[key]) == length[key]
         assert_same(fleet[key], track(MODEL, KALMAN, y[key, : length[key]], u[key, : length[key]]))
@@ -95,7 +94,7 @@ def test_settings_per_series():
         assert_same(fleet[key], track(MODEL, own[key], y[key], u[key]))
     with pytest.raises(ValueError, match="11 trackers were given for 12 series"):
         track(MODEL, own[:11], y, u, by="row")
-    with pytest.raises(ValueError, match="lack 1 of 12 series, such as 11"):
+    with pytest.raises(ValueError, match="missing for 1 of 12 series, such as 11"):
         track(MODEL, dict(enumerate(own[:11])), y, u, by="row")
 
 

@@ -39,9 +39,9 @@ def test_filter_is_the_published_recursion(mu):
     run = track(Regression(2), FLS(mu, theta0=[1.0, -1.0]), y, phi)
     path, costs = published(phi, y, mu, theta0=[1.0, -1.0])
     np.testing.assert_allclose(run.theta, path, rtol=1e-8, atol=1e-9)
-    tile = run._tile
-    assert tile["squares"][0, 0] == pytest.approx(costs[-1], rel=1e-9)
-    assert tile["scale"][0, 0] == pytest.approx(costs[-1] / 38, rel=1e-9)
+    state = run.state
+    assert state["squares"] == pytest.approx(costs[-1], rel=1e-9)
+    assert state["scale"] == pytest.approx(costs[-1] / 38, rel=1e-9)
 
 
 @pytest.mark.parametrize("mu", [1e-3, 1.0, 1e4])
@@ -61,7 +61,7 @@ def test_filter_is_kalman_with_an_estimated_scale():
     y[[5, 6]] = np.nan
     fls, kalman = track(Regression(2), FLS(4.0), y, phi), track(Regression(2), Kalman(q=0.25, r=1.0), y, phi)
     np.testing.assert_allclose(fls.theta, kalman.theta, rtol=1e-12, atol=1e-13)
-    scale = fls._tile["scale"][0, 0]
+    scale = fls.state["scale"]
     np.testing.assert_allclose(fls.cov(-1), scale * kalman.cov(-1), rtol=1e-12)
     np.testing.assert_allclose(fls.prediction, kalman.prediction, rtol=1e-12, atol=1e-13)
 

@@ -26,7 +26,7 @@ def test_directional_forgetting_flattens_one_marginal_only():
         P = P - np.outer(P @ z, P @ z) * e / (1.0 + e * h)
         assert z @ P @ z == pytest.approx(z @ plain @ z / LAM)
         np.testing.assert_allclose(run.theta[t], theta, atol=1e-12)
-    np.testing.assert_allclose(run.cov(-1) / run._tile["scale"][0, 0], P, atol=1e-12)
+    np.testing.assert_allclose(run.cov(-1) / run.state["scale"], P, atol=1e-12)
 
 
 def test_directional_forgetting_of_one_is_least_squares_and_forgets_nothing_in_silence():
@@ -36,11 +36,11 @@ def test_directional_forgetting_of_one_is_least_squares_and_forgets_nothing_in_s
     u[50:] = 0.0
     run = track(Regression(N), RLS(LAM, kind="directional"), y, u)
     assert same(run.theta[50:], np.repeat(run.theta[49:50], 150, axis=0))
-    P = run._tile["P"]
+    P = run.state["P"]
     assert np.isfinite(P).all()
     y[60:], u[60:] = np.nan, 1.0
     missing = track(Regression(N), RLS(LAM, kind="directional"), y, u)
-    assert same(missing._tile["P"], P)
+    assert same(missing.state["P"], P)
 
 
 def test_members_of_the_family_are_banks_of_one_hypothesis():

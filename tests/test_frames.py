@@ -161,7 +161,7 @@ def test_names_and_dates_of_a_frame_are_kept(tmp_path):
     only = track(Regression(intercept=True), TRACKER, y.to_numpy(), X.set_axis(dates))
     assert only.labels.zone == "Europe/Berlin"
     timed = track(ARX(1, 1), TRACKER, y.set_axis(dates), X["a"].set_axis(dates), dt="2d")
-    assert timed._known[:4, 0].tolist() == [1.0, 1.5, 0.5, 0.5]
+    assert timed.known.interval[:4].tolist() == [1.0, 1.5, 0.5, 0.5]
     newest_first = y.set_axis(dates[::-1])
     with pytest.raises(ValueError, match="time must increase"):
         track(Regression(intercept=True), TRACKER, newest_first, X.to_numpy())

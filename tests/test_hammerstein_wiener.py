@@ -54,7 +54,7 @@ class Still(Tracker):
 def seen_by(model, y, u):
     """phi (T, n) and z (T,) as a tracker sees them."""
     run = track(model, Still(), y, u)
-    return run._written("phi"), run._written("y")
+    return run.written("phi"), run.written("y")
 
 
 def rows(model, y, u):

@@ -35,7 +35,7 @@ def test_rls_is_kalman_without_drift_is_least_squares_at_every_prefix():
         assert np.isinf(kalman.std[k + 1]).all() == (rank < 4)
     P = np.linalg.inv(phi.T @ phi)
     np.testing.assert_allclose(kalman.cov(-1), R * P, rtol=1e-8)
-    np.testing.assert_allclose(rls.cov(-1) / rls._tile["scale"][0, 0], P, rtol=1e-8)
+    np.testing.assert_allclose(rls.cov(-1) / rls.state["scale"], P, rtol=1e-8)
 
 
 def test_minimum_norm_is_about_theta0():
@@ -58,7 +58,7 @@ def test_least_squares_with_weights():
     for tracker, r in ((RLS(1.0), None), (Kalman(q=0.0, r=R), R)):
         run = track(ARX(2, 2), tracker, y, u, weights=weights)
         np.testing.assert_allclose(run.theta[-1], theta, rtol=1e-8)
-        np.testing.assert_allclose(run.cov(-1) / (r or run._tile["scale"][0, 0]), P, rtol=1e-8)
+        np.testing.assert_allclose(run.cov(-1) / (r or run.state["scale"]), P, rtol=1e-8)
 
 
 def test_noise_estimate_of_rls_is_that_of_least_squares():
@@ -67,7 +67,7 @@ def test_noise_estimate_of_rls_is_that_of_least_squares():
     phi, target = rows_of(y, u)
     run = track(ARX(2, 2), RLS(1.0), y, u)
     rest = np.linalg.lstsq(phi, target)[1][0]
-    np.testing.assert_allclose(run._tile["scale"][0, 0], rest / (len(target) - 4), rtol=1e-8)
+    np.testing.assert_allclose(run.state["scale"], rest / (len(target) - 4), rtol=1e-8)
     np.testing.assert_allclose(
         run.std[-1], np.sqrt(np.diag(np.linalg.inv(phi.T @ phi)) * rest / (len(target) - 4)), rtol=1e-8
     )

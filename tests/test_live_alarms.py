@@ -11,8 +11,8 @@ from test_bank import record as jumping
 
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
 from driftfit.judge.alarms.calibration import null_records
-from driftfit.judge.alarms.rule import AlarmRule
 from driftfit.run.live.alarm import LiveAlarm
+from driftfit.run.live.rule import AlarmRule
 
 K = Kalman(q=1e-4, r=0.01)
 T, CUT, FAULT = 900, 500, 700

@@ -79,7 +79,7 @@ def second_order(theta):
 
 def told_apart(tracker, run, at):
     """Where the 95 % band of `second_order` does not hold 0, from theta and its covariance."""
-    theta, cov, step = run.theta[at], run._written("P")[at], 1e-6
+    theta, cov, step = run.theta[at], run.written("P")[at], 1e-6
 
     def value(theta):
         return second_order(as_arx(tracker, theta))

@@ -266,7 +266,7 @@ def test_diagnostics_tell_good_from_bad():
     assert {"b1", "b2"} <= set(dull.dull())
     bent = run.theta[-1].copy()
     bent[3] = -9.0
-    run._out["theta"][-1, :, 0] = bent
+    run.theta[-1] = bent
     assert diagnose_blocks(run, every=300).slope[0] < 0.0
     with pytest.raises(ValueError, match="at least 21"):
         diagnose_blocks(run, window=5)
@@ -282,7 +282,7 @@ def test_an_estimate_that_does_not_increase_is_flagged_and_predicted_with_its_en
     y_hat, _ = live.predict(0.3)
     assert np.isfinite(y_hat)
     assert s.y.min() - np.ptp(s.y) < y_hat < s.y.max() + np.ptp(s.y)
-    run._out["theta"][:, 3, 0] = -5.0
+    run.theta[:, 3] = -5.0
     assert not free_run(run).rising[60:].any()
 
 

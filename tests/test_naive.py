@@ -80,7 +80,7 @@ def check_record(model_name, tracker_name, data):
         weights = 1.0 / noise
     run = track(model, fast(**given_settings), y, u, time=np.cumsum(dt), weights=weights, drift=drift)
     rows = twin.run(slow(model.n, **given_settings), y, u, dt, noise, drift)
-    written = (run._written(name) for name in ("theta", "var", "y_hat", "e", "s", "ok"))
+    written = (run.written(name) for name in ("theta", "var", "y_hat", "e", "s", "ok"))
     assert_like(rows, *written, noise)
 
 

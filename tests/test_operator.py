@@ -34,8 +34,8 @@ def test_a_record_cut_in_two_is_the_whole(tracker, cut):
     whole = track(MODEL, tracker, y, u, time=time, dt=1.4)
     first = track(MODEL, tracker, y[:cut], u[:cut], time=time[:cut], dt=1.4)
     second = track(MODEL, tracker, y[cut:], u[cut:], time=time[cut:], dt=1.4, warm_start=first)
-    for name in whole._out.dtype.names:
-        assert np.array_equal(whole._written(name)[cut:], second._written(name), equal_nan=True), name
+    for name in whole.stores():
+        assert np.array_equal(whole.written(name)[cut:], second.written(name), equal_nan=True), name
     assert np.array_equal(second.cov(-1), whole.cov(-1), equal_nan=True)
     if tracker.covariance:
         assert np.isclose(first.loglik + second.loglik, whole.loglik)

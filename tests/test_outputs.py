@@ -5,7 +5,7 @@ import pytest
 from support import same
 
 from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.run.live.outputs import LiveOutputs
+from driftfit.streams import LiveOutputs
 
 NAMES = ["level", "flow"]
 
@@ -140,8 +140,8 @@ def test_stream_is_record_also_after_a_restart(tracker, tmp_path):
 def test_summary_and_pictures():
     y, u = coupled()
     run = track(ARX(1, 1, ny=NAMES), Kalman(q=1e-5, r=0.01), y, u)
-    assert "a1[flow<-level]" in run.summary()
-    assert "b1[level<-u]" in run.summary()
+    assert "a1[flow<-level]" in str(run.summary())
+    assert "b1[level<-u]" in str(run.summary())
     drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in run.plot().axes}
     assert drawn.keys() == {name for names in run.names for name in names}
     for k, names in enumerate(run.names):
@@ -149,7 +149,7 @@ def test_summary_and_pictures():
     assert "level 119" in repr(run)
     z, phi = measured()
     shared = track(Regression(2, ny=2, shared=True), FLS(50.0), z, phi)
-    assert "One-step prediction error" in shared.summary()
+    assert "One-step prediction error" in str(shared.summary())
     drawn = {axis.get_ylabel(): axis.get_lines()[0].get_ydata() for axis in shared.plot().axes}
     assert all(same(drawn[name][1::2], shared.theta[:, i]) for i, name in enumerate(shared.names))
 

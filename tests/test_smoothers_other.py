@@ -268,7 +268,7 @@ class TestForecast:
     def test_fls_takes_its_estimated_scale(self):
         phi, y = record()
         run = track(Regression(2), FLS(10.0), y, phi)
-        scale = run._tile["scale"][0, 0]
+        scale = run.state["scale"]
         P = run.cov(-1) + 2 * scale / 10.0 * np.eye(2)
         assert run.forecast(2, phi[:2]).y_std[1] ** 2 == pytest.approx(phi[1] @ P @ phi[1] + scale)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from driftfit import FLS, track
-from driftfit.smooth.parts.walk import walk_of
+from driftfit.smooth.problem import walk_of
 from driftfit.systems.drift import Jump, Ramp, RandomWalk, SineIncrement, SineOffset, paths, reflect
 from driftfit.systems.time_varying import EXAMPLES, example, exp_ar, hammerstein, rational, switching
 

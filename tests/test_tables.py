@@ -33,8 +33,8 @@ def alone(y, u, **more) -> Track:
 
 
 def assert_same(one: Track, other: Track) -> None:
-    for name in one._out.dtype.names or ():
-        assert np.array_equal(one._written(name), other._written(name), equal_nan=True), name
+    for name in one.stores():
+        assert np.array_equal(one.written(name), other.written(name), equal_nan=True), name
 
 
 def as_pandas(columns):

@@ -351,7 +351,7 @@ def test_constants_are_those_of_rls_from_a_diffuse_start():
     u[:40] = 0.0
     weights = np.where(np.arange(300) % 3 == 0, 0.2, 1.0)
     steady = track(ARX(2, 2), RLS(1.0), y, u, weights=weights)
-    got = constant_least_squares(steady.model, y, steady.u, steady._known)
+    got = constant_least_squares(steady.model, steady.record)
     later = slice(60, None)
     assert got["theta"][later, :, 0] == pytest.approx(steady.theta[later], rel=1e-6, abs=1e-9)
     assert got["e"][later, 0] == pytest.approx(steady.innovation[later], rel=1e-6, abs=1e-8, nan_ok=True)
@@ -363,7 +363,7 @@ def test_constants_of_regressors_that_are_the_same():
     y, u = arx_record(300, 8)
     lag = np.concatenate([[0.0], u[:-1]])
     run = track(Regression(4), Kalman(q=1e-4, r=0.01), y, np.column_stack([lag, u, lag, 0.5 * lag]))
-    got = constant_least_squares(run.model, y, run.u, run._known)
+    got = constant_least_squares(run.model, run.record)
     twin = track(Regression(2), RLS(1.0), y, np.column_stack([lag, u]))
     assert got["e"][20:, 0] == pytest.approx(twin.innovation[20:], rel=1e-6, abs=1e-8)
     assert np.abs(got["theta"]).max() < 100.0

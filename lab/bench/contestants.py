@@ -14,8 +14,8 @@ import numpy as np
 
 from driftfit import trackers
 from driftfit.engine.kernel import Array
-from driftfit.run.track import track
 from driftfit.trackers.base import Tracker
+from driftfit.tracking import track
 from lab.bench import peers
 from lab.bench.machine import installed
 from lab.bench.peers import Follow, walk

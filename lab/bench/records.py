@@ -16,7 +16,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.run.result import Track
+from driftfit.results import Track
 from driftfit.systems.scenarios import Simulated, simulate
 
 MODELS: dict[str, Model] = {"regression": Regression(3), "arx": ARX(2, 2)}

@@ -16,8 +16,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.regression import Regression
-from driftfit.run.live.live import Live
-from driftfit.run.track import track
+from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
@@ -27,6 +26,7 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
+from driftfit.tracking import track
 from lab.bench import speed_peers as peers
 from lab.bench.contest import Contest, Finish, Job, hold
 from lab.bench.machine import times

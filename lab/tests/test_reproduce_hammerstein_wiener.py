@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from driftfit.run.track import track
 from driftfit.systems.hammerstein_wiener import example
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 from lab.program import app
 from lab.reproduce import found as reproductions
 from lab.reproduce.hammerstein_wiener import claims, runs, tables

@@ -1,9 +1,8 @@
 """driftfit follows the parameters of a system while they change."""
 
-from importlib.metadata import version
-
-from driftfit.data import prepare
 from driftfit.engine.settings import DataWarning
+from driftfit.engine.version import __version__
+from driftfit.fleets import Fleet
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
@@ -11,10 +10,8 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.regression import Regression
-from driftfit.run.fleet import Fleet
-from driftfit.run.live.live import Live
-from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.results import Track
+from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
@@ -24,10 +21,11 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
+from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
 from driftfit.tune.tune import tune
+from driftfit.use import prepare
 
-__version__ = version("driftfit")
 __all__ = [
     "ARX",
     "FLS",
@@ -52,6 +50,7 @@ __all__ = [
     "Regression",
     "Sensor",
     "Track",
+    "__version__",
     "frontier",
     "grid",
     "prepare",

@@ -24,11 +24,12 @@ from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.results import Track
 from driftfit.run.fleet import FEWEST
-from driftfit.run.live.live import Live
-from driftfit.run.result import Track, root_mean_square
-from driftfit.run.track import track
+from driftfit.run.result import root_mean_square
+from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
+from driftfit.tracking import track
 
 T = 200
 LONG = 20_000
@@ -79,8 +80,8 @@ def damaged(seed: int = 0, bad: float = np.nan) -> tuple[Array, Array]:
 
 def _differ(one: Track, other: Track, upto: int | None = None) -> str | None:
     """The first result in which two runs differ, and from which sample on."""
-    for name in one._out.dtype.names or ():
-        a, b = one._written(name)[:upto], other._written(name)[:upto]
+    for name in one.stores():
+        a, b = one.written(name)[:upto], other.written(name)[:upto]
         wrong = ~((a == b) | (np.isnan(a) & np.isnan(b)))
         if wrong.any():
             return f"{name} differs from sample {int(np.argmax(wrong.reshape(len(a), -1).any(axis=1)))} on"
@@ -195,7 +196,7 @@ def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
 
 
 def _variances(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
-    var, cov = run._written("var")[-1], run.cov(-1)
+    var, cov = run.var[-1], run.cov(-1)
     if not tracker.covariance:
         if not np.isnan(var).all():
             yield (
@@ -209,7 +210,7 @@ def _variances(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
         np.isfinite(cov).all() and np.array_equal(cov, cov.T) and np.linalg.eigvalsh(cov).min() >= -1e-9 * var.max()
     ):
         yield "The covariance of theta is not symmetric, finite and positive; keep its lower triangle in s.P."
-    s = run._written("s")[run.ok]
+    s = run.innovation_var[run.ok]
     if not ((s > 0.0) | ~np.isfinite(s)).all():
         yield "The variance of the innovation, s.s, is not positive."
 

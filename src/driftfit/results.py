@@ -1,117 +1,128 @@
-"""What can be asked of a run once it is there; `Track` inherits these."""
+"""Track with its verbs: what users get from `driftfit.track`. Verbs are modules of their own, on plain data."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.alarms.detect import Alarms, detect
+from driftfit.judge.diagnose import Diagnosis, diagnose
+from driftfit.judge.segment import Segmentation, segmented
+from driftfit.judge.verdict import Verdict, verdict
+from driftfit.models.hammerstein_wiener.results.plots import plot_blocks
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
+from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.run import result
+from driftfit.run.live.rule import AlarmRule
+from driftfit.show.plots import plot_track
+from driftfit.show.report import report
+from driftfit.show.summary import Summary, summarise
+from driftfit.smooth.smoothed import Smoothed
+from driftfit.trackers.bank.results.decided_path import EventSmoothed
+from driftfit.trackers.bank.results.results import Hypotheses
+from driftfit.use import simulate, system
+from driftfit.use.crossing import Crossing, crossing
+from driftfit.use.forecast import Forecast, forecast
+from driftfit.use.prediction import Prediction
+from driftfit.use.system import FrequencyResponse, LongRun, Response
+from driftfit.use.system_plots import plot_system, plot_validation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from driftfit.engine.kernel import Array
-    from driftfit.judge.alarms.detect import Alarms
-    from driftfit.judge.alarms.many import ManyAlarms
-    from driftfit.judge.alarms.rule import AlarmRule
-    from driftfit.judge.diagnose import Diagnosis
-    from driftfit.judge.many import ManyDiagnoses, ManyVerdicts
-    from driftfit.judge.segment import Segmentation
-    from driftfit.judge.verdict import Verdict
-    from driftfit.run.result import Track
-    from driftfit.use.crossing import Crossing
-    from driftfit.use.simulate import Prediction
-    from driftfit.use.system import FrequencyResponse, LongRun, Response
 
+class Track(result.Track, public=True):
+    __doc__ = result.Track.__doc__
 
-class JudgedMany:
-    """Questions to many runs at once, by key: a fleet, or the outputs of one record; see `driftfit.judge.many`."""
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
+        return Hypotheses(self)
 
-    def _runs(self) -> dict[Hashable, Track]:
-        raise NotImplementedError
+    def smooth(
+        self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm"
+    ) -> Smoothed | EventSmoothed:
+        """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.
 
-    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
-        """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
-        from driftfit.judge.many import verdicts
-
-        return verdicts(self._runs(), level, lags, burn)
-
-    def diagnose(self) -> ManyDiagnoses:
-        """What `Track.diagnose` says of each, and how often each number is out of bounds."""
-        from driftfit.judge.many import diagnoses
-
-        return diagnoses(self._runs())
-
-    def detect(
-        self,
-        kind: str = "band",
-        *,
-        every: float = 10_000.0,
-        level: float = 0.05,
-        reference: Any = None,
-        **settings: Any,
-    ) -> ManyAlarms:
-        """Alarms of all of them, one false in ``every`` samples of all together, and which of them had something.
-
-        ``level`` is a false discovery rate, ``reference`` one for all or a mapping from every key to its own; kinds and
-        other settings are those of `driftfit.judge.alarms.detect`.
+        The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
+        each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
+        time; the samples are sorted by it, smoothed in that order, and put back. ``undetermined``: what to give for
+        parameters that the record does not determine, whose std is inf: "min_norm", the answer nearest to theta0;
+        "nan"; or "raise". A `Bank` is smoothed given the events that it found
+        (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for another tracker that is no random
+        walk in Gaussian noise.
         """
-        from driftfit.judge.alarms.many import alarms
+        if self.tracker.weighs and self.start is None:
+            return Hypotheses(self).smooth()
+        return Smoothed.of(self, keep, order_by, undetermined)
 
-        return alarms(self._runs(), kind, every=every, level=level, reference=reference, **settings)
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """theta and y at the h nominal samples after the record, u (h,) or (h, m) being the inputs then."""
+        return forecast(self, h, u)
 
-    def report(
-        self,
-        path: str | PathLike[str],
-        title: str | None = None,
-        *,
-        alarms: ManyAlarms | None = None,
-        labels: Mapping[Hashable, Array] | None = None,
-    ) -> None:
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+    def summary(self) -> Summary:
+        """Parameters now, and one-step errors beside what one would otherwise do; print it."""
+        return summarise(self)
 
-        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters with bands, prediction against output, innovations; a matplotlib figure."""
+        return plot_track(self, level)
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row a sample; see `driftfit.show.export`."""
+        from driftfit.show.export import to_table  # polars takes as long to import as all the rest
+
+        return to_table(self, kind)
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """The same table as an Arrow stream, for whatever reads one."""
+        return self.to_table().__arrow_c_stream__(requested_schema)
+
+    def to_parquet(self, path: str | PathLike[str]) -> None:
+        """Write the same table as Parquet."""
+        from driftfit.show.export import to_parquet
+
+        to_parquet(self, path)
+
+    def blocks(
+        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
+    ) -> Blocks:
+        """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
+
+        ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see
+        `driftfit.models.hammerstein_wiener.separation.separate`; ``input``, ``output`` and ``at`` choose the gauge,
+        see `driftfit.models.hammerstein_wiener.separation.paths.Blocks.gauge`; None is "unit", or "c1" for a tracker
+        that follows the minimal parameters.
         """
-        from driftfit.show.report import check_path
-        from driftfit.show.report_many import page_of_many
+        return blocks_of(self, method, input, output, at)
 
-        text = page_of_many(self._runs(), title, getattr(self, "failed", {}), alarms, labels)
-        check_path(path).write_text(text, encoding="utf-8")
-
-
-class Judged:
-    """Questions to a run. Each is a module of its own, imported when it is asked."""
+    def plot_blocks(self, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
+        """The static curves at some samples, and the coefficients over time; a matplotlib figure."""
+        return plot_blocks(self, method, times)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
         """Is the time variation real, which parameters move, and does following them pay? See
         `driftfit.judge.verdict`.
         """
-        from driftfit.judge.verdict import verdict
-
-        return verdict(cast("Track", self), level, lags, burn)
+        return verdict(self, level, lags, burn)
 
     def segment(self, **settings: Any) -> Segmentation:
         """Segments of the whole record with constant parameters, with dates and their intervals; `driftfit.segment`."""
-        from driftfit.judge.segment import segmented
-
-        return segmented(cast("Track", self), **settings)
+        return segmented(self, **settings)
 
     def diagnose(self) -> Diagnosis:
         """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.judge.diagnose`."""
-        from driftfit.judge.diagnose import diagnose
-
-        return diagnose(cast("Track", self))
+        return diagnose(self)
 
     def ahead(self, k: int) -> Prediction:
         """Every output predicted from k samples before it, the inputs given; see `driftfit.use.simulate`."""
-        from driftfit.use.simulate import ahead
-
-        return ahead(cast("Track", self), k)
+        return simulate.ahead(self, k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
         """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
-        from driftfit.use.simulate import simulate
-
-        return simulate(cast("Track", self), u, at, y)
+        return simulate.simulate(self, u, at, y)
 
     def crossing(
         self,
@@ -124,80 +135,56 @@ class Judged:
         level: float = 0.9,
     ) -> Crossing:
         """When a parameter or the output crosses a limit, with an interval; see `driftfit.use.crossing`."""
-        from driftfit.use.crossing import crossing
-
-        return crossing(cast("Track", self), what, below=below, above=above, horizon=horizon, u=u, level=level)
+        return crossing(self, what, below=below, above=above, horizon=horizon, u=u, level=level)
 
     def poles(self, at: Any = None) -> Array:
         """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.use.system`."""
-        from driftfit.use.system import poles
-
-        return poles(cast("Track", self), at)
+        return system.poles(self, at)
 
     def largest_pole(self, at: Any = None) -> Response:
         """Magnitude (T,) of the largest pole, with its standard deviation; below 1 the system is stable."""
-        from driftfit.use.system import largest_pole
-
-        return largest_pole(cast("Track", self), at)
+        return system.largest_pole(self, at)
 
     def dc_gain(self, at: Any = None) -> Response:
         """Gain (T, m) of every input for signals that stand, with its standard deviation."""
-        from driftfit.use.system import dc_gain
-
-        return dc_gain(cast("Track", self), at)
+        return system.dc_gain(self, at)
 
     def step_response(self, h: int, input: int | str = 0, at: Any = -1) -> Response:
         """Response (., h) to a unit step of an input, at the samples ``at`` (None: all), with std."""
-        from driftfit.use.system import step_response
-
-        return step_response(cast("Track", self), h, input, at)
+        return system.step_response(self, h, input, at)
 
     def impulse_response(self, h: int, input: int | str = 0, at: Any = -1) -> Response:
         """Response (., h) to a unit impulse of an input, at the samples ``at`` (None: all), with std."""
-        from driftfit.use.system import impulse_response
-
-        return impulse_response(cast("Track", self), h, input, at)
+        return system.impulse_response(self, h, input, at)
 
     def frequency_response(self, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
         """Magnitude and phase at w radians per sample, with std; see `driftfit.use.system`."""
-        from driftfit.use.system import frequency_response
-
-        return frequency_response(cast("Track", self), w, input, at)
+        return system.frequency_response(self, w, input, at)
 
     def to_scipy(self, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
         """The system of a sample as `scipy.signal.dlti`, from one input to y."""
-        from driftfit.use.system import to_scipy
-
-        return to_scipy(cast("Track", self), at, dt, input)
+        return system.to_scipy(self, at, dt, input)
 
     def long_run(self, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
         """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""
-        from driftfit.use.system import long_run
-
-        return long_run(cast("Track", self), at, level)
+        return system.long_run(self, at, level)
 
     def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
         """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.judge.alarms.detect`.
 
         ``kind`` may also be the rule of another run, ``said.rule``.
         """
-        from driftfit.judge.alarms.detect import detect
-
-        return detect(cast("Track", self), kind, **settings)
+        return detect(self, kind, **settings)
 
     def plot_system(self, input: int | str = 0, at: Any = None, **settings: Any) -> Figure:
         """Step and frequency response over time with bands, poles in the plane, gain; see
         `driftfit.use.system_plots`.
         """
-        from driftfit.use.system_plots import plot_system
-
-        return plot_system(cast("Track", self), input, at, **settings)
+        return plot_system(self, input, at, **settings)
 
     def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
         """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
-        from driftfit.use.system_plots import plot_validation
-
-        return plot_validation(cast("Track", self), y, u, at, level)
+        return plot_validation(self, y, u, at, level)
 
     def report(
         self,
@@ -211,6 +198,4 @@ class Judged:
 
         ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
         """
-        from driftfit.show.report import report
-
-        report(cast("Track", self), path, title, alarms, labels)
+        report(self, path, title, alarms, labels)

@@ -68,7 +68,7 @@ def test_no_excitation_stays_within_the_promise(model, tracker):
         assert live._tile["rank"][0, 0] == model.n
         at_full_rank = np.trace(np.tril(live._tile["P"][0, ..., 0]))
         for t in (600, 5000, LONG - 1):
-            scale = track(model, tracker, y[: t + 1], u[: t + 1])._tile["scale"][0, 0]
+            scale = track(model, tracker, y[: t + 1], u[: t + 1]).state["scale"]
             assert np.trace(run.cov(t)) <= 1.0000001 * tracker.c_max * at_full_rank * scale
 
 

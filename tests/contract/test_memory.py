@@ -47,4 +47,4 @@ def test_a_record_needs_its_outputs_and_no_more(model, tracker):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak < run._out.nbytes + 0.5 * T * np.dtype(float).itemsize
+    assert peak < run._lane.out.nbytes + 0.5 * T * np.dtype(float).itemsize

@@ -7,7 +7,7 @@ import pytest
 from support import arx_record, damaged, run_lanes, same
 
 from driftfit import Live, track
-from driftfit.engine.drivers import known_factors
+from driftfit.data.known import Known
 
 T = 300
 
@@ -25,7 +25,7 @@ def assert_same_run(a, b, upto=None):
     for name in ("theta", "std", "prediction", "innovation", "innovation_std", "ok"):
         assert same(getattr(a, name)[:upto], getattr(b, name)[:upto]), name
     for name in a.tracker.outputs:
-        assert same(a._written(name)[:upto], b._written(name)[:upto]), name
+        assert same(a.written(name)[:upto], b.written(name)[:upto]), name
 
 
 @pytest.mark.parametrize("known", [{}, factors(5)], ids=["plain", "times, weights, drift"])
@@ -52,11 +52,11 @@ def test_a_lane_says_what_the_record_says(model, tracker):
     runs = [track(model, tracker, y, u, **k) for (y, u), k in zip(series, known, strict=True)]
     y, u = (np.stack(signal, axis=1) for signal in zip(*series, strict=True))
     out, _ = run_lanes(
-        model, [tracker] * tracker.width, y, u[:, None, :], np.stack([run._known for run in runs], axis=2)
+        model, [tracker] * tracker.width, y, u[:, None, :], np.stack([run.known.columns for run in runs], axis=2)
     )
     for lane, run in enumerate(runs):
-        for name in run._out.dtype.names:
-            assert same(out[name][..., lane], run._written(name)), (lane, name)
+        for name in run.stores():
+            assert same(out[name][..., lane], run.written(name)), (lane, name)
 
 
 def test_lanes_do_not_touch_each_other(model, tracker):
@@ -66,7 +66,8 @@ def test_lanes_do_not_touch_each_other(model, tracker):
     ys, us = (np.repeat(signal[:, None], tracker.width, axis=1) for signal in (y, u))
     if tracker.width > 1:
         ys[:, 1], us[::3, 1] = 1e149, np.nan
-    out, _ = run_lanes(model, [tracker] * tracker.width, ys, us[:, None, :], known_factors()[:, :, None] + 0 * ys[:1])
+    known = Known.of().columns[:, :, None] + 0 * ys[:1]
+    out, _ = run_lanes(model, [tracker] * tracker.width, ys, us[:, None, :], known)
     for lane in set(range(tracker.width)) - {1}:
         assert same(out["theta"][..., lane], alone.theta)
 

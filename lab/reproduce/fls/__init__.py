@@ -21,11 +21,11 @@ from rich.table import Table
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import root_mean_square as rms
-from driftfit.run.track import track
 from driftfit.smooth.augmented import augmented
 from driftfit.systems.time_varying import EXAMPLES, MU, Simulated, example
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
+from driftfit.tracking import track
 
 SEEDS = 100
 METHODS = ("A-FLS on-line", "A-FLS smoothed", "T-FLS filtered", "T-FLS smoothed", "constant LS", "zero")

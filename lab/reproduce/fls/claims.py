@@ -11,11 +11,12 @@ from rich.console import Console
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
 from driftfit.run.result import root_mean_square as rms
-from driftfit.run.track import track
 from driftfit.smooth.augmented import augmented
+from driftfit.smooth.smoothed import Smoothed
 from driftfit.systems.time_varying import MU, Simulated, example, hammerstein, sinusoids, switching
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
+from driftfit.tracking import track
 from driftfit.tune.tune import tune
 from lab.reproduce import Claim
 from lab.reproduce.fls import METHODS
@@ -135,7 +136,7 @@ def limits() -> Claim:
     d = example("sinusoids")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        path = track(d.model, FLS(1e-9), d.y, d.u).smooth()
+        path = Smoothed.of(track(d.model, FLS(1e-9), d.y, d.u))
     frozen = track(d.model, AugmentedFLS(1e12), d.y, d.u).theta
     constant = np.linalg.lstsq(d.phi, d.y, rcond=None)[0]
     apart = np.abs(track(d.model, FLS(1e12), d.y, d.u).smooth().theta - constant).max()

@@ -18,11 +18,11 @@ from scipy import linalg
 
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.run.result import Track
-from driftfit.run.track import track
-from driftfit.show.plots import new_figure
+from driftfit.results import Track
+from driftfit.show.parts.axes import new_figure
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
+from driftfit.tracking import track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,11 +16,12 @@ from rich.table import Table
 
 from driftfit.models.regression import Regression
 from driftfit.run.result import root_mean_square as rms
-from driftfit.run.track import track
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import MU, Simulated, example
 from driftfit.trackers.fls import FLS
-from driftfit.tune.tune import Tuned, tune
+from driftfit.tracking import track
+from driftfit.tune.tune import tune
+from driftfit.tune.tuned import Tuned
 
 METHODS = ("ml", "loo", "gcv")
 SEEDS = {"sinusoids": 100, "rational": 60, "switching": 25, "exp-ar": 40}

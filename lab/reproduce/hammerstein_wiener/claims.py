@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from rich.console import Console
 
-from driftfit.run.track import track
 from driftfit.systems.hammerstein_wiener import WALK, example
+from driftfit.tracking import track
 from lab.reproduce import Claim
 from lab.reproduce.hammerstein_wiener import verdicts
 from lab.reproduce.hammerstein_wiener.runs import PAPER

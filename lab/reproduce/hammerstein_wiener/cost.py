@@ -15,8 +15,8 @@ from driftfit.models.hammerstein_wiener.curves.basis import Legendre
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation.paths import empty
 from driftfit.models.hammerstein_wiener.separation.separate import METHODS, separate
-from driftfit.run.track import track
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 
 ORDERS = ((2, 2, 3, 3), (3, 3, 3, 4), (4, 4, 5, 5))
 REPEATS = 5

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.run.track import track
-from driftfit.show.plots import BLUE, GREY, RED, new_figure
+from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems.arc_furnace import furnace
 from driftfit.systems.hammerstein_wiener import Simulated, example
+from driftfit.tracking import track
 from lab.reproduce.hammerstein_wiener.runs import FAST, PAPER, STARTS, fourth_example, off, separated
 
 if TYPE_CHECKING:

@@ -24,11 +24,11 @@ from driftfit.models.hammerstein_wiener.results.product_drift import track_produ
 from driftfit.models.hammerstein_wiener.separation.paths import Groups, minimal, split
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
-from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.results import Track
 from driftfit.systems.arc_furnace import THRESHOLDS, A, B, Furnace
 from driftfit.systems.hammerstein_wiener import CUBIC, WALK, Simulated, example
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 
 PAPER = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
 FAST = ExtendedKalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)

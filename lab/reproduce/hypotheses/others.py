@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.results import Track
 from driftfit.smooth.piecewise import piecewise
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
@@ -16,6 +15,7 @@ from driftfit.trackers.bank.reduction import Beam, Decide
 from driftfit.trackers.bank.results.decided_path import problem_of, solve
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 from lab.reproduce.hypotheses.contests import CHANGES, P0, R, bank
 from lab.reproduce.hypotheses.scores import pooled
 

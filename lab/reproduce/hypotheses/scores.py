@@ -8,10 +8,10 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.results import Track
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
+from driftfit.tracking import track
 from lab.reproduce.hypotheses.contests import Contest, Entry
 
 REACH, QUIET = 20, 50
@@ -86,7 +86,7 @@ def score(entry: Entry, record: Jumping) -> Score:
     return Score(
         np.array([square[part].sum() for part in masks]), np.array([part.sum() for part in masks]), len(hits),
         len(record.jumps), float(np.sum(hits)), int(np.sum(since_jump(record)[called] >= REACH)),
-        float(log_p[masks[0]].mean()), nees(error[START:], made._written("P")[START:]),
+        float(log_p[masks[0]].mean()), nees(error[START:], made.written("P")[START:]),
         float(made.hypotheses.leaves.mean()) if is_bank else 1.0,
     )  # fmt: skip
 

@@ -29,10 +29,10 @@ from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.results import Track
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
+from driftfit.tracking import track
 
 
 class TrackedRegressor(RegressorMixin, BaseEstimator):

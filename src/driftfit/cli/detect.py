@@ -15,7 +15,7 @@ from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import moment, stretch
 from driftfit.cli.track import Plot, Report
 from driftfit.judge.alarms.detect import Alarms
-from driftfit.run.result import Track
+from driftfit.results import Track
 from driftfit.show.report import check_path
 
 

@@ -15,8 +15,8 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
 from driftfit.cli.parts.reading import Part, rows_of
 from driftfit.engine.kernel import Array
-from driftfit.run.result import Track
-from driftfit.show.summary import table_of
+from driftfit.results import Track
+from driftfit.show.parts.text import table_of
 
 SHOWN = 40
 """Rows that are printed."""

@@ -14,7 +14,7 @@ from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
 from driftfit.engine.settings import missing_settings
-from driftfit.show.summary import facts, table_of
+from driftfit.show.parts.text import facts, table_of
 from driftfit.tune.tune import tune
 
 PLACES = 5

@@ -9,8 +9,8 @@ import typer
 
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, say
-from driftfit.data.export import check_ending, write
-from driftfit.run.result import Track
+from driftfit.results import Track
+from driftfit.show.export import check_ending, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

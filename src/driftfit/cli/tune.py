@@ -12,7 +12,7 @@ from driftfit.cli.parts.arguments import given_fields
 from driftfit.cli.parts.options import Given, reads
 from driftfit.cli.parts.program import app, progress, say
 from driftfit.cli.track import Plot
-from driftfit.show.summary import facts, shortened, table_of
+from driftfit.show.parts.text import facts, shortened, table_of
 
 
 @app.command()

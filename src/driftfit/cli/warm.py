@@ -12,7 +12,7 @@ from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
 from driftfit.run.fleet import FEWEST
-from driftfit.show.summary import facts
+from driftfit.show.parts.text import facts
 
 SAMPLES = 300
 """Of the made-up record."""
@@ -30,8 +30,8 @@ def warm(
     fleet: Annotated[bool, typer.Option("--fleet", help="For many series at once as well.")] = False,
 ) -> None:
     """Compile what models and a tracker need (record, stream, summary, verdict), so that it is found on disk later."""
-    from driftfit.run.live.live import Live
-    from driftfit.run.track import track
+    from driftfit.streams import Live
+    from driftfit.tracking import track
 
     with helpful():
         if inputs < 0:

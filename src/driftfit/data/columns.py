@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from driftfit.data.clock import zone_name
-from driftfit.data.signals import as_numbers
+from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 

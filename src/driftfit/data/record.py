@@ -15,12 +15,14 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from driftfit.data.clock import LABEL, Clock, instants, warn_of_gaps
+from driftfit.data.known import Known
 from driftfit.data.labels import held, ordered, times_of, together
 from driftfit.data.limits import Limits, marked, within_each
-from driftfit.data.signals import as_inputs, as_numbers, as_output, factor, intervals, noise_of
-from driftfit.engine.drivers import known_factors
+from driftfit.data.signals import as_inputs, as_output, intervals, noise_of
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.trackers.base import Tracker
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,37 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class Record:
+    """One checked series: ``y`` (T,), ``u`` (T, m), what is ``known`` of every sample, ``time`` (T,) or None."""
+
+    y: Array
+    u: Array
+    known: Known
+    time: Array | None = None
+    labels: Labels = PLAIN
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    @property
+    def noise(self) -> Array:
+        """(T,): factors of the noise variance."""
+        return np.broadcast_to(self.known.noise, len(self))
+
+    def part(self, rows: slice) -> Record:
+        """Some samples in a row."""
+        time = None if self.time is None else self.time[rows]
+        return replace(self, y=self.y[rows], u=self.u[rows], known=self.known.part(rows), time=time)
+
+
+@dataclass(frozen=True)
 class Records:
     """Series in flat arrays of N samples.
 
-    ``y`` (N,), ``u`` (N, m), ``known`` (N, 3) or (1, 3), ``time`` (N,) or None; series k is ``length[k]`` samples from
-    ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that never became
-    samples and numbers that were taken as missing. ``drifts`` (N, k) are factors of the drift for each parameter or
-    change, until the tracker has made columns of ``known`` of them.
+    ``y`` (N,), ``u`` (N, m), ``known`` of N samples or one row, ``time`` (N,) or None; series k is ``length[k]``
+    samples from ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that
+    never became samples and numbers that were taken as missing. ``drifts`` (N, k) are
+    factors of the drift for each parameter or change, until the tracker has made columns of ``known`` of them (`told`).
     """
 
     keys: tuple[Hashable, ...]
@@ -98,18 +124,26 @@ class Records:
     length: Array
     y: Array
     u: Array
-    known: Array
+    known: Known
     time: Array | None = None
     labels: Labels = PLAIN
     dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
     drifts: Array | None = None
     missing: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
 
-    def part(self, k: int) -> tuple[Array, Array, Array | None, Array]:
-        """(y, u, time, known) of series k, as views."""
+    def part(self, k: int) -> Record:
+        """Series k; its arrays are views."""
         rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
-        known = self.known if len(self.known) == 1 else self.known[rows]
-        return self.y[rows], self.u[rows], None if self.time is None else self.time[rows], known
+        return Record(self.y, self.u, self.known, self.time, self.labels_of(k)).part(rows)
+
+    def told(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
+        """With what is known beside interval, noise and drift as columns of ``known``, for these trackers."""
+        if self.drifts is None and prob is None:
+            return self
+        columns, *others = (one.beside(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
+        if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
+            raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
+        return replace(self, known=self.known.with_more(columns), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""
@@ -135,7 +169,7 @@ class Records:
         found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
-            warn_of_gaps(clock, self.time, self.known[:, 0], self.first, reach or model.reach, zone)
+            warn_of_gaps(clock, self.time, self.known.interval, self.first, reach or model.reach, zone)
         return found
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
@@ -167,7 +201,7 @@ def one_series(y: Any, u: Any, reading: Reading) -> Records:
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     drift = beside["drift"].values
     common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
-    known = known_factors(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
+    known = Known.of(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
     labels = Labels(
         (signals["y"].names or ("y",))[0], signals["u"].names, times.name, zone=times.zone, dt=Clock.of(dt).plain
     )
@@ -210,8 +244,8 @@ def _inputs_of_rows(u: Any, units: int, T: int) -> Array:
     return inputs.reshape(units * T, inputs.shape[2])
 
 
-def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Array, Array | None]:
-    """known (units * T, 3) or (1, 3), and time (units * T,) or None."""
+def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: Any) -> tuple[Known, Array | None]:
+    """What is known of units * T samples, and time (units * T,) or None."""
     shape = (units, T)
     axis: Array | None = None
     gaps: Any = 1.0
@@ -227,7 +261,7 @@ def _known_of_rows(units: int, T: int, time: Any, dt: Any, weights: Any, drift: 
             raise ValueError(f'by="row": time must be ({T},) or {shape}; got shape {given.shape}.')
     factors = [gaps, _per_row("weights", weights, shape, noise_of), _per_row("drift", drift, shape, drift_of)]
     flat = [np.broadcast_to(f, shape).ravel() if np.ndim(f) else f for f in factors]
-    return known_factors(*flat), None if axis is None else axis.ravel()
+    return Known.of(*flat), None if axis is None else axis.ravel()
 
 
 def drift_of(value: Any, T: int | None = None) -> Array:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from driftfit.data.clock import Clock, instants
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import missing_settings
+from driftfit.engine.settings import Settings, missing_settings
 
-if TYPE_CHECKING:
-    from driftfit.trackers.base import Tracker
+S = TypeVar("S", bound=Settings)
 
 
-def check_ready(tracker: Tracker) -> Tracker:
+def check_ready(tracker: S) -> S:
     """Refuse a tracker whose settings are not all numbers yet."""
     missing = missing_settings(tracker)
     if missing:
@@ -23,25 +23,6 @@ def check_ready(tracker: Tracker) -> Tracker:
             f"{name}: {', '.join(missing)} must be given: {name}({', '.join(f'{m}=...' for m in missing)})."
         )
     return tracker
-
-
-def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN, text is named with its place."""
-    if isinstance(values, np.ma.MaskedArray):
-        values = np.ma.filled(values.astype(float), np.nan)
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        pass
-    given = np.asarray(values, dtype=object)
-    out = np.empty(given.shape)
-    for place, value in np.ndenumerate(given):
-        try:
-            out[place] = np.nan if value is None or value == "" else float(value)
-        except (TypeError, ValueError):
-            where = f"entry {place[0] if len(place) == 1 else place}" if place else "it"
-            raise ValueError(f"{name}: {where} is {value!r}, which is not a number.") from None
-    return out
 
 
 def as_output(y: Any) -> Array:
@@ -69,16 +50,6 @@ def as_inputs(u: Any, T: int) -> Array:
     if len(array) != T:
         hint = f" u.T has shape {array.T.shape}." if array.shape[1] == T else ""
         raise ValueError(f"y has {T} samples but u has shape {array.shape}: the first axis must be time.{hint}")
-    return array
-
-
-def factor(name: str, value: Any, T: int | None = None) -> Array:
-    """A known factor of a variance: finite and not negative, one number or one per sample."""
-    array = as_numbers(name, value)
-    if array.ndim > 1 or (array.ndim == 1 and len(array) != T):
-        raise ValueError(f"{name} must be one number or one per sample ({T}); got shape {array.shape}.")
-    if not (np.isfinite(array) & (array >= 0.0)).all():
-        raise ValueError(f"{name} must be finite and not negative everywhere.")
     return array
 
 

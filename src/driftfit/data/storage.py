@@ -10,7 +10,7 @@ import json
 import os
 import secrets
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from importlib import import_module
 from io import BytesIO
@@ -21,7 +21,6 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
-from driftfit.trackers.base import Tracker
 
 FORMAT = 1
 
@@ -65,10 +64,10 @@ def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[
         raise
 
 
-def read(path: str | PathLike[str], kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Header and arrays of a file that holds a ``kind`` ("state" or "track"); ValueError where it does not."""
+def read(path: str | PathLike[str], *kinds: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of a file that holds one of the ``kinds`` ("state", "track"); ValueError where it does not."""
     with open(path, "rb") as handle:
-        return _take(handle, os.fspath(path), kind)
+        return _take(handle, os.fspath(path), kinds)
 
 
 def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -76,7 +75,7 @@ def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> N
     np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
 
 
-def _take(file: Any, name: str, kind: str) -> tuple[dict[str, Any], dict[str, Array]]:
+def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
     try:
         with np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -87,8 +86,8 @@ def _take(file: Any, name: str, kind: str) -> tuple[dict[str, Any], dict[str, Ar
         raise ValueError(
             f"{name} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
         )
-    if header.get("kind") != kind:
-        raise ValueError(f"{name} holds a {header.get('kind')}, not a {kind}.")
+    if header.get("kind") not in kinds:
+        raise ValueError(f"{name} holds a {header.get('kind')}, not a {' or a '.join(kinds)}.")
     return header, arrays
 
 
@@ -111,9 +110,15 @@ class Kept(ABC):
         write(path, *self._written())
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
+    def _kinds(cls) -> Mapping[str, type[Kept]]:
+        """What `load` understands: the class that each kind of file becomes."""
+        return {cls._kind: cls}
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Any:
         """Continue from a file as if never stopped."""
-        return cls._read(os.fspath(path), *read(path, cls._kind))
+        header, arrays = read(path, *cls._kinds())
+        return cls._kinds()[header["kind"]]._read(os.fspath(path), header, arrays)
 
     def to_bytes(self) -> bytes:
         """What `save` writes, for a queue or a database."""
@@ -122,9 +127,10 @@ class Kept(ABC):
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, data: bytes) -> Self:
+    def from_bytes(cls, data: bytes) -> Any:
         """The inverse of `to_bytes`."""
-        return cls._read("what was given", *_take(BytesIO(data), "what was given", cls._kind))
+        header, arrays = _take(BytesIO(data), "what was given", list(cls._kinds()))
+        return cls._kinds()[header["kind"]]._read("what was given", header, arrays)
 
 
 def _encode(value: Any) -> Any:
@@ -152,7 +158,7 @@ def _decode(value: dict[str, Any]) -> Any:
 
 
 def restore(
-    source: str | PathLike[str], tracker: Tracker, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
+    source: str | PathLike[str], tracker: Settings, arrays: Mapping[str, Array], prefix: str, into: Mapping[str, Array]
 ) -> None:
     """Write stored arrays into the fields of a record; ValueError where one is missing or of another shape."""
     for name, field in into.items():

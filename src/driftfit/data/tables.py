@@ -16,9 +16,9 @@ import numpy as np
 from driftfit.data.clock import Clock
 from driftfit.data.columns import Columns, Wanted
 from driftfit.data.files import read
+from driftfit.data.known import Known
 from driftfit.data.record import Labels, Reading, Records, drift_of
 from driftfit.data.signals import noise_of
-from driftfit.engine.drivers import known_factors
 from driftfit.engine.kernel import Array
 
 
@@ -50,7 +50,7 @@ def read_records(
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
     clock = Clock.of(reading.dt, columns.zone)
-    known = known_factors(
+    known = Known.of(
         1.0 if times is None else _gaps(times, first, clock),
         _factor(weights, values, noise_of),
         _factor(1.0 if each else drift, values, drift_of),

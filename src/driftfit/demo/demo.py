@@ -30,11 +30,11 @@ from rich.text import Text
 from driftfit.data.files import read_columns
 from driftfit.engine.kernel import Array
 from driftfit.models.arx import ARX
-from driftfit.run.result import Track
-from driftfit.run.track import track
-from driftfit.show.plots import GREY, RED, draw_innovation, draw_parameter, draw_prediction, new_figure
+from driftfit.results import Track
+from driftfit.show.parts.axes import GREY, RED, draw_innovation, draw_parameter, draw_prediction, new_figure
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,8 +14,8 @@ import numpy as np
 from driftfit.data.signals import check_ready
 from driftfit.embedded.project import files_of, record_bytes, write
 from driftfit.models.base import Model
-from driftfit.run.live.live import Live
-from driftfit.run.warm_start import fresh_tile
+from driftfit.run.program import Program
+from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
 
@@ -43,13 +43,13 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
     if len(model.outputs) > 1:
         raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
     bound = model.bind(model.m)
-    tile = fresh_tile(bound, check_ready(tracker))
+    tile = Program(bound, check_ready(tracker)).tile()
     write(Path(path), files_of(bound, tracker, tile, f"{bound!r}, {tracker!r}"))
 
 
 def to_struct(live: Live) -> bytes:
     """The state of a stream as the bytes of ``tracker_state`` (double build, the byte order of this computer)."""
-    return record_bytes(fresh_tile(live.model, live.tracker, live.lane()))
+    return record_bytes(live.program.tile(live.lane()))
 
 
 def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:

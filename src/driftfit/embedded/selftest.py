@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.live.live import Live
+from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
 SAMPLES = 200

@@ -134,11 +134,6 @@ def _common(n: int, m: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def known_factors(dt: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Array:
-    """What is known beside the signals, (T, 3) or (1, 3): interval, factors of the noise variance and of the drift."""
-    return np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, float)) for v in (dt, noise, drift))), axis=1)
-
-
 def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:
     """A tile of ``len(trackers)`` lanes: an array of one record, its fields set to the given starts.
 

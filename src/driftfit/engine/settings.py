@@ -20,12 +20,12 @@ class DataWarning(UserWarning):
     """Something in the data that makes a result less than it seems; what was found, and the way out."""
 
 
-def warn(message: str) -> None:
+def warn(message: str, kind: type[Warning] = DataWarning) -> None:
     """Warn of data, at the line of the user's program that called the library."""
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == "driftfit":
         level, frame = level + 1, frame.f_back
-    warnings.warn(message, DataWarning, stacklevel=level)
+    warnings.warn(message, kind, stacklevel=level)
 
 
 class Settings:

@@ -13,11 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
-from driftfit.run.result import Track, root_mean_square
+from driftfit.run.result import Track, burn_in, root_mean_square
 
 
 class Comparison(NamedTuple):
@@ -52,23 +53,17 @@ class Errors(NamedTuple):
     scored: Array
 
 
-def burn_in(n: int) -> int:
-    """Samples that are not scored where a model has n parameters."""
-    return max(50, 5 * n)
-
-
 def errors(run: Track, burn: int | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constant least squares and of constant ARX.
 
     The first ``burn`` samples are not scored, max(50, 5 n) unless it is said.
     """
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
-    steady = constant_least_squares(run.model, run.y, run.u, run._known)
-    known = run._known[:, :3].copy()
-    known[:, 0] = np.where(known[:, 0] > 0.0, known[:, 0], 1.0)  # 0 before the lags of the run were filled
-    known[:, 1] = 1.0
+    steady = constant_least_squares(run.model, run.record)
+    gaps = run.known.interval
+    known = run.known.changed(interval=np.where(gaps > 0.0, gaps, 1.0), noise=1.0)  # 0 before the lags were filled
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
-    arx = constant_least_squares(small, y, u, known)
+    arx = constant_least_squares(small, Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     own = (tracked, y - persistence(y), constant, arx["e"][:, 0])
     scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)

@@ -10,12 +10,16 @@ that is compiled once for all models. Cost per sample: O(n^2).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from driftfit.data.record import Record
 from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type, unknown
 from driftfit.engine.kernel import Array, State, kernel, shared
 from driftfit.models.base import Model
-from driftfit.smooth.parts.walk import COLLECTED, collect
+from driftfit.run.program import lane_of
+from driftfit.run.seen import COLLECTED, collect
 
 FLAT = 1e-11
 """A diagonal entry below this share of its column is taken for zero."""
@@ -67,14 +71,14 @@ def learn(s: State, l: int) -> None:
 STEPS = TrackerSteps(stay, learn, unknown, None, collect)
 
 
-def constant_least_squares(model: Model, y: Array, u: Array, known: Array) -> Array:
-    """Constants over a record, y (T,), u (T, m), known (T, 3): (T,) records of phi, y, dt, valid, e, ok and more.
+def constant_least_squares(model: Model, record: Record) -> Array:
+    """Constants over a record: (T,) records of phi, y, dt, valid, e, ok and more.
 
     Lags that are missing are filled by the predictions of these constants.
     """
     n = model.n
     state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
     tile = make_tile(n, model.m, model.memory(), [state])
-    out = np.empty(len(y), output_type(tile, COLLECTED))
-    drivers(model.steps, STEPS).run(tile, y[:, None], u[:, :, None], known[:, :3, None], out)
+    out = np.empty(len(record), output_type(tile, COLLECTED))
+    drivers(model.steps, STEPS).run(tile, *lane_of(replace(record, known=record.known.common)), out)
     return out

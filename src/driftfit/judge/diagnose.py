@@ -32,15 +32,16 @@ from rich.text import Text
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.excitation import INDEX, Excitation, excitation
+from driftfit.judge.plots import Health, draw_diagnosis
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
 from driftfit.judge.statistics.scale import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 
 if TYPE_CHECKING:
@@ -118,9 +119,8 @@ class Diagnosis(Printed):
 
     def plot(self) -> Figure:
         """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""
-        from driftfit.judge.plots import draw_diagnosis
-
-        return draw_diagnosis(self)
+        parts = (self.run, self.z, self.white, self.excited, self.constant, self.rows)
+        return draw_diagnosis(Health(*parts, lambda name: self[name].ok))
 
 
 def diagnose(run: Track) -> Diagnosis:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.run.result import burn_in
 
 INDEX = 100.0
 """Limit of the condition index."""
@@ -42,7 +43,7 @@ class Excitation(NamedTuple):
 def excitation(phi: Array, window: int | None = None) -> Excitation:
     """Eigenvalues of windows of regressors phi (N, n); max(50, 5 n) samples unless ``window`` says otherwise."""
     N, n = phi.shape
-    W = max(50, 5 * n) if window is None else window
+    W = burn_in(n) if window is None else window
     size = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.ones(n)
     scaled = phi / np.where(size > 0.0, size, 1.0)
     ends = np.arange(W, N + 1, max(W // 2, 1))

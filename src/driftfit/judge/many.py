@@ -27,7 +27,7 @@ from rich.text import Text
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.verdict import Verdict, p_text, verdict
-from driftfit.show.summary import Printed, key_text, table_of
+from driftfit.show.parts.text import Printed, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
+from driftfit.run.result import Track
 
 
 class Rows(NamedTuple):
@@ -26,8 +24,8 @@ class Rows(NamedTuple):
 
 def regressors(run: Track) -> Rows:
     """The samples of a regression that a record makes for the model of a run."""
-    out = constant_least_squares(run.model, run.y, run.u, run._known)
+    out = constant_least_squares(run.model, run.record)
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
-    noise = run._known[:, 1] if len(run._known) == 1 else run._known[at, 1]
+    noise = run.known.part(at).noise
     root = 1.0 / np.sqrt(noise)
     return Rows(at, out["phi"][at, :, 0] * np.reshape(root, (-1, 1)), out["y"][at, 0] * root)

@@ -28,6 +28,7 @@ import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
+from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import regressors
@@ -37,14 +38,13 @@ from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.robust import orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.result import Track
 from driftfit.run.track import track
-from driftfit.show.summary import Printed, table_of
+from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.rls import RLS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.run.result import Track
 
 CELLS = 2000
 """At most so many places for breaks are compared at once."""
@@ -189,7 +189,10 @@ def segment(
     """
     if model is None:
         model = Regression(0 if u is None else None, intercept=True)
-    return segmented(track(model, RLS(1.0), y, u, **record), level=level, false=false, shortest=shortest)
+    data = record.pop("data", None)
+    run = track(model, RLS(1.0), y, u, Reading(**record), data=data)
+    assert isinstance(run, Track)
+    return segmented(run, level=level, false=false, shortest=shortest)
 
 
 def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: int | None = None) -> Segmentation:

@@ -30,15 +30,15 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.engine.settings import whole
-from driftfit.judge.compare import burn_in, errors
+from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.attribution import Attribution, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
 from driftfit.judge.statistics.whiteness import whiteness
-from driftfit.run.result import Track, root_mean_square
-from driftfit.show.summary import Printed, facts, table_of
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.show.parts.text import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "constant ARX")
 CORRELATED = 1e-3

@@ -11,7 +11,15 @@ outputs in a row; after that samples cannot be used until real lags are back, be
 away. A missing input makes every sample that needs it unusable. A gap in time above 1.5 nominal intervals makes the
 lags that reach across missing.
 
-Source: Ljung, System Identification (1999), eq. 4.7; the filling rule is ours. Cost per sample: O(na + nb).
+Several outputs (``ny=2``) have a regression each, all on the same regressors, and are bound as `JointARX`:
+
+    phi_t = [y1_{t-1} .. y1_{t-na}, y2_{t-1} .., u1_{t-nk} .., (1)],   yo_t = phi_t' theta_o,t + v_o,t
+
+The outputs are lanes of one tile, so every tracker runs unchanged. Each lane keeps a copy of the lags of all outputs,
+which ``push`` fills from ``y`` of the other lanes, or from their predictions where y is missing.
+
+Source: Ljung, System Identification (1999), eq. 4.7; the filling rule is ours. Cost per sample: O(na + nb), and
+O(ny (ny na + nb)) for the lags of several outputs.
 """
 
 from __future__ import annotations
@@ -50,7 +58,7 @@ class ARX(Model):
         "drop": until the lags are filled nothing happens at all. "zero": the unknown past is zero.
     ny : int or names
         Outputs, columns of y. With several, each has a regression of its own on the lags of all of them and on the
-        inputs (`driftfit.models.joint_arx`).
+        inputs (`JointARX`).
     """
 
     na: int
@@ -100,8 +108,6 @@ class ARX(Model):
         bound = self._bound(inputs)
         if len(self.outputs) == 1:
             return bound
-        from driftfit.models.joint_arx import JointARX
-
         return JointARX.from_settings(bound.settings())
 
     @property
@@ -277,5 +283,86 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
         s.filled[l] = 0.0 if seen else filled + 1.0
         if na > 0:
             s.y_lag[0, l] = y if seen else fill
+
+    return ModelSteps(regress, push)
+
+
+@dataclass(frozen=True)
+class JointARX(ARX):
+    """A bound `ARX` with several outputs."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        own = [f"a{i + 1}[<-{output}]" for output in self.outputs for i in range(self.na)]
+        return (*own, *self._input_names())
+
+    def names_of(self, output: str) -> tuple[str, ...]:
+        named = []
+        for name in self.names:
+            head, _, source = name.partition("[")
+            source = source.removeprefix("<-").removesuffix("]") or ("" if head == "intercept" else "u")
+            named.append(f"{head}[{output}<-{source}]" if source else f"{head}[{output}]")
+        return tuple(named)
+
+    @property
+    def dimensions(self) -> None:  # type: ignore[override]
+        return None
+
+    def memory(self) -> Mapping[str, Any]:
+        count = len(self.outputs)
+        unknown = np.nan if self.start == "drop" else 0.0
+        return {**super().memory(), "y_lag": np.full((count, max(self.na, 1)), unknown), "filled": np.zeros(count)}
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
+
+    def polynomials(self, theta: Array) -> tuple[Array, list[Array]]:
+        raise ValueError("polynomials: A(z) of several outputs is a matrix; take it from run.theta by run.names.")
+
+
+@lru_cache
+def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
+    m = len(lags)
+    nb = tuple(b for b, _ in lags) or (0,)
+    nk = tuple(k for _, k in lags) or (0,)
+    at = tuple(int(ny * na + sum(nb[:j])) for j in range(max(m, 1)))
+    n = ny * na + sum(nb)
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        broken = s.dt[l] > GAP
+        depth = s.u_lag.shape[1]
+        for o in range(ny):
+            for i in range(na):
+                s.y_lag[o, i, l] = np.nan if broken else s.y_lag[o, i, l]
+                s.phi[o * na + i, l] = s.y_lag[o, i, l]
+        for j in range(m):
+            for i in range(depth - 1, 0, -1):
+                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
+            s.u_lag[j, 0, l] = s.u[j, l]
+            for i in range(nb[j]):
+                s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
+        if intercept:
+            s.phi[n, l] = 1.0
+        started = 1.0
+        for i in range(s.phi.shape[0]):
+            started = started if abs(s.phi[i, l]) < LARGEST else s.started[l]
+        s.started[l] = started
+        s.dt[l] = s.dt[l] if started > 0.0 else 0.0
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        for o in range(ny):  # lane o follows output o
+            for i in range(na - 1, 0, -1):
+                s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
+            informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
+            fill = s.y_hat[o] if s.valid[o] > 0.0 and informed and s.filled[o, l] < na else np.nan
+            s.filled[o, l] = 0.0 if s.seen[o] > 0.0 else s.filled[o, l] + 1.0
+            if na > 0:
+                s.y_lag[o, 0, l] = s.y[o] if s.seen[o] > 0.0 else fill
 
     return ModelSteps(regress, push)

@@ -13,30 +13,26 @@ from __future__ import annotations
 import os
 import threading
 import warnings
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Hashable, Iterator, KeysView, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from driftfit.data.record import Records
-from driftfit.engine.drivers import drivers, make_tile, output_type, repeat_tile
+from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array, Driver
 from driftfit.models.base import Model
-from driftfit.results import JudgedMany
-from driftfit.run.result import Track
+from driftfit.run.plain import Plain
+from driftfit.run.program import Program, State, tile_of
+from driftfit.run.result import Lane, Track
 from driftfit.run.warm_start import carried, first_interval
 from driftfit.trackers.base import Tracker
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from driftfit.show.fleet_summary import FleetSummary
 
 BLOCK = 256
 """Samples that are brought into lane order at a time: a block of a tile stays in the second-level cache."""
@@ -54,15 +50,40 @@ SHOWN = 1_000_000
 _thread = threading.local()
 
 
-class Place(NamedTuple):
-    """Where the result of one series is: what was written for its tile, the tile's end state, the lane."""
+class Many(Plain):
+    """Results of many series, from key to `Track` like a dict; ``by`` names what the keys stand for."""
 
-    out: Array
-    tile: Array
-    lane: int
+    failed: dict[Hashable, str]
+    """Why a key has no result."""
+
+    @property
+    def by(self) -> tuple[str, ...]:
+        """Names of what tells the results apart, one for each part of a key."""
+        raise NotImplementedError
+
+    def runs(self) -> dict[Hashable, Track]:
+        """Every single result with its key."""
+        raise NotImplementedError
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Rows that never became samples, by reason."""
+        return dict(sum((Counter(run.labels.dropped) for run in self.runs().values()), Counter()))
+
+    def stack(self, name: str) -> Array:
+        """One result of every series in natural order, (series, T, ...), NaN after a series' end.
+
+        ``name`` is that of an attribute of `Track`: "theta", "std", "prediction", "innovation", "innovation_std".
+        """
+        parts = [np.asarray(getattr(run, name), dtype=float) for run in self.runs().values()]
+        longest = max(len(part) for part in parts)
+        stacked = np.full((len(parts), longest, *parts[0].shape[1:]), np.nan)
+        for row, part in zip(stacked, parts, strict=True):
+            row[: len(part)] = part
+        return stacked
 
 
-class Fleet(JudgedMany):
+class Fleet(Many):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
@@ -70,20 +91,18 @@ class Fleet(JudgedMany):
 
     def __init__(
         self,
-        model: Model,
-        trackers: Sequence[Tracker],
+        programs: Sequence[Program],
         records: Records,
-        places: Sequence[Place | None],
+        lanes: Sequence[Lane | None],
         failed: Mapping[Hashable, str],
-        starts: Mapping[int, Mapping[str, Array]],
+        starts: Mapping[int, State],
     ) -> None:
-        self.model = model
         self.records = records
         self.failed = dict(failed)
-        self._trackers = trackers
-        self._places = places
+        self._programs = programs
+        self._lanes = lanes
         self._starts = starts
-        self._index = {key: k for k, key in enumerate(records.keys) if places[k] is not None}
+        self._index = {key: k for k, key in enumerate(records.keys) if lanes[k] is not None}
 
     def __getitem__(self, key: Hashable) -> Track:
         try:
@@ -93,19 +112,28 @@ class Fleet(JudgedMany):
         return self._track(k)
 
     def _track(self, k: int) -> Track:
-        y, u, time, known = self.records.part(k)
-        place = self._places[k]
-        assert place is not None
-        return Track(
-            self.model, self._trackers[k], y, u, time, known, place.out[: len(y)], place.tile, place.lane,
-            self.records.labels_of(k), self._starts.get(k),
-        )  # fmt: skip
+        record, lane = self.records.part(k), self._lanes[k]
+        assert lane is not None
+        return Track(self._programs[k], record, lane._replace(out=lane.out[: len(record)]), self._starts.get(k))
 
     def _absent(self, key: Hashable) -> str:
         if key in self.failed:
             return f"{key!r} has no result: {self.failed[key]}"
         some = ", ".join(repr(k) for k in list(self._index)[:5])
         return f"the fleet has no {key!r}; it has {len(self)} keys: {some}{', ...' if len(self) > 5 else ''}"
+
+    @property
+    def model(self) -> Model:
+        """The model of all series."""
+        return self._programs[0].model
+
+    @property
+    def by(self) -> tuple[str, ...]:
+        return self.records.labels.by
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        return dict(sum((Counter(counts) for counts in self.records.dropped.values()), Counter()))
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._index
@@ -122,7 +150,7 @@ class Fleet(JudgedMany):
         """Keys and results."""
         return ((key, self._track(k)) for key, k in self._index.items())
 
-    def _runs(self) -> dict[Hashable, Track]:
+    def runs(self) -> dict[Hashable, Track]:
         return dict(self.items())
 
     def __iter__(self) -> Iterator[Hashable]:
@@ -138,90 +166,24 @@ class Fleet(JudgedMany):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return self._trackers[0].names_for(self.model)
-
-    def stack(self, name: str) -> Array:
-        """One result of every series in natural order, (series, T, ...), NaN after a series' end.
-
-        ``name`` is that of an attribute of `Track`: "theta", "std", "prediction", "innovation", "innovation_std".
-        """
-        parts = [np.asarray(getattr(run, name), dtype=float) for run in self.values()]
-        longest = max(len(part) for part in parts)
-        stacked = np.full((len(parts), longest, *parts[0].shape[1:]), np.nan)
-        for row, part in zip(stacked, parts, strict=True):
-            row[: len(part)] = part
-        return stacked
-
-    def to_table(self, kind: str = "polars") -> Any:
-        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.data.export`."""
-        from driftfit.data.export import to_table
-
-        return to_table(self, kind)
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for whatever reads one."""
-        return self.to_table().__arrow_c_stream__(requested_schema)
-
-    def to_parquet(self, path: str | os.PathLike[str]) -> None:
-        """Write the same table as Parquet."""
-        from driftfit.data.export import to_parquet
-
-        to_parquet(self, path)
-
-    def forecast(self, h: int, u: Any = None) -> Any:
-        """The h nominal samples after the end of every series as one polars table, a row a sample.
-
-        Columns: what tells the series apart, ``step`` (1 .. h), the time where the record has one, ``y_hat`` and
-        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
-        inputs (h,) or (h, m), or one array for all; a key that is not in it has none. See `driftfit.use.forecast`.
-        """
-        from driftfit.data.export import forecasts_table
-
-        return forecasts_table(self._runs(), self.records.labels, h, u)
-
-    def crossing(
-        self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,
-        level: float = 0.9,
-    ) -> Any:  # fmt: skip
-        """When a parameter or the output of every series crosses a limit, as one polars table, the first on top.
-
-        Limits are one for all, or a mapping from every key. Columns: what tells the series apart, ``probability``
-        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times where the
-        record has them. See `driftfit.use.crossing`.
-        """
-        from driftfit.use.crossing import crossings
-
-        return crossings(self._runs(), self.records.labels.by, what, below, above, horizon, u, level)
-
-    def summary(self) -> FleetSummary:
-        """Series ranked by how much their parameters moved; print it."""
-        from driftfit.show.fleet_summary import summarise
-
-        return summarise(self)
-
-    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-        """Small multiples of one parameter for the series that moved most; a matplotlib figure."""
-        from driftfit.show.plots import plot_fleet
-
-        return plot_fleet(self, which, most, level)
+        return self._programs[0].names
 
 
 def run_fleet(
-    model: Model,
-    trackers: Sequence[Tracker],
+    programs: Sequence[Program],
     records: Records,
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
     before: Fleet | None = None,
 ) -> Fleet:
-    """Run every series of ``records`` with its tracker and return the results.
+    """Run every series of ``records`` by its program and return the results; all have one bound model.
 
-    ``model`` is bound; ``failed`` gives the reasons of what could not become a series. An interrupt (Ctrl-C) stops the
+    ``failed`` gives the reasons of what could not become a series. An interrupt (Ctrl-C) stops the
     fleet and returns what is finished, with a warning.
     """
-    places: list[Place | None] = [None] * len(trackers)
-    starts, records = _warm(model, trackers, records, before)
-    jobs = [job for group in _groups(model, trackers) for job in _jobs(model, trackers, records, group, keep)]
+    lanes: list[Lane | None] = [None] * len(programs)
+    starts, records = _warm(programs, records, before)
+    jobs = [job for group in _groups(programs) for job in _jobs(programs, records, group, keep)]
     for job in jobs:
         for lane, k in enumerate(job.series):
             for name, value in starts.get(int(k), {}).items():
@@ -231,32 +193,30 @@ def run_fleet(
     for job in jobs:
         if job.done:
             for lane, k in enumerate(job.series[: job.live]):
-                places[k] = Place(job.out, job.tile, lane)
-    absent = {records.keys[k]: "interrupted before it was run" for k, place in enumerate(places) if place is None}
+                lanes[k] = Lane(job.out, job.tile, lane)
+    absent = {records.keys[k]: "interrupted before it was run" for k, lane in enumerate(lanes) if lane is None}
     if absent:
         warnings.warn(
-            f"interrupted: {len(trackers) - len(absent)} of {len(trackers)} series are finished; "
+            f"interrupted: {len(programs) - len(absent)} of {len(programs)} series are finished; "
             "the others are listed in fleet.failed.",
             stacklevel=3,
         )
-    return Fleet(model, trackers, records, places, {**(failed or {}), **absent}, starts)
+    return Fleet(programs, records, lanes, {**(failed or {}), **absent}, starts)
 
 
-def _warm(
-    model: Model, trackers: Sequence[Tracker], records: Records, before: Fleet | None
-) -> tuple[dict[int, dict[str, Array]], Records]:
+def _warm(programs: Sequence[Program], records: Records, before: Fleet | None) -> tuple[dict[int, State], Records]:
     """(fields that each series takes over, by its number; the records with the intervals since the runs before)."""
     if before is None:
         return {}, records
-    starts: dict[int, dict[str, Array]] = {}
-    known = records.known.copy()
+    starts: dict[int, State] = {}
+    factors: dict[int, float] = {}
     for k, key in enumerate(records.keys):
         if key in before:
-            run = before[key]
-            starts[k] = carried(run, model, trackers[k])
+            run, first = before[key], int(records.first[k])
+            (starts[k],) = carried(run, [programs[k]])
             if records.time is not None:
-                known[records.first[k], 0] *= first_interval(run, records.time[records.first[k]], records.labels)
-    return starts, replace(records, known=known)
+                factors[first] = first_interval(run, records.time[first], records.labels)
+    return starts, replace(records, known=records.known.begun(factors))
 
 
 class Job:
@@ -271,51 +231,49 @@ class Job:
         self.done = False
 
 
-def _groups(model: Model, trackers: Sequence[Tracker]) -> list[list[int]]:
+def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
     kinds: dict[Tracker, Any] = {}
-    for k, tracker in enumerate(trackers):
-        if tracker not in kinds:
-            shapes = tuple((name, np.shape(value)) for name, value in tracker.state_for(model).items())
-            kinds[tracker] = (tracker.steps_for(model), tracker.outputs, shapes)
-        groups[kinds[tracker]].append(k)
+    for k, program in enumerate(programs):
+        if program.tracker not in kinds:
+            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
+        groups[kinds[program.tracker]].append(k)
     return list(groups.values())
 
 
-def lanes(tracker: Tracker, model: Model, count: int) -> int:
+def width_of(program: Program, count: int) -> int:
     """Lanes of the tiles for ``count`` series."""
-    return 1 if count < FEWEST or model.n > LARGEST else tracker.width
+    return 1 if count < FEWEST or program.model.n > LARGEST else program.tracker.width
 
 
-def _jobs(
-    model: Model, trackers: Sequence[Tracker], records: Records, group: Sequence[int], keep: str
-) -> Iterator[Job]:
+def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str) -> Iterator[Job]:
     """Tiles for the series of one group, longest first."""
-    tracker = trackers[group[0]]
-    L = lanes(tracker, model, len(group))
+    program = programs[group[0]]
+    L = width_of(program, len(group))
     order = np.array(group)[np.argsort(-records.length[group], kind="stable")]
     padded = np.concatenate([order, np.full(-len(order) % L, order[-1])]).reshape(-1, L)
-    tiles = _tiles(model, trackers, padded)
+    tiles = _tiles(programs, padded)
     longest = records.length[padded[:, 0]]
     ends = np.cumsum(longest)
     # one allocation for all tiles, so that it is large enough for huge pages
-    out = np.empty(int(ends[-1]), output_type(tiles[:1], tracker.outputs, keep))
-    run = drivers(model.steps, tracker.steps_for(model), keep).run
+    out = program.written(tiles[:1], int(ends[-1]), keep)
+    run = program.drivers(keep).run
     for k, series in enumerate(padded):
         live = min(L, len(order) - k * L)
         yield Job(run, tiles[k : k + 1], series, live, out[ends[k] - longest[k] : ends[k]])
 
 
-def _tiles(model: Model, trackers: Sequence[Tracker], padded: Array) -> Array:
+def _tiles(programs: Sequence[Program], padded: Array) -> Array:
     """Tiles at their start, one record per row of ``padded``."""
     count, L = padded.shape
-    starts = {tracker: tracker.state_for(model) for tracker in {trackers[k] for k in padded.ravel()}}
-    first = starts[trackers[padded[0, 0]]]
-    tiles = repeat_tile(make_tile(model.n, model.m, model.memory(), [first] * L), count)
-    if len(starts) > 1:
-        for name in first:
-            values = np.array([starts[trackers[k]][name] for k in padded.ravel()])
+    some = {programs[k].tracker: programs[k] for k in padded.ravel()}
+    first = programs[padded[0, 0]]
+    tiles = repeat_tile(tile_of([first] * L), count)
+    if len(some) > 1:
+        starts = {tracker: tracker.state_for(first.model) for tracker in some}
+        for name in starts[first.tracker]:
+            values = np.array([starts[programs[k].tracker][name] for k in padded.ravel()])
             tiles[name][...] = np.moveaxis(values.reshape(count, L, *values.shape[1:]), 1, -1)
     return tiles
 
@@ -351,11 +309,12 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     """Run one tile over its first ``stop`` samples, block by block."""
     L = len(job.series)
     first, length = records.first[job.series], records.length[job.series]
-    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(records.known)), records.known.shape[1])
+    columns = records.known.columns
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(columns)), columns.shape[1])
     finals: dict[int, Array] = {}
     bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
-        _gather(records.y, records.u, records.known, first, length, a, b, y, u, known)
+        _gather(records.y, records.u, columns, first, length, a, b, y, u, known)
         factors = known if len(known) == 1 else known[: b - a]
         job.run(job.tile, y[: b - a], u[: b - a], factors, job.out[a:b])
         for lane in np.flatnonzero(length == b).tolist():

@@ -10,36 +10,32 @@ the joint run used, with everything that a Track can do.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.record import PLAIN, Labels
+from driftfit.data.known import Known
+from driftfit.data.record import Labels, Record
 from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.results import JudgedMany
-from driftfit.run.output_lanes import Starts, drive, end_of, joint_tile, parameter_names, shown
-from driftfit.run.result import Track
-from driftfit.run.warm_start import End, fresh_tile
-from driftfit.smooth.parts.walk import COLLECTED, collect
-from driftfit.smooth.smoothed import Smoothed
+from driftfit.run.fleet import Many
+from driftfit.run.output_lanes import shown
+from driftfit.run.program import Program, State, state_of, tile_of
+from driftfit.run.result import Lane, Track, names_of
+from driftfit.run.seen import COLLECTED, collect
+from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-    from driftfit.use.forecast import Forecast
-
-
-class Outputs(JudgedMany):
+class Outputs(Many):
     """A record with several outputs, each with a theta of its own.
 
     Attributes
@@ -56,17 +52,45 @@ class Outputs(JudgedMany):
     """
 
     def __init__(
-        self, model: Model, trackers: tuple[Tracker, ...], y: Array, u: Array, time: Array | None, known: Array,
-        out: Array, tile: Array, starts: Starts = (), labels: Labels = PLAIN,
-    ) -> None:  # fmt: skip
-        self.model, self.trackers, self.y, self.u = model, trackers, y, u
-        self._time, self._known, self._out, self._tile = time, known, out, tile
-        self._starts, self.labels = starts, labels
-        self.outputs = model.outputs
-        self.names = parameter_names(model, trackers)
+        self, programs: Sequence[Program], record: Record, out: Array, tile: Array, starts: Sequence[State] = ()
+    ) -> None:
+        self.programs, self.record, self.starts = tuple(programs), record, tuple(starts)
+        self._out, self._tile = out, tile
+        self.failed = {}
+        self.outputs = self.model.outputs
+        self.names = tuple(one.names for one in self.programs)
+
+    @property
+    def model(self) -> Model:
+        return self.programs[0].model
+
+    @property
+    def trackers(self) -> tuple[Tracker, ...]:
+        return tuple(one.tracker for one in self.programs)
+
+    @property
+    def y(self) -> Array:
+        return self.record.y
+
+    @property
+    def u(self) -> Array:
+        return self.record.u
+
+    @property
+    def labels(self) -> Labels:
+        return self.record.labels
+
+    @property
+    def timed(self) -> bool:
+        """Whether samples have times; else `time` counts them."""
+        return self.record.time is not None
+
+    @property
+    def by(self) -> tuple[str, ...]:
+        return ("output",)
 
     def __len__(self) -> int:
-        return len(self.y)
+        return len(self.record)
 
     def __repr__(self) -> str:
         used = ", ".join(f"{name} {int(ok)}" for name, ok in zip(self.outputs, self.ok.sum(axis=0), strict=True))
@@ -106,29 +130,29 @@ class Outputs(JudgedMany):
     @property
     def time(self) -> Array:
         """Times given, or sample numbers."""
-        return np.arange(len(self)) if self._time is None else self._time
+        return np.arange(len(self)) if self.record.time is None else self.record.time
 
     @cached_property
     def loglik(self) -> float:
         """Sum over the outputs: their noises are taken to be independent."""
-        return sum(track.loglik for track in self)
+        return sum(track.loglik for track in self.values())
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, ny, n): pointwise bands of theta at this level."""
-        low, high = zip(*(track.band(level) for track in self), strict=True)
+        low, high = zip(*(track.band(level) for track in self.values()), strict=True)
         return np.stack(low, axis=1), np.stack(high, axis=1)
 
     def cov(self, t: int) -> Array:
         """Covariances (ny, n, n) of the theta of each output after sample t."""
-        return np.array([track.cov(t) for track in self])
+        return np.array([track.cov(t) for track in self.values()])
 
     @cached_property
     def _seen(self) -> Array:
         """What the tracker saw: the regressors, which all outputs share."""
-        steps = self.trackers[0].steps_for(self.model)._replace(store=collect)
-        tile = joint_tile(self.model, self.trackers, self._starts)
+        steps = self.programs[0].steps._replace(store=collect)
+        tile = tile_of(self.programs, self.starts)
         out = np.empty(len(self), output_type(tile, COLLECTED))
-        drive(self.model, steps, "std", tile, self.y, self.u, self._known, out)
+        self.programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
     def __getitem__(self, output: str | int) -> Track:
@@ -143,69 +167,62 @@ class Outputs(JudgedMany):
 
     def _track(self, lane: int) -> Track:
         """One output by itself, as a regression where the others are among its regressors."""
-        tracker, alone, u = self.trackers[lane], self.model.alone(self.outputs[lane]), self.u
-        known, names = self._known[..., lane].copy(), self.labels.u
+        alone, u = self.programs[lane].alone, self.u
+        known, names = Known(self.record.known.columns[..., lane]), self.labels.u
         if alone is None:
             seen, names = self._seen, self.names[lane]
-            alone, known[:, 0] = Regression(names), seen["dt"][:, lane]
+            alone, known = Program(Regression(names), self.trackers[lane]), known.changed(interval=seen["dt"][:, lane])
             u = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
-        tile = fresh_tile(alone, tracker)
-        shapes = {name: tile[name].shape[:-1] for name in storage.fields(tile) if name != "u"}
-        own = [name for name, shape in shapes.items() if shape == self._tile[name].shape[:-1]]
+        tile = alone.tile()
+        shapes = {name: value.shape for name, value in state_of(tile).items() if name != "u"}
+        state = state_of(self._tile, lane)
+        own = [name for name, shape in shapes.items() if shape == state[name].shape]
         for name in own:
-            tile[name][0, ..., 0] = self._tile[name][0, ..., lane]
-        out = np.empty(len(self), output_type(tile, tracker.outputs, "cov" if "P" in names_of(self._out) else "std"))
+            tile[name][0, ..., 0] = state[name]
+        out = alone.written(tile, len(self), "cov" if "P" in names_of(self._out) else "std")
         for name in names_of(out):
             out[name][..., 0] = self._out[name][..., lane]
-        start = {name: value for name, value in self._starts[lane].items() if name in own} if self._starts else None
+        start = {name: value for name, value in self.starts[lane].items() if name in own} if self.starts else None
         others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
         missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
         labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing)
-        return Track(alone, tracker, self.y[:, lane], u, self._time, known, out, tile, 0, labels, start)
+        record = Record(self.y[:, lane], u, known, self.record.time, labels)
+        return Track(alone, record, Lane(out, tile), start)
 
-    def __iter__(self) -> Iterator[Track]:
-        return iter(self._tracks)
+    def keys(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.outputs
 
-    def _runs(self) -> dict[Hashable, Track]:
-        return dict(zip(self.outputs, self, strict=True))
+    def values(self) -> tuple[Track, ...]:
+        """The record of each output."""
+        return self._tracks
 
-    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
-        """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""
-        return {name: self[name].smooth(keep, order_by, undetermined) for name in self.outputs}
+    def items(self) -> Iterator[tuple[str, Track]]:
+        """Names and records of the outputs."""
+        return zip(self.outputs, self._tracks, strict=True)
 
-    def forecast(self, h: int, u: Any = None) -> Forecast:
-        """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
-        from driftfit.use.forecast import forecast_outputs
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
 
-        return forecast_outputs(self, h, u)
+    def __contains__(self, output: object) -> bool:
+        return output in self.outputs
+
+    def runs(self) -> dict[Hashable, Track]:
+        return dict(self.items())
 
     def end(self) -> End:
-        """Where the run ended, for another one to begin (`warm_start`); fields have the output as their last axis."""
-        return end_of(self.model, self.trackers, self._tile, None if self._time is None else self._time[-1])
-
-    def summary(self) -> str:
-        """The summaries of all outputs."""
-        return "\n\n".join(f"{name}\n{self[name].summary()}" for name in self.outputs)
-
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands: a row of pictures for each output."""
-        from driftfit.show.plots import plot_outputs
-
-        return plot_outputs(self, level)
-
-    def to_table(self, kind: str = "polars") -> Any:
-        """The results as one table, a row a sample; see `driftfit.data.export.outputs_table`."""
-        from driftfit.data.export import outputs_table
-
-        return outputs_table(self, kind)
+        """Where the run ended, for another one to begin (`warm_start`)."""
+        lanes = range(len(self.outputs))
+        states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
+        return End(self.programs, states, None if self.record.time is None else self.record.time[-1])
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file, without pickle; complete or not at all."""
-        arrays = {"y": self.y, "u": self.u, "known": self._known}
-        arrays |= {} if self._time is None else {"time": self._time}
+        arrays = {"y": self.y, "u": self.u, "known": self.record.known.columns}
+        arrays |= {} if self.record.time is None else {"time": self.record.time}
         arrays |= {f"out_{name}": self._out[name] for name in names_of(self._out)}
         arrays |= {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
-        for lane, start in enumerate(self._starts):
+        for lane, start in enumerate(self.starts):
             arrays |= {f"start{lane}_{name}": value for name, value in start.items()}
         header: dict[str, Any] = {"model": storage.describe(self.model)}
         header |= {"trackers": [storage.describe(one) for one in self.trackers]}
@@ -217,27 +234,26 @@ class Outputs(JudgedMany):
         """Read what `save` wrote."""
         header, arrays = storage.read(path, "outputs of a record")
         model = storage.rebuild(header["model"], Model)
-        trackers = tuple(storage.rebuild(one, Tracker) for one in header["trackers"])
-        tile = joint_tile(model, trackers)
-        storage.restore(path, trackers[0], arrays, "state_", {n: tile[n][0] for n in storage.fields(tile)})
-        out = np.empty(len(arrays["y"]), output_type(tile, trackers[0].outputs, header["keep"]))
-        storage.restore(path, trackers[0], arrays, "out_", {name: out[name] for name in names_of(out)})
-        lanes = [f"start{lane}_" for lane in range(len(trackers))]
+        programs = [Program(model, storage.rebuild(one, Tracker)) for one in header["trackers"]]
+        tracker, tile = programs[0].tracker, tile_of(programs)
+        storage.restore(path, tracker, arrays, "state_", {n: tile[n][0] for n in storage.fields(tile)})
+        out = programs[0].written(tile, len(arrays["y"]), header["keep"])
+        storage.restore(path, tracker, arrays, "out_", {name: out[name] for name in names_of(out)})
+        lanes = [f"start{lane}_" for lane in range(len(programs))]
         starts = [{n.removeprefix(lane): arrays[n] for n in arrays if n.startswith(lane)} for lane in lanes]
         labels = Labels(**header["labels"])
-        return cls(
-            model, trackers, arrays["y"], arrays["u"], arrays.get("time"), arrays["known"], out, tile,
-            starts if starts[0] else (), labels,
-        )  # fmt: skip
+        record = Record(arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), labels)
+        return cls(programs, record, out, tile, starts if starts[0] else ())
 
 
-def names_of(records: Array) -> tuple[str, ...]:
-    """Fields of an array of records."""
-    return records.dtype.names or ()
+def lanes_of(record: Record) -> tuple[Array, Array, Array]:
+    """(y, u, known) of a record of outputs, y (T, ny), known (T, k, ny): every lane gets the same inputs u (T, m)."""
+    return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
 
 
 def missing(name: str, output: str) -> str:
     """What to say of an attribute that a run of several outputs does not have."""
-    if hasattr(Track, name):
+    if hasattr(Track.public(), name):
         return f"{name} is of one output at a time: run[{output!r}].{name}"
-    return f"a run of several outputs has no {name!r}; {near(name, [one for one in dir(Outputs) if one[0] != '_'])}"
+    known = [one for one in dir(Outputs.public()) if one[0] != "_"]
+    return f"a run of several outputs has no {name!r}; {near(name, known)}"

@@ -1,36 +1,51 @@
-"""Track: the result of a run, the same whatever ran."""
+"""Track as plain data: the result of a run, the same whatever ran. Its verbs are in `driftfit.results`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.record import PLAIN, Labels, time_text
-from driftfit.engine.drivers import drivers, output_type
+from driftfit.data.known import Known
+from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.results import Judged
-from driftfit.run.warm_start import End, fresh_tile
+from driftfit.run.plain import Plain
+from driftfit.run.program import Program, State, lane_of, state_of
+from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-    from driftfit.models.hammerstein_wiener.separation.paths import Blocks
-    from driftfit.show.summary import Summary
-    from driftfit.smooth.smoothed import Smoothed
-    from driftfit.trackers.bank.results.results import Hypotheses
-    from driftfit.use.forecast import Forecast
+class Lane(NamedTuple):
+    """Where the result of one series is: what was written for its tile, the tile's end state, the lane."""
+
+    out: Array
+    tile: Array
+    lane: int = 0
+
+    def written(self, name: str) -> Array:
+        """A field of what the driver wrote."""
+        field: Array = self.out[name][..., self.lane]
+        return field
+
+    def alone(self, program: Program) -> Lane:
+        """A copy in a tile of its own, without the series beside it."""
+        if self.tile["theta"].shape[-1] == 1:
+            return self
+        tile = program.tile(state_of(self.tile, self.lane))
+        out = program.written(tile, len(self.out), "cov" if "P" in names_of(self.out) else "std")
+        for name in names_of(out):
+            out[name][..., 0] = self.written(name)
+        return Lane(out, tile)
 
 
-class Track(Judged):
+class Track(Plain):
     """Parameters of a record, sample by sample.
 
     Attributes
@@ -48,59 +63,77 @@ class Track(Judged):
         Names of the parameters.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        tracker: Tracker,
-        y: Array,
-        u: Array,
-        time: Array | None,
-        known: Array,
-        out: Array,
-        tile: Array,
-        lane: int = 0,
-        labels: Labels = PLAIN,
-        start: Mapping[str, Array] | None = None,
-    ) -> None:
-        self.model = model
-        self.tracker = tracker
-        self.y = y
-        self.u = u
-        self._time = time
-        self._known = known
-        self._out = out
-        self._tile = tile
+    def __init__(self, program: Program, record: Record, lane: Lane, start: State | None = None) -> None:
+        self.program, self.record, self.start = program, record, start
         self._lane = lane
-        self.labels = labels
-        self._start = start
 
     def __reduce__(self) -> Any:
         """A copy, and what is sent to another process, leaves the other series of a fleet's tile behind."""
-        out, tile = self._out, self._tile
-        if tile["theta"].shape[-1] > 1:
-            tile = fresh_tile(self.model, self.tracker)
-            for name in storage.fields(tile):
-                tile[name][0, ..., 0] = self._tile[name][0, ..., self._lane]
-            out = np.empty(len(self), output_type(tile, self.tracker.outputs, "cov" if "P" in _names(out) else "std"))
-            for name in _names(out):
-                out[name][..., 0] = self._written(name)
-        signals = (self.y, self.u, self._time, self._known)
-        return type(self), (self.model, self.tracker, *signals, out, tile, 0, self.labels, self._start)
+        return type(self), (self.program, self.record, self._lane.alone(self.program), self.start)
 
-    def _written(self, name: str) -> Array:
-        """A field of what the driver wrote, for this lane."""
-        field: Array = self._out[name][..., self._lane]
-        return field
+    @property
+    def model(self) -> Model:
+        return self.program.model
+
+    @property
+    def tracker(self) -> Tracker:
+        return self.program.tracker
+
+    @property
+    def y(self) -> Array:
+        return self.record.y
+
+    @property
+    def u(self) -> Array:
+        return self.record.u
+
+    @property
+    def labels(self) -> Labels:
+        """What signals are called, in which units they are, and what was left out."""
+        return self.record.labels
+
+    @property
+    def known(self) -> Known:
+        """What was known of every sample beside its signals."""
+        return self.record.known
+
+    @property
+    def timed(self) -> bool:
+        """Whether samples have times; else `time` counts them."""
+        return self.record.time is not None
+
+    @property
+    def keeps_cov(self) -> bool:
+        """Whether the covariance of every sample was stored (``keep="cov"``)."""
+        return "P" in names_of(self._lane.out)
+
+    @property
+    def last(self) -> Any:
+        """The time of the last sample; None where samples have none."""
+        return None if self.record.time is None else self.record.time[-1]
+
+    @property
+    def state(self) -> dict[str, Array]:
+        """The state after the last sample, field by field; views, not to be written to."""
+        return state_of(self._lane.tile, self._lane.lane)
+
+    def written(self, name: str) -> Array:
+        """A field of what the driver wrote of every sample, (T, ..): one of the tracker's ``outputs``, for example."""
+        return self._lane.written(name)
+
+    def stores(self) -> tuple[str, ...]:
+        """Names of these fields."""
+        return names_of(self._lane.out)
 
     def __len__(self) -> int:
-        return len(self.y)
+        return len(self.record)
 
     def __repr__(self) -> str:
         return f"Track of {len(self)} samples, {int(self.ok.sum())} used: {self.model!r}, {self.tracker!r}"
 
     @property
     def names(self) -> tuple[str, ...]:
-        return self.tracker.names_for(self.model)
+        return self.program.names
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -113,7 +146,7 @@ class Track(Judged):
     @property
     def time(self) -> Array:
         """Times given, or sample numbers."""
-        return np.arange(len(self)) if self._time is None else self._time
+        return np.arange(len(self)) if self.record.time is None else self.record.time
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
@@ -121,27 +154,37 @@ class Track(Judged):
 
     @property
     def theta(self) -> Array:
-        return self._written("theta")
+        return self.written("theta")
+
+    @property
+    def var(self) -> Array:
+        """(T, n): variances of the parameters."""
+        return self.written("var")
 
     @cached_property
     def std(self) -> Array:
-        return np.sqrt(self._written("var"))
+        return np.sqrt(self.var)
 
     @property
     def prediction(self) -> Array:
-        return self._written("y_hat")
+        return self.written("y_hat")
 
     @property
     def innovation(self) -> Array:
-        return self._written("e")
+        return self.written("e")
+
+    @property
+    def innovation_var(self) -> Array:
+        """(T,): variances of the innovations."""
+        return self.written("s")
 
     @cached_property
     def innovation_std(self) -> Array:
-        return np.sqrt(self._written("s"))
+        return np.sqrt(self.innovation_var)
 
     @cached_property
     def ok(self) -> Array:
-        return self._written("ok") > 0.0
+        return self.written("ok") > 0.0
 
     @cached_property
     def loglik(self) -> float:
@@ -153,8 +196,8 @@ class Track(Judged):
         if not self.tracker.covariance:
             return float("nan")
         total = np.nansum(self.log_density)
-        if "F" in _names(self._tile):
-            total -= 0.5 * np.sum(np.log(self._tile["F"][..., self._lane]))
+        if "F" in self.state:
+            total -= 0.5 * np.sum(np.log(self.state["F"]))
         return float(total)
 
     @cached_property
@@ -164,12 +207,12 @@ class Track(Judged):
         The Gaussian one of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses that of
         their mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
-        s = self._written("s")
+        s = self.innovation_var
         counted = self.ok & np.isfinite(s) & (s > 0.0)
-        own = self.tracker.log_density(self._out)
+        own = self.tracker.log_density(self._lane.out)
         with np.errstate(invalid="ignore", divide="ignore"):
             gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
-        terms = np.where(counted, gaussian if own is None else own[:, self._lane], np.nan)
+        terms = np.where(counted, gaussian if own is None else own[:, self._lane.lane], np.nan)
         if hasattr(self.model, "log_jacobian") and not self.tracker.output_error:
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
@@ -190,161 +233,96 @@ class Track(Judged):
         if not -T <= t < T:
             raise IndexError(f"cov: t must be within the record of {T} samples; got {t}.")
         t %= T
-        if "P" in _names(self._out):
-            return np.array(self._written("P")[t])
+        if self.keeps_cov:
+            return np.array(self.written("P")[t])
         return self.tracker.cov(self.lane(t))
+
+    def covariances(self) -> Array:
+        """Covariances (T, n, n) of theta after every sample; replays the record unless they were kept."""
+        return self.written("P") if self.keeps_cov else self.program.run(self.fresh(), self.record, "cov")["P"][..., 0]
 
     def lane(self, t: int) -> dict[str, Array]:
         """The state after sample t, field by field; replays the record up to t, O(t)."""
-        t %= len(self)
-        tile = self._fresh_tile()
-        out = np.empty(t + 1, output_type(tile, self.tracker.outputs))
-        known = self._known if len(self._known) == 1 else self._known[: t + 1]
-        run = drivers(self.model.steps, self.tracker.steps_for(self.model)).run
-        run(tile, self.y[: t + 1, None], self.u[: t + 1, :, None], known[:, :, None], out)
-        return {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
+        tile = self.fresh()
+        record = self.record.part(slice(0, t % len(self) + 1))
+        self.program.drivers().run(tile, *lane_of(record), self.program.written(tile, len(record)))
+        return state_of(tile)
 
-    @property
-    def hypotheses(self) -> Hypotheses:
-        """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
-        if not self.tracker.weighs:
-            raise ValueError(f"hypotheses: {type(self.tracker).__name__} has no hypotheses; track with a Bank.")
-        from driftfit.trackers.bank.results.results import Hypotheses
-
-        return Hypotheses(self)
-
-    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
-        """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.
-
-        The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
-        each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
-        time; the samples are sorted by it, smoothed in that order, and put back. ``undetermined``: what to give for
-        parameters that the record does not determine, whose std is inf: "min_norm", the answer nearest to theta0;
-        "nan"; or "raise". A `Bank` is smoothed given the events that it found
-        (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for another tracker that is no random
-        walk in Gaussian noise.
-        """
-        from driftfit.smooth.smoothed import Smoothed
-
-        if self._start is not None:
-            raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
-        if self.tracker.weighs:
-            return cast("Smoothed", self.hypotheses.smooth())
-        return Smoothed.of(self, keep, order_by, undetermined)
-
-    def forecast(self, h: int, u: Any = None) -> Forecast:
-        """theta and y at the h nominal samples after the record, u (h,) or (h, m) being the inputs then."""
-        from driftfit.use.forecast import forecast
-
-        return forecast(self, h, u)
-
-    def _fresh_tile(self) -> Array:
+    def fresh(self) -> Array:
         """A tile of one lane as it was before the first sample."""
-        return fresh_tile(self.model, self.tracker, self._start)
+        return self.program.tile(self.start)
+
+    def again(self, y: Array) -> Self:
+        """The same run over another output, without its times."""
+        tile, record = self.fresh(), replace(self.record, y=y, time=None)
+        return type(self)(self.program, record, Lane(self.program.run(tile, record), tile), self.start)
 
     def end(self) -> End:
         """Where the run ended, for another one to begin (`warm_start`)."""
-        state = {name: self._tile[name][0, ..., self._lane].copy() for name in storage.fields(self._tile)}
-        return End(self.model, self.tracker, state, None if self._time is None else self._time[-1])
-
-    def summary(self) -> Summary:
-        """Parameters now, and one-step errors beside what one would otherwise do; print it."""
-        from driftfit.show.summary import summarise
-
-        return summarise(self)
-
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, prediction against output, innovations; a matplotlib figure."""
-        from driftfit.show.plots import plot_track
-
-        return plot_track(self, level)
-
-    def to_table(self, kind: str = "polars") -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row a sample; see `driftfit.data.export`."""
-        from driftfit.data.export import to_table
-
-        return to_table(self, kind)
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for whatever reads one."""
-        return self.to_table().__arrow_c_stream__(requested_schema)
-
-    def to_parquet(self, path: str | PathLike[str]) -> None:
-        """Write the same table as Parquet."""
-        from driftfit.data.export import to_parquet
-
-        to_parquet(self, path)
+        return End((self.program,), ({name: value.copy() for name, value in self.state.items()},), self.last)
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
         convert = getattr(self.model, "polynomials", None)
         if convert is None:
             raise ValueError(f"polynomials: {type(self.model).__name__} has no polynomials; use ARX.")
-        return cast("tuple[Array, list[Array]]", convert(self.theta))
-
-    def blocks(
-        self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0
-    ) -> Blocks:
-        """Coefficients of the blocks of a `HammersteinWiener` model, sample by sample: ``.a``, ``.b``, ``.c``, ``.d``.
-
-        ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see
-        `driftfit.models.hammerstein_wiener.separation.separate`; ``input``, ``output`` and ``at`` choose the gauge,
-        see `driftfit.models.hammerstein_wiener.separation.paths.Blocks.gauge`; None is "unit", or "c1" for a tracker
-        that follows the minimal parameters.
-        """
-        from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-
-        return blocks_of(self, method, input, output, at)
-
-    def plot_blocks(self, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
-        """The static curves at some samples, and the coefficients over time; a matplotlib figure."""
-        from driftfit.models.hammerstein_wiener.results.plots import plot_blocks
-
-        return plot_blocks(self, method, times)
+        A, B = convert(self.theta)
+        return A, B
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file, without pickle; complete or not at all."""
-        storage.write(path, *self.written())
+        storage.write(path, *self.stored())
 
-    def written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+    def stored(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """(header, arrays): what `save` writes."""
         header = {
             "kind": "track",
             "model": storage.describe(self.model),
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
-            "keep": "cov" if "P" in _names(self._out) else "std",
+            "keep": "cov" if self.keeps_cov else "std",
         }
-        arrays = {"y": self.y, "u": self.u, "known": self._known}
-        if self._time is not None:
-            arrays["time"] = self._time
-        arrays |= {f"out_{name}": self._written(name) for name in _names(self._out)}
-        arrays |= {f"state_{name}": self._tile[name][0, ..., self._lane] for name in storage.fields(self._tile)}
-        arrays |= {f"start_{name}": value for name, value in (self._start or {}).items()}
+        arrays = {"y": self.y, "u": self.u, "known": self.known.columns}
+        if self.record.time is not None:
+            arrays["time"] = self.record.time
+        arrays |= {f"out_{name}": self.written(name) for name in self.stores()}
+        arrays |= {f"state_{name}": value for name, value in self.state.items()}
+        arrays |= {f"start_{name}": value for name, value in (self.start or {}).items()}
         return header, arrays
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read what `save` wrote."""
-        return cls.from_written(path, *storage.read(path, "track"))
+        return cls.from_stored(path, *storage.read(path, "track"))
 
     @classmethod
-    def from_written(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        """The inverse of `written`; ``path`` is for the message of an error."""
-        model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
-        tile = fresh_tile(model, tracker)
-        state = {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
-        storage.restore(path, tracker, arrays, "state_", state)
-        out = np.empty(len(arrays["y"]), output_type(tile, tracker.outputs, header["keep"]))
-        storage.restore(path, tracker, arrays, "out_", {name: out[name][..., 0] for name in _names(out)})
+    def from_stored(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        """The inverse of `stored`; ``path`` is for the message of an error."""
+        program = Program(storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker))
+        record = Record(
+            arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
+        )
+        tile = program.tile()
+        storage.restore(path, program.tracker, arrays, "state_", state_of(tile))
+        out = program.written(tile, len(record), header["keep"])
+        storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
         start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
-        return cls(
-            model, tracker, arrays["y"], arrays["u"], arrays.get("time"), arrays["known"], out, tile,
-            labels=Labels(**header["labels"]), start=start or None,
-        )  # fmt: skip
+        return cls(program, record, Lane(out, tile), start or None)
 
 
-def _names(records: Array) -> tuple[str, ...]:
+def track_record(program: Program, record: Record, keep: str = "std", start: State | None = None) -> Track:
+    """Run a checked record from the tracker's start, or from given fields."""
+    tile = program.tile(start)
+    return Track(program, record, Lane(program.run(tile, record, keep), tile), start)
+
+
+def burn_in(n: int) -> int:
+    """Samples at the start of a run of n parameters that are not judged: they show where it began."""
+    return max(50, 5 * n)
+
+
+def names_of(records: Array) -> tuple[str, ...]:
+    """Fields of an array of records."""
     return records.dtype.names or ()
 
 

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, ItemsView, Iterator, KeysView, Mapping, Sequence, ValuesView
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.data.clock import LABEL, Clock, warn_of_gaps
+from driftfit.data.known import INTERVAL, Known
 from driftfit.data.labels import Held, held, order_of, ordered, times_of, together
 from driftfit.data.limits import Limits, within_each
-from driftfit.data.record import PLAIN, Labels, Reading
-from driftfit.data.signals import as_inputs, as_numbers, factor, intervals, noise_of
-from driftfit.engine.drivers import output_type
+from driftfit.data.record import PLAIN, Labels, Reading, Record
+from driftfit.data.signals import as_inputs, intervals, noise_of
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
-from driftfit.results import JudgedMany
-from driftfit.run.output_lanes import drive, joint_tile, taken_over, trackers_of
-from driftfit.run.outputs import Outputs
-from driftfit.run.result import Track
+from driftfit.run.fleet import Many
+from driftfit.run.output_lanes import programs_of
+from driftfit.run.outputs import Outputs, lanes_of
+from driftfit.run.program import Program, tile_of
+from driftfit.run.result import Track, track_record
 from driftfit.run.shared_outputs import Shared, row_model
-from driftfit.run.warm_start import Run, first_interval
-from driftfit.show.fleet_summary import FleetSummary, summary_of
+from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
 
@@ -43,7 +43,7 @@ class Signals(NamedTuple):
     labels: Labels = PLAIN
 
 
-class OutputsFleet(JudgedMany, dict[Hashable, Any]):
+class OutputsFleet(Many):
     """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result.
 
     Verdict, diagnosis, summary and report are over every output of every record, with keys (key, output); over every
@@ -51,37 +51,58 @@ class OutputsFleet(JudgedMany, dict[Hashable, Any]):
     """
 
     def __init__(
-        self, runs: Mapping[Hashable, Any], failed: Mapping[Hashable, str], by: Sequence[str] = ("series",)
-    ) -> None:
-        super().__init__(runs)
-        self.failed, self.by = dict(failed), tuple(by)
+        self, records: Mapping[Hashable, Outputs | Shared], failed: Mapping[Hashable, str],
+        by: Sequence[str] = ("series",),
+    ) -> None:  # fmt: skip
+        self._records, self._by, self.failed = dict(records), tuple(by), dict(failed)
+
+    @property
+    def by(self) -> tuple[str, ...]:
+        return self._by
+
+    @property
+    def model(self) -> Model:
+        """The model of all records."""
+        return next(iter(self._records.values())).model
 
     def __repr__(self) -> str:
         return f"Records of several outputs: {', '.join(map(repr, self))}"
 
-    def _runs(self) -> dict[Hashable, Track]:
+    def __getitem__(self, key: Hashable) -> Outputs | Shared:
+        return self._records[key]
+
+    def __iter__(self) -> Iterator[Hashable]:
+        return iter(self._records)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._records
+
+    def keys(self) -> KeysView[Hashable]:
+        """Keys of the records that have a result."""
+        return self._records.keys()
+
+    def values(self) -> ValuesView[Outputs | Shared]:
+        """The results."""
+        return self._records.values()
+
+    def items(self) -> ItemsView[Hashable, Outputs | Shared]:
+        """Keys and results."""
+        return self._records.items()
+
+    def runs(self) -> dict[Hashable, Track]:
         found: dict[Hashable, Track] = {}
-        for key, run in self.items():
-            found |= {key: run.rows} if run.model.shared else {(key, name): run[name] for name in run.outputs}
+        for key, run in self._records.items():
+            found |= {key: run.rows} if isinstance(run, Shared) else {(key, name): run[name] for name in run.outputs}
         return found
-
-    def summary(self) -> FleetSummary:
-        """Which outputs of which records moved most; printing it shows the first twenty."""
-        model = next((repr(run.model) for run in self.values()), "")
-        return summary_of(self._runs(), model, self.failed, {})
-
-    def to_table(self, kind: str = "polars") -> Any:
-        """All results as one table, the keys first."""
-        from driftfit.data.export import outputs_table
-
-        return outputs_table(self, kind)
 
 
 def track_outputs(
     model: Model, tracker: Any, y: Any, u: Any, data: Any, by: Any, reading: Reading, keep: str, before: Any
-) -> Any:
+) -> Outputs | Shared | OutputsFleet:
     """Follow a model with several outputs; the arguments are those of `track`."""
-    one_of("track", "keep", keep, ("std", "cov"))
     failed: Mapping[Hashable, str] = {}
     if reading.units is not None:
         raise ValueError("track: units= is not supported for several outputs.")
@@ -102,31 +123,30 @@ def track_outputs(
         return OutputsFleet({k: run_one(model, one, found[0], keep, before) for k, one in enumerate(tracker)}, {})
     if isinstance(tracker, Sequence):
         raise ValueError("track: a grid of trackers over several outputs is for one record; leave by= out.")
-    if before is not None and not isinstance(before, Mapping):
+    if before is not None and not isinstance(before, OutputsFleet):
         raise ValueError(f"warm_start: with by= pass the result of such a run, from key to record; got {before!r}.")
-    starts = before or {}
+    starts = {} if before is None else dict(before.items())
     runs = {key: run_one(model, tracker, one, keep, starts.get(key)) for key, one in found.items()}
     return OutputsFleet(runs, failed, ("series",) if by == "row" else (by,) if isinstance(by, str) else by)
 
 
 def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None) -> Outputs | Shared:
     """One record."""
-    y, u, time = signals.y, signals.u, signals.time
-    gaps = signals.gaps.copy()
     if before is not None:
+        gaps, time = signals.gaps.copy(), signals.time
         gaps[0] *= first_interval(before, None if time is None else time[0], signals.labels)
+        signals = signals._replace(gaps=gaps)
     if model.shared:
-        return run_shared(model, tracker, signals._replace(gaps=gaps), keep, before)
-    bound = model.bind(signals.labels.u or u.shape[1])
-    trackers = trackers_of(bound, tracker)
-    starts = taken_over(before, bound, trackers)
-    for lane, output in enumerate(bound.outputs):
-        (bound.alone(output) or bound).inspect(y[:, lane], u)
-    known = known_of(bound, trackers, signals._replace(gaps=gaps))
-    tile = joint_tile(bound, trackers, starts)
-    out = np.empty(len(y), output_type(tile, trackers[0].outputs, keep_of(keep, trackers[0])))
-    drive(bound, trackers[0].steps_for(bound), keep, tile, y, u, known, out)
-    return Outputs(bound, trackers, y, u, time, known, out, tile, starts, signals.labels)
+        return run_shared(model, tracker, signals, keep, before)
+    programs = programs_of(model.bind(signals.labels.u or signals.u.shape[1]), tracker)
+    for lane, one in enumerate(programs):
+        (one.model if one.alone is None else one.alone.model).inspect(signals.y[:, lane], signals.u)
+    starts = carried(before, programs)
+    record = Record(signals.y, signals.u, known_of(programs[0], signals), signals.time, signals.labels)
+    tile, keep = tile_of(programs, starts), keep_of(keep, programs[0].tracker)
+    out = programs[0].written(tile, len(record), keep)
+    programs[0].drivers(keep).run(tile, *lanes_of(record), out)
+    return Outputs(programs, record, out, tile, starts)
 
 
 def restricted(model: Model, found: Mapping[Hashable, Signals], reading: Reading) -> dict[Hashable, Signals]:
@@ -167,35 +187,31 @@ def keep_of(keep: str, tracker: Tracker) -> str:
     return keep
 
 
-def known_of(model: Model, trackers: Sequence[Tracker], signals: Signals) -> Array:
+def known_of(program: Program, signals: Signals) -> Known:
     """What the driver is told of every sample, (T, k, ny)."""
     gaps, noise, drift = signals.gaps, signals.noise, signals.drift
     T, ny = noise.shape
     common = np.ones(T) if drift.ndim == 2 else drift
     known = np.stack([np.repeat(gaps[:, None], ny, axis=1), noise, np.repeat(common[:, None], ny, axis=1)], axis=1)
     if drift.ndim == 1:
-        return known
-    columns = trackers[0].beside(model, T, None, drift)
-    return np.concatenate([known, np.repeat(columns[:, :, None], ny, axis=2)], axis=1)
+        return Known(known)
+    columns = program.tracker.beside(program.model, T, None, drift)
+    return Known(np.concatenate([known, np.repeat(columns[:, :, None], ny, axis=2)], axis=1))
 
 
 def run_shared(model: Model, tracker: Any, signals: Signals, keep: str, before: Run | None) -> Shared:
     """Rows of one instant as successive samples between which no time passes."""
-    from driftfit.run.track import drive as drive_one
-
     (T, ny), time = signals.y.shape, signals.time
-    (one,) = trackers_of(model, tracker)
-    rows = row_model(model, one, signals.u.shape[2])
-    starts = taken_over(before, rows, (one,))
-    tile = joint_tile(rows, (one,), starts)
-    known = np.moveaxis(known_of(rows, (one,), signals), 1, 2).reshape(T * ny, -1)
-    known[np.arange(T * ny) % ny > 0, 0] = 0.0
+    (one,) = programs_of(model, tracker)
+    program = Program(row_model(model, one.tracker, signals.u.shape[2]), one.tracker)
+    starts = carried(before, [program])
+    columns = np.moveaxis(known_of(program, signals).columns, 1, 2).reshape(T * ny, -1)
+    known = Known(columns).changed(interval=np.where(np.arange(T * ny) % ny > 0, 0.0, columns[:, INTERVAL]))
     flat, inputs = np.ascontiguousarray(signals.y.ravel()), np.ascontiguousarray(signals.u.reshape(T * ny, -1))
-    out = drive_one(rows, one, tile, flat, inputs, known, keep_of(keep, one))
     times = None if time is None else np.repeat(time, ny)
-    start = starts[0] if starts else None
-    labels = replace(signals.labels, u=())
-    return Shared(Track(rows, one, flat, inputs, times, known, out, tile, 0, labels, start), model, time)
+    record = Record(flat, inputs, known, times, replace(signals.labels, u=()))
+    rows = track_record(program, record, keep_of(keep, one.tracker), starts[0] if starts else None)
+    return Shared(rows, model, time)
 
 
 def of_arrays(model: Model, y: Any, u: Any, reading: Reading) -> tuple[Model, Signals]:
@@ -294,15 +310,17 @@ def of_table(
     labels = replace(PLAIN, time=records.labels.time, zone=records.labels.zone, dt=records.labels.dt)
     found = {}
     for k, key in enumerate(records.keys):
-        first, rest, axis, known = records.part(k)
-        T, end = len(first), ny - 1 + len(inputs)
-        known = np.broadcast_to(known, (T, 3))
+        one = records.part(k)
+        first, rest = one.y, one.u
+        T, end, known = len(one), ny - 1 + len(inputs), one.known.over(len(one))
         each = rest[:, end:]
         noise = (
-            noise_of_each(np.where(np.isfinite(each), each, 1.0), T, ny) if many else np.repeat(known[:, 1:2], ny, 1)
+            noise_of_each(np.where(np.isfinite(each), each, 1.0), T, ny)
+            if many
+            else np.repeat(known.noise[:, None], ny, 1)
         )
         rows = slice(int(records.first[k]), int(records.first[k]) + T)
-        factors = known[:, 2].copy() if records.drifts is None else records.drifts[rows]
+        factors = known.drift.copy() if records.drifts is None else records.drifts[rows]
         names: tuple[str, ...] = ()
         signals = np.ascontiguousarray(rest[:, ny - 1 : end])
         if model.shared:
@@ -310,5 +328,5 @@ def of_table(
         else:
             signals, names = ordered(model, signals, inputs)
         both = np.column_stack([first, rest[:, : ny - 1]])
-        found[key] = Signals(both, signals, axis, known[:, 0].copy(), noise, factors, replace(labels, u=names))
+        found[key] = Signals(both, signals, one.time, known.interval.copy(), noise, factors, replace(labels, u=names))
     return model, found, failed

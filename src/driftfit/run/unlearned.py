@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
 from driftfit.run.fleet import Fleet
 from driftfit.run.result import Track
 
 
 def warn_unlearned(run: Track | Fleet) -> None:
-    """Warn of what `Tracker.unlearned` names, from the function that calls this for its user."""
+    """Warn of what `Tracker.unlearned` names."""
     series = [run] if isinstance(run, Track) else [one for _, one in run.items()]
     found, counts, owners = 0, Counter[str](), []
     for one in series:
@@ -26,18 +25,16 @@ def warn_unlearned(run: Track | Fleet) -> None:
     named = ", ".join(counts)
     if not isinstance(run, Track):
         named = f"in {found} of {len(series)} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
-    warnings.warn(
+    warn(
         f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
         "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
         "constant or repeat another.",
         UserWarning,
-        stacklevel=3,
     )
 
 
 def _missed(run: Track) -> list[str]:
-    tile, l = run._tile, run._lane
-    if not np.isinf(tile["var"][0, ..., l]).any():
+    lane = run.state
+    if not np.isinf(lane["var"]).any():
         return []
-    lane: dict[str, Array] = {name: tile[name][0, ..., l] for name in tile.dtype.names or ()}
     return [name for name, missed in zip(run.names, run.tracker.unlearned(lane), strict=True) if missed]

@@ -7,63 +7,59 @@ value, a larger q for example.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from driftfit.data.clock import Clock, instant
 from driftfit.data.record import Labels
-from driftfit.engine.drivers import make_tile
-from driftfit.engine.kernel import Array
-from driftfit.models.base import Model
-from driftfit.trackers.base import Tracker
+from driftfit.run.program import Program, State
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
 """Fields that stay behind: what an operator set for the stream, and the diffuse likelihood of the run before."""
 
 
 class End(NamedTuple):
-    """Where a run ended: its model and tracker, the fields of its record, and the time of its last sample.
+    """Where a run ended, lane by lane (one for a single output): its programs, their states, and its last time.
 
     ``awaits`` says whether a stream still expects the input of that sample (`driftfit.run.live.late_input`).
     """
 
-    model: Model
-    tracker: Tracker
-    state: Mapping[str, Array]
+    programs: tuple[Program, ...]
+    states: tuple[State, ...]
     last: Any
     awaits: int = 0
 
 
 class Run(Protocol):
-    """What a warm start can begin from: a `Track` or a `Live`."""
+    """What a warm start can begin from: a `Track`, a `Live`, or one of several outputs."""
 
     def end(self) -> End:
         """Where it ended."""
 
 
-def fresh_tile(model: Model, tracker: Tracker, state: Mapping[str, Array] | None = None) -> Array:
-    """A tile of one lane at its start, or with the given fields."""
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
-    for name, value in (state or {}).items():
-        tile[name][0, ..., 0] = value
-    return tile
-
-
-def carried(run: Run, model: Model, tracker: Tracker) -> dict[str, Array]:
-    """The fields that a run of ``tracker`` takes over from another run; ValueError where the two do not fit."""
+def carried(run: Run | None, programs: Sequence[Program]) -> tuple[State, ...]:
+    """The fields that each lane takes over from a run before; ValueError where the two do not fit."""
+    if run is None:
+        return ()
     end = run.end()
-    if type(tracker) is not type(end.tracker):
+    if len(end.programs) != len(programs):
+        raise ValueError(f"warm_start: {run!r} is not a run of these outputs.")
+    return tuple(_carried(*lane) for lane in zip(end.programs, end.states, programs, strict=True))
+
+
+def _carried(before: Program, state: State, now: Program) -> State:
+    if type(now.tracker) is not type(before.tracker):
         raise ValueError(
-            f"warm_start: the run before was made by {type(end.tracker).__name__}, this one is by "
-            f"{type(tracker).__name__}; start from its estimates instead, with theta0= and p0=."
+            f"warm_start: the run before was made by {type(before.tracker).__name__}, this one is by "
+            f"{type(now.tracker).__name__}; start from its estimates instead, with theta0= and p0=."
         )
-    if not model.follows(end.model):
-        raise ValueError(f"warm_start: the run before followed {end.model!r}, this one follows {model!r}.")
-    before, now = end.tracker.state_for(end.model), tracker.state_for(model)
-    changed = {name for name, value in now.items() if not _same(before.get(name), value)}
-    return {name: value for name, value in end.state.items() if name not in changed and name not in _LEFT}
+    if not now.model.follows(before.model):
+        raise ValueError(f"warm_start: the run before followed {before.model!r}, this one follows {now.model!r}.")
+    old, new = before.tracker.state_for(before.model), now.tracker.state_for(now.model)
+    changed = {name for name, value in new.items() if not _same(old.get(name), value)}
+    return {name: value for name, value in state.items() if name not in changed and name not in _LEFT}
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -22,12 +21,10 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
-from driftfit.run.result import root_mean_square
-from driftfit.show.summary import Printed, counts, facts, key_text, table_of
-
-if TYPE_CHECKING:
-    from driftfit.run.fleet import Fleet
-    from driftfit.run.result import Track
+from driftfit.run.fleet import Fleet
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.run.track_outputs import OutputsFleet
+from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of
 
 SHOWN = 20
 
@@ -95,12 +92,9 @@ class FleetSummary(Printed):
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
 
 
-def summarise(fleet: Fleet) -> FleetSummary:
+def summarise(fleet: Fleet | OutputsFleet) -> FleetSummary:
     """Build the summary of a fleet."""
-    dropped: Counter[str] = Counter()
-    for of_one in fleet.records.dropped.values():
-        dropped.update(of_one)
-    return summary_of(dict(fleet.items()), repr(fleet.model), fleet.failed, dict(dropped))
+    return summary_of(fleet.runs(), repr(fleet.model), fleet.failed, fleet.dropped)
 
 
 def summary_of(
@@ -134,8 +128,8 @@ class _Path:
 
 def _path(run: Track) -> _Path:
     n, T = len(run.names), len(run)
-    begin = min(max(50, 5 * n), T // 3)
-    theta, var = run.theta[begin:], run._written("var")[begin:]
+    begin = min(burn_in(n), T // 3)
+    theta, var = run.theta[begin:], run.var[begin:]
     known = np.isfinite(var) | (not run.tracker.covariance)
     first = (np.argmax(known, axis=0), np.arange(n))
     away = np.where(known, np.abs(theta - theta[first]), 0.0)

@@ -9,7 +9,7 @@ from io import StringIO
 from typing import TYPE_CHECKING
 
 from driftfit.show.page_style import STYLE
-from driftfit.show.plots import BLUE, GREY, RED
+from driftfit.show.parts.axes import BLUE, GREY, RED
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

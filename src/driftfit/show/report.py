@@ -14,21 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftfit.engine.version import __version__
 from driftfit.judge.diagnose import Diagnosis, diagnose
-from driftfit.judge.plots import draw_diagnosis
 from driftfit.judge.verdict import Verdict, p_text, verdict
 from driftfit.models.arx import ARX
-from driftfit.run.result import Track
+from driftfit.run.result import Track, burn_in
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
-from driftfit.show.plots import (
-    date_axis,
-    draw_innovation,
-    draw_parameter,
-    draw_prediction,
-    new_figure,
-    time_label,
-)
+from driftfit.show.parts.axes import date_axis, draw_innovation, draw_parameter, draw_prediction, new_figure, time_label
 from driftfit.show.report_faults import faults
 from driftfit.show.summary import Summary, summarise
 from driftfit.use.system import dc_gain, largest_pole
@@ -91,7 +84,7 @@ def page(run: Track, title: str | None = None, alarms: Alarms | None = None, lab
         section("Parameters over time", picture(parameter_figure(run), run, PARAMETERS)),
         section("Parameters", _parameter_table(facts, said) + _system_table(run)),
         section("Predictions", _comparison(said) + picture(_signals(run), run, SIGNALS)),
-        section("Diagnostics", _checks(health) + picture(draw_diagnosis(health), run, DIAGNOSTICS)),
+        section("Diagnostics", _checks(health) + picture(health.plot(), run, DIAGNOSTICS)),
         section("Settings and omitted data", _settings(run, facts)),
         section("How to read this", READING),
     ]
@@ -149,7 +142,7 @@ def _system_table(run: Track) -> str:
     if not isinstance(run.model, ARX) or run.names != run.model.names or run.model.na == 0 or len(run) < 10:
         return ""
     T = len(run)
-    at = np.unique(np.linspace(min(max(50, 5 * run.model.n), T // 3), T - 1, 5).astype(int))
+    at = np.unique(np.linspace(min(burn_in(run.model.n), T // 3), T - 1, 5).astype(int))
     gain, pole = dc_gain(run, at), largest_pole(run, at)
     names = run.model.inputs if isinstance(run.model.inputs, tuple) else [f"u{j + 1}" for j in range(run.model.m)]
     heads = ("at", *(f"gain of {escape(str(name))}" for name in names), "largest pole")
@@ -181,8 +174,6 @@ def _checks(health: Diagnosis) -> str:
 
 
 def _settings(run: Track, facts: Summary) -> str:
-    from driftfit import __version__
-
     missing_y, missing_u = int(np.sum(~np.isfinite(run.y))), int(np.sum(~np.isfinite(run.u).all(axis=1)))
     pairs = [
         ("Model", facts.model), ("Tracker", facts.tracker), ("Signals", facts.signals), ("Time", facts.span),

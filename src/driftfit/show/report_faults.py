@@ -10,10 +10,9 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.onsets import onsets
-from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import picture, table
-from driftfit.show.summary import key_text
+from driftfit.show.parts.text import key_text
 
 if TYPE_CHECKING:
     from driftfit.judge.alarms.detect import Alarms
@@ -34,7 +33,7 @@ def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
     wrong = None if labels is None else _checked(run, labels)
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
-        parts += [_said(alarms, wrong), _alarms(alarms), picture(plot_alarms(alarms, wrong), run, PICTURE)]
+        parts += [_said(alarms, wrong), _alarms(alarms), picture(alarms.plot(wrong), run, PICTURE)]
     return "".join(parts)
 
 
@@ -60,7 +59,7 @@ def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, label
     shown = [row for row in watched.values() if len(row.alarms.onsets)][:PICTURED]
     pictures = (
         f'<div class="one"><h3>{escape(key_text(row.key))}</h3>'
-        f"{picture(plot_alarms(row.alarms, _given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
+        f"{picture(row.alarms.plot(_given(runs, labels, row.key)), runs[row.key], PICTURE)}</div>"
         for row in shown
     )
     return table(f"Intervals labelled as wrong, and alarms.{_more(rows)}", heads, rows[:LISTED], (2, 4)) + "".join(

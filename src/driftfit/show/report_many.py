@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from driftfit.engine.version import __version__
 from driftfit.judge.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
+from driftfit.show.parts.text import key_text
 from driftfit.show.report import PARAMETERS, parameter_figure
 from driftfit.show.report_faults import many_faults
-from driftfit.show.summary import key_text
 
 if TYPE_CHECKING:
     from driftfit.engine.kernel import Array
@@ -111,8 +112,6 @@ def _health(health: ManyDiagnoses) -> str:
 
 
 def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:
-    from driftfit import __version__
-
     trackers = list(dict.fromkeys(repr(run.tracker) for run in runs.values()))
     models = list(dict.fromkeys(repr(run.model) for run in runs.values()))
     pairs = [

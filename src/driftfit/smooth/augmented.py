@@ -20,18 +20,17 @@ errors at t = T are corrected as above. Cost: O(T n) a sweep.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import numbers, one_of, vector, whole
+from driftfit.run.result import Track
 from driftfit.smooth.exact import smooth
-from driftfit.smooth.parts.walk import constants, walk_of
+from driftfit.smooth.parts.walk import constants
+from driftfit.smooth.problem import walk_of
 from driftfit.trackers.augmented_fls import AugmentedFLS
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
 
 
 class AugmentedPath(NamedTuple):

@@ -16,7 +16,7 @@ smoothings.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -24,12 +24,11 @@ from scipy.stats import median_abs_deviation
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
+from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Path, Walk, walk_of
+from driftfit.smooth.parts.walk import Path, Walk
+from driftfit.smooth.problem import walk_of
 from driftfit.smooth.smoothed import Smoothed
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
 
 EFFICIENT = 1.345
 """delta in standard deviations: 95 % efficiency on Gaussian residuals."""

@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.smooth.parts.walk import replay
+from driftfit.run.result import Track
+from driftfit.smooth.plots import plot_segments
+from driftfit.smooth.problem import replay
+from driftfit.trackers.bank.results.decided_path import faults
+from driftfit.trackers.bank.results.results import Hypotheses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.run.result import Track
 
 
 class Segments:
@@ -34,7 +36,7 @@ class Segments:
 
     def __init__(self, run: Track, breaks: Any = None, r: float | None = None) -> None:
         if breaks is None:
-            breaks = [event.span.date for event in run.hypotheses.events() if event.kind == "change"]
+            breaks = [event.span.date for event in Hypotheses(run).events() if event.kind == "change"]
         T = len(run)
         inner = sorted({int(b) for b in breaks})
         if inner and not 0 < inner[0] <= inner[-1] < T:
@@ -43,9 +45,7 @@ class Segments:
         seen = replay(run)
         known = seen["ok"][:, 0] > 0.0
         if run.tracker.weighs:  # a sensor at fault tells nothing of the segment
-            from driftfit.trackers.bank.results.decided_path import faults
-
-            known &= faults(run.tracker, run, run.hypotheses.events()) == 1.0  # type: ignore[arg-type]
+            known &= faults(run.tracker, run, Hypotheses(run).events()) == 1.0  # type: ignore[arg-type]
         self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
         self._weight = 1.0 / seen["used_noise"][:, 0]
         self._solve(r)
@@ -90,9 +90,7 @@ class Segments:
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters of the segments with bands, over the tracked path."""
-        from driftfit.show.plots import plot_segments
-
-        return plot_segments(self, level)
+        return plot_segments(self.run, self.bounds.tolist(), self.theta, self.std, level)
 
 
 def piecewise(run: Track, breaks: Any = None, r: float | None = None) -> Segments:

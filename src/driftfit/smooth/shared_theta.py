@@ -7,13 +7,11 @@ the instant, and the lag from one instant to the next is that from its last row 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 from driftfit.engine.kernel import Array
+from driftfit.run.shared_outputs import Shared
 from driftfit.smooth.smoothed import Smoothed
-
-if TYPE_CHECKING:
-    from driftfit.run.shared_outputs import Shared
 
 
 class SmoothedShared(Smoothed):
@@ -22,6 +20,13 @@ class SmoothedShared(Smoothed):
     As `Smoothed`, with ``theta``, ``std``, ``slope`` (T, n), ``rank`` (T,) and ``residual``, ``loo``, ``leverage``
     (T, ny). ``rows`` is the path of the T ny rows.
     """
+
+    @classmethod
+    def of_shared(cls, run: Shared, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Self:
+        """Smooth a record of outputs that share one theta."""
+        if order_by is not None:
+            raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
+        return cls(Smoothed.of(run.rows, keep, undetermined=undetermined), run)
 
     def __init__(self, rows: Smoothed, run: Shared) -> None:
         self.rows, self._ny = rows, len(run.outputs)

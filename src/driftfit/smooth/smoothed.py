@@ -11,16 +11,17 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
+from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Path, Walk, ordered, walk_of
+from driftfit.smooth.parts.walk import Path, Walk, ordered
+from driftfit.smooth.plots import plot_smoothed
+from driftfit.smooth.problem import walk_of
 
 ALONE = 1e-12
 """Below this sqrt(1 - leverage) a sample alone determines a direction, and says nothing when it is left out."""
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.run.result import Track
 
 
 class Smoothed:
@@ -65,6 +66,8 @@ class Smoothed:
     @classmethod
     def of(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Smoothed:
         """Smooth a run."""
+        if run.start is not None:
+            raise ValueError("smooth: a run with a warm start cannot be smoothed; track the whole record.")
         one_of("smooth", "keep", keep, ("std", "cov"))
         one_of("smooth", "undetermined", undetermined, ("min_norm", "nan", "raise"))
         walk = walk_of(run)
@@ -178,9 +181,7 @@ class Smoothed:
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters with bands, smoothed and filtered; a matplotlib figure."""
-        from driftfit.show.plots import plot_smoothed
-
-        return plot_smoothed(self, level)
+        return plot_smoothed(self.run, self.theta, *self.band(level))
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:

@@ -17,17 +17,16 @@ the penalty, Yuan and Lin (2006) for groups. Cost: 100 to 1,000 exact smoothings
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
+from driftfit.run.result import Track
 from driftfit.smooth import exact
-from driftfit.smooth.parts.walk import Walk, constants, walk_of
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
+from driftfit.smooth.parts.walk import Walk, constants
+from driftfit.smooth.problem import walk_of
 
 SMOOTHING = 1e-6
 """eta, relative to the size of theta."""

@@ -3,13 +3,13 @@
 K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k r / c_i`` a nominal sample,
 where r is the present noise variance and c_i the mean square of regressor i, so ratio_k is the share of r that the
 drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. The filters are the
-modes of a Markov chain and interact (`driftfit.trackers.parts.drift_ladder`).
+modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
-the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.mode_filters`). Readings out of all
+the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
 proportion are left out (`driftfit.trackers.parts.disproportion`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
-(`driftfit.trackers.parts.drift_ladder`), or more noise.
+(`driftfit.trackers.parts.modes.ladder`), or more noise.
 
 Reported are the mean and covariance of the mixture; the one-step variance leaves the outlier level out, so its band is
 one for samples that are not outliers.
@@ -48,9 +48,8 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.disproportion import bound_leverage, learn_proportion, leave_out, no_proportion, proportion
-from driftfit.trackers.parts.drift_ladder import filters, mix
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
-from driftfit.trackers.parts.mode_filters import (
+from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
     mixture,
@@ -59,7 +58,8 @@ from driftfit.trackers.parts.mode_filters import (
     update_filters,
     weigh,
 )
-from driftfit.trackers.parts.mode_smoother import NOTED, note, varying
+from driftfit.trackers.parts.modes.ladder import filters, mix
+from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
 from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
@@ -263,7 +263,7 @@ class AdaptiveKalman(Tracker):
         return learned(lane)
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        lane, names = run.end().state, np.array(run.names)
+        lane, names = run.state, np.array(run.names)
         never = np.isinf(lane["var"])
         lately = ~never & ~learned(lane)
         said = []

@@ -148,7 +148,7 @@ class FLS(Tracker):
         return second_differences.STEPS if self.differences == 2 else STEPS
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.end().state)
+        return resolution(run.state)
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
         n = len(lane["theta"])

@@ -229,7 +229,7 @@ class RLS(Tracker):
         }
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        return resolution(run.end().state)
+        return resolution(run.state)
 
     @property
     def steps(self) -> TrackerSteps:

@@ -17,9 +17,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.data.arguments import check_role
+from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
+from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.trackers.fls import FLS
 
@@ -38,9 +42,7 @@ class Frontier(NamedTuple):
 
     def plot(self) -> Figure:
         """r_M^2 against r_D^2, and both against mu; a matplotlib figure."""
-        from driftfit.tune.plots import plot_frontier
-
-        return plot_frontier(self)
+        return _plot(self)
 
 
 def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, **known: Any) -> Frontier:
@@ -64,14 +66,24 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
         raise ValueError("frontier: takes one output at a time: use run[name], and frontier(run[name].model, .y, .u).")
+    reading = Reading(**known)
     if mu is None:
-        steady = track(model, FLS(1.0), y, u, **known).smooth()
+        steady = _path(model, FLS(1.0), y, u, reading)
         used = steady.walk.weight > 0.0
         power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
-    paths = [track(model, FLS(float(m), differences=differences), y, u, **known).smooth() for m in weights]
+    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading) for m in weights]
     return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
+
+
+def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading) -> Smoothed:
+    """The smoothed path of a record."""
+    run = track(model, tracker, y, u, reading)
+    if isinstance(run, Shared):
+        return SmoothedShared.of_shared(run)
+    assert isinstance(run, Track)
+    return Smoothed.of(run)
 
 
 def _movement(path: Smoothed) -> float:
@@ -81,3 +93,24 @@ def _movement(path: Smoothed) -> float:
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
     factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
+
+
+def _plot(frontier: Frontier) -> Figure:
+    """Measurement cost against dynamic cost, and both against mu."""
+    figure = new_figure(9.0, 3.6)
+    left, right = figure.subplots(1, 2)
+    left.loglog(frontier.dynamic, frontier.measurement, color=BLUE, lw=1.3, marker="o", ms=2.5)
+    for i in range(0, len(frontier.mu), max(len(frontier.mu) // 6, 1)):
+        point = (frontier.dynamic[i], frontier.measurement[i])
+        left.annotate(
+            f"{frontier.mu[i]:.2g}", point, (-4, -10), textcoords="offset points", ha="right", fontsize=7, color=GREY
+        )
+    left.set_xlabel("dynamic cost r_D^2")
+    left.set_ylabel("measurement cost r_M^2 (numbers: mu)")
+    right.loglog(frontier.mu, frontier.measurement, color=BLUE, lw=1.3, label="measurement cost r_M^2")
+    right.loglog(frontier.mu, frontier.dynamic, color=RED, lw=1.3, label="dynamic cost r_D^2")
+    right.set_xlabel("mu")
+    right.legend(fontsize=8, frameon=False)
+    for axis in (left, right):
+        axis.grid(alpha=0.25, lw=0.5)
+    return figure

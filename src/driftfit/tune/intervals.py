@@ -9,12 +9,12 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 from driftfit.tune.knobs import Knobs
-from driftfit.tune.lanes import Record, score
+from driftfit.tune.lanes import Task, score
 from driftfit.tune.search import STEP, Search
 
 
 def intervals_of(
-    search: Search, record: Record, method: str, tracker: Tracker, level: float
+    search: Search, task: Task, method: str, tracker: Tracker, level: float
 ) -> dict[str, tuple[float, float]]:
     """Intervals by name of setting; NaN where the criterion is no likelihood."""
     knobs = search.knobs
@@ -26,7 +26,7 @@ def intervals_of(
         low, high = (_value(knobs, search.x, i, end, entry) for end in ends[i])
         found[name] = (low, high)
     if knobs.profiled and "r" in tracker.required:
-        found |= _joint(search, record, level)
+        found |= _joint(search, task, level)
     return found
 
 
@@ -37,7 +37,7 @@ def _value(knobs: Knobs, x: Array, i: int, end: float, entry: int) -> float:
     return float(knobs.values(point)[entry])
 
 
-def _joint(search: Search, record: Record, level: float) -> dict[str, tuple[float, float]]:
+def _joint(search: Search, task: Task, level: float) -> dict[str, tuple[float, float]]:
     """Intervals of q and r where r was found in closed form, from curvature in logarithms.
 
     With g the slope of log sigma^2 over the knobs: Var log r = 2 / N + g' C g,
@@ -48,7 +48,7 @@ def _joint(search: Search, record: Record, level: float) -> dict[str, tuple[floa
     for j, i in enumerate(free):
         points[2 * j + 1, i] += STEP
         points[2 * j + 2, i] -= STEP
-    scores = score(record, [knobs.run(point) for point in points])
+    scores = score(task, [knobs.run(point) for point in points])
     r = float(scores.sigma2()[0])
     g = np.log(scores.sigma2()[1::2] / scores.sigma2()[2::2]) / (2.0 * STEP)
     found = {"r": _spread(r, 2.0 / scores.used[0] + g @ C @ g, level)}

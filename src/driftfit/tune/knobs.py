@@ -29,7 +29,7 @@ from driftfit.engine.settings import missing_settings
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
-from driftfit.tune.lanes import Record, score
+from driftfit.tune.lanes import Task, score
 
 Bounds = tuple[float, float] | None
 
@@ -60,25 +60,25 @@ class Knobs:
         return find_knobs, self.origin
 
 
-def find_knobs(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
+def find_knobs(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     """The knobs of a tracker for a record; ValueError where it has none."""
-    return replace(_find(record, tracker, groups, bounds), origin=(record, tracker, groups, bounds))
+    return replace(_find(task, tracker, groups, bounds), origin=(task, tracker, groups, bounds))
 
 
-def _find(record: Record, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
+def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
     missing = missing_settings(tracker)
     if isinstance(tracker, Bank) and groups is None:
         return _changes(tracker, bounds)
     if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
         raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
     if missing == ["mu"]:
-        return _weight(record, tracker, groups, bounds)
+        return _weight(task, tracker, groups, bounds)
     if missing in (["q"], ["q", "r"]):
-        return _drift(record, tracker, groups, bounds)
+        return _drift(task, tracker, groups, bounds)
     if missing == ["r"]:
-        return _noise(record, tracker, bounds)
+        return _noise(task, tracker, bounds)
     if missing == ["forgetting"]:
-        return _memory(record, tracker, bounds)
+        return _memory(task, tracker, bounds)
     raise ValueError(
         f"tune: {tracker!r} leaves {', '.join(missing) or 'nothing'} open; tune can find mu, q and r, or "
         "forgetting. Leave out the settings to be found, as in FLS(), Kalman(r=0.1) or RLS()."
@@ -101,31 +101,31 @@ def members(names: Sequence[str], groups: Any) -> Array:
     return np.array([unique.index(label) for label in labels])
 
 
-def still(record: Record, scored_by: Tracker) -> tuple[Array, float]:
+def still(task: Task, scored_by: Tracker) -> tuple[Array, float]:
     """Mean squares of the regressors (n,), and the variance that a constant theta leaves."""
-    scores = score(record, [scored_by])
+    scores = score(task, [scored_by])
     power, variance = scores.power[:, 0], float(scores.sigma2()[0])
     if not np.any(power > 0.0):
         raise ValueError("tune: the record has no usable sample with a regressor other than zero: nothing to tune on.")
     return power, variance if 0.0 < variance < np.inf else 1.0
 
 
-def constant(record: Record, tracker: Any) -> Tracker:
+def constant(task: Task, tracker: Any) -> Tracker:
     """The tracker with its drift taken away, or as near to that as it can be."""
-    n = record.model.n
+    n = task.model.n
     if not tracker.covariance:
         return replace(tracker, mu=1e300)  # type: ignore[no-any-return]
     if "mu" in tracker.required:
         return replace(tracker, mu=(np.inf,) * n, p0=None)  # type: ignore[no-any-return]
-    if len(tracker.names_for(record.model)) == n:
+    if len(tracker.names_for(task.model)) == n:
         return replace(tracker, q=(0.0,) * n, r=1.0, p0=None)  # type: ignore[no-any-return]
     return Kalman(q=(0.0,) * n, r=1.0)
 
 
-def _range(record: Record, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
+def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
     """Ends of log10 mu, (p,) each; a drift of slopes adds up twice over the record."""
     times = getattr(tracker, "differences", 1)
-    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(record.y))))
+    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(task.record))))
     return np.full(p, low), np.full(p, high)
 
 
@@ -137,15 +137,15 @@ def _ends(bounds: Bounds, low: float, high: float) -> tuple[float, float]:
     return float(np.log10(bounds[0])), float(np.log10(bounds[1]))
 
 
-def _weight(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
+def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     """mu of FLS or AugmentedFLS."""
-    names = record.model.names
+    names = task.model.names
     if groups is not None and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has one mu for all parameters; leave groups=None.")
-    power, _ = still(record, constant(record, tracker))
+    power, _ = still(task, constant(task, tracker))
     group = members(names, groups)
     share = np.full(len(names), power.sum()) if groups is None else np.where(power > 0.0, power, power.max())
-    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
+    low, high = _range(task, tracker, bounds, int(group.max()) + 1)
 
     def each(x: Array) -> Array:
         return np.asarray(10.0 ** x[group] * share)
@@ -160,15 +160,15 @@ def _weight(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     return Knobs(low, high, no, True, build, build, tuple(f"mu[{name}]" for name in names), group, each)
 
 
-def _drift(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
+def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     """q of Kalman; an open r in closed form after a diffuse start, as a knob of its own after a given prior."""
-    names = tracker.names_for(record.model)
-    power, variance = still(record, constant(record, tracker))
+    names = tracker.names_for(task.model)
+    power, variance = still(task, constant(task, tracker))
     if len(names) != len(power):  # the tracker's parameters are not the regression's
         power = np.full(len(names), power.sum())
     group = members(names, groups)
     share = np.where(power > 0.0, 1.0 / np.where(power > 0.0, power, 1.0), 0.0)
-    low, high = _range(record, tracker, bounds, int(group.max()) + 1)
+    low, high = _range(task, tracker, bounds, int(group.max()) + 1)
     low, high = -high, -low
     own_r = tracker.r is None and tracker.p0 is not None
     profiled = tracker.r is None and not own_r
@@ -199,9 +199,9 @@ def _drift(record: Record, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
     )  # fmt: skip
 
 
-def _noise(record: Record, tracker: Any, bounds: Bounds) -> Knobs:
+def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     """r of Kalman under a given q."""
-    _, variance = still(record, constant(record, tracker))
+    _, variance = still(task, constant(task, tracker))
     low, high = _ends(bounds, -9.0, 3.0)
 
     def values(x: Array) -> Array:
@@ -250,9 +250,9 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
     return Knobs(lows, highs, zero, False, build, build, names, np.arange(len(names)), values)
 
 
-def _memory(record: Record, tracker: Any, bounds: Bounds) -> Knobs:
+def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds are of the memory."""
-    low, high = _ends(bounds, float(np.log10(2.0 * record.model.n)), float(np.log10(100.0 * len(record.y))))
+    low, high = _ends(bounds, float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * len(task.record))))
 
     def values(x: Array) -> Array:
         return np.asarray(np.maximum(1.0 - 10.0**-x, 0.0))

@@ -20,22 +20,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import drivers, make_tile, output_type
+from driftfit.data.record import Record
+from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.models.base import Model
+from driftfit.run.program import Program, spread, tile_of
+from driftfit.run.result import burn_in
 from driftfit.trackers.base import Tracker
 
 BLOCK = 1024
 """Samples between two condensations: a tile's output of that length stays in the cache."""
 
 
-class Record(NamedTuple):
-    """A checked record: bound model, y (T,), u (T, m), known factors (T, 3) or (1, 3)."""
+class Task(NamedTuple):
+    """What settings are scored on: a bound model and a checked record."""
 
     model: Model
-    y: Array
-    u: Array
-    known: Array
+    record: Record
 
 
 class Scores(NamedTuple):
@@ -85,30 +86,28 @@ def storing(store: Any) -> Any:
     return store_both
 
 
-def score(record: Record, trackers: Sequence[Tracker], h: int = 1) -> Scores:
+def score(task: Task, trackers: Sequence[Tracker], h: int = 1) -> Scores:
     """Run the record under each tracker (all of one class and one form of settings)."""
     width = trackers[0].width
     parts = []
     for a in range(0, len(trackers), width):
         some = list(trackers[a : a + width])
         full = some + [some[-1]] * (width - len(some))
-        parts.append([value[..., : len(some)] for value in _score_tile(record, full, h)])
+        parts.append([value[..., : len(some)] for value in _score_tile(task, full, h)])
     return Scores(*(np.concatenate(values, axis=-1) for values in zip(*parts, strict=True)))
 
 
-def _score_tile(record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
-    model, y, u, known = record
-    T, L = len(y), len(trackers)
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model) for tracker in trackers])
-    steps, own = trackers[0].steps_for(model), trackers[0].outputs if trackers[0].density else ()
+def _score_tile(task: Task, trackers: Sequence[Tracker], h: int) -> Scores:
+    (model, record), L = task, len(trackers)
+    programs = [Program(model, tracker) for tracker in trackers]
+    T, tile = len(record), tile_of(programs)
+    steps, own = programs[0].steps, trackers[0].outputs if trackers[0].density else ()
     out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))
-    run = drivers(model.steps, steps._replace(store=storing(steps.store) if own else store_inside)).run
-    sums = _Sums(record, trackers[0], tile, h)
+    run = programs[0].drivers(steps=steps._replace(store=storing(steps.store) if own else store_inside)).run
+    sums = _Sums(task, trackers[0], tile, h)
     for a in range(0, T, BLOCK):
         b = min(a + BLOCK, T)
-        factors = known if len(known) == 1 else known[a:b]
-        spread = [np.repeat(part[..., None], L, axis=-1) for part in (y[a:b], u[a:b], factors)]
-        run(tile, *spread, out[: b - a])
+        run(tile, *spread(record.part(slice(a, b)), L), out[: b - a])
         sums.add(a, out[: b - a])
     return sums.scores(tile)
 
@@ -116,13 +115,13 @@ def _score_tile(record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
 class _Sums:
     """Sums over the blocks of a run, each with the lanes on the last axis."""
 
-    def __init__(self, record: Record, tracker: Tracker, tile: Array, h: int) -> None:
+    def __init__(self, task: Task, tracker: Tracker, tile: Array, h: int) -> None:
         n, L = tile["theta"].shape[1:]
-        self.record, self.tracker, self.h = record, tracker, h
-        self.burn = min(max(50, 5 * n), len(record.y) // 3)
+        self.model, self.record, self.tracker, self.h = *task, tracker, h
+        self.burn = min(burn_in(n), len(self.record) // 3)
         self.count, self.log_s, self.squares, self.more = np.zeros((4, L))
         self.errors, self.scored, self.used = np.zeros((3, L))
-        self.power = np.zeros((record.model.n, L))
+        self.power = np.zeros((task.model.n, L))
         self.scale = np.ones(L) * tile["scale"][0]
         self.past = np.full((h, n, L), np.nan)
 
@@ -131,8 +130,8 @@ class _Sums:
         y = self.record.y[a : a + len(out), None]
         counted = self._likelihood(out, ok)
         self._forecast(a, out, ok, y)
-        if hasattr(self.record.model, "log_jacobian"):
-            terms = self.record.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
+        if hasattr(self.model, "log_jacobian"):
+            terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
         self.power += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
         self.used += ok.sum(axis=0)
@@ -161,8 +160,7 @@ class _Sums:
             theta = np.concatenate([self.past, out["theta"]])
             self.past = theta[-self.h :].copy()
             error = y - np.sum(out["phi"] * theta[: len(out)], axis=1)
-        known = self.record.known
-        weight = 1.0 / (known if len(known) == 1 else known[a : a + len(out)])[:, 1, None]
+        weight = 1.0 / self.record.known.part(slice(a, a + len(out))).noise[:, None]
         scored = ok & (np.arange(a, a + len(out)) >= self.burn)[:, None]
         with np.errstate(invalid="ignore"):
             self.errors += np.sum(np.where(scored, weight * error**2, 0.0), axis=0)

@@ -7,25 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import make_tile
+from driftfit.data.known import Known
+from driftfit.data.record import Record
 from driftfit.engine.kernel import Array
 from driftfit.models.regression import Regression
-from driftfit.run.result import Track
-from driftfit.run.track import drive
-from driftfit.smooth.parts.walk import ordered, walk_of
+from driftfit.run.program import Program
+from driftfit.run.result import Track, track_record
+from driftfit.smooth.parts.walk import ordered
+from driftfit.smooth.problem import walk_of
+from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.base import Tracker
 from driftfit.tune.knobs import Knobs, constant
-from driftfit.tune.lanes import Record, score
+from driftfit.tune.lanes import Task, score
 
 
-def along(record: Record, tracker: Tracker, order_by: Any) -> Record:
+def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
     """The record as a regression whose samples are sorted by a variable."""
-    model = record.model
-    walk, _ = ordered(walk_of(run_record(record, constant(record, tracker))), order_by)
-    known = np.ones((len(walk.y), 3))
+    walk, _ = ordered(walk_of(run_task(task, constant(task, tracker))), order_by)
     with np.errstate(divide="ignore"):
-        known[:, 1] = 1.0 / walk.weight
-    return Record(Regression(model.names), walk.y, walk.phi, known)
+        known = Known.of(noise=1.0 / walk.weight)
+    return Task(Regression(task.model.names), Record(walk.y, walk.phi, known))
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Criterion:
     In logarithms the unit of y is an offset, so that the tolerances of the search do not depend on it.
     """
 
-    record: Record
+    task: Task
     knobs: Knobs
     method: str
     h: int
@@ -43,26 +44,23 @@ class Criterion:
     def __call__(self, points: Array) -> Array:
         trackers = [self.knobs.run(x) for x in points]
         if self.method == "ml":
-            return -score(self.record, trackers).loglik(self.knobs.profiled)
+            return -score(self.task, trackers).loglik(self.knobs.profiled)
         if self.method == "h-step":
-            squares = score(self.record, trackers, self.h).h_step
+            squares = score(self.task, trackers, self.h).h_step
         else:
-            squares = np.array([_smoothed_score(self.record, tracker, self.method) for tracker in trackers])
+            squares = np.array([_smoothed_score(self.task, tracker, self.method) for tracker in trackers])
         tiny = np.finfo(float).tiny  # a perfect fit is the best there is, and has a logarithm
         return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
 
 
-def run_record(record: Record, tracker: Tracker) -> Track:
-    """Track a checked record."""
-    model, y, u, known = record
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
-    out = drive(model, tracker, tile, y, u, known)
-    return Track(model, tracker, y, u, None, known, out, tile)
+def run_task(task: Task, tracker: Tracker) -> Track:
+    """Track the record of a task."""
+    return track_record(Program(task.model, tracker), task.record)
 
 
-def _smoothed_score(record: Record, tracker: Tracker, method: str) -> float:
+def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
     """Mean square of the leave-one-out residuals of the smoothed path, or its rotation-invariant relative."""
-    path = run_record(record, tracker).smooth()
+    path = Smoothed.of(run_task(task, tracker))
     weight = path.walk.weight
     used = weight > 0.0
     if method == "loo":

@@ -8,23 +8,23 @@ also fill missing lags.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from driftfit.data.record import Reading
 from driftfit.models.base import Model
+from driftfit.run.outputs import Outputs
+from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
-from driftfit.tune.lanes import Record
-
-if TYPE_CHECKING:
-    from driftfit.tune.tune import Tuned
-
+from driftfit.tune.lanes import Task
+from driftfit.tune.tuned import Tuned
 
 STILL = Kalman(q=0.0, r=1.0)
 """Constant parameters, of which nothing is known before."""
 
 
-class TunedOutputs(Mapping[str, "Tuned"]):
+class TunedOutputs(Mapping[str, Tuned]):
     """What `tune` returns for a model with several outputs: a `driftfit.tune.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
@@ -59,11 +59,11 @@ class TunedOutputs(Mapping[str, "Tuned"]):
 
 
 def tune_outputs(model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], one: Callable[..., Any]) -> Any:
-    """Tune every output with ``one(record)``, or the rows of a shared theta at once."""
+    """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run: Any = track(model, STILL, y, u, **known)
-    if model.shared:
-        return one(Record(run.rows.model, run.rows.y, run.rows.u, run.rows._known))
-    records = {name: run[name] for name in run.outputs}
-    return TunedOutputs({name: one(Record(r.model, r.y, r.u, r._known)) for name, r in records.items()})
+    run = track(model, STILL, y, u, Reading(**known))
+    if isinstance(run, Shared):
+        return one(Task(run.rows.model, run.rows.record))
+    assert isinstance(run, Outputs)
+    return TunedOutputs({name: one(Task(each.model, each.record)) for name, each in run.items()})

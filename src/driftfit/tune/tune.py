@@ -18,100 +18,25 @@ out after Allen (1974), GCV after Craven and Wahba (1979).
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, one_series
-from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
-from driftfit.run.track import with_drifts
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.knobs import find_knobs
-from driftfit.tune.lanes import Record, score
+from driftfit.tune.lanes import Task, score
 from driftfit.tune.objective import Criterion, along
+from driftfit.tune.outputs import tune_outputs
 from driftfit.tune.search import Counted, Search, minimise
-
-if TYPE_CHECKING:
-    import polars
-    from matplotlib.figure import Figure
+from driftfit.tune.tuned import Tuned
 
 METHODS = ("ml", "h-step", "loo", "gcv")
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """What `tune` returns.
-
-    Attributes
-    ----------
-    tracker : Tracker
-        The tracker with its numbers, ready for `track` and `Live`.
-    method : str
-        The criterion.
-    loglik : float
-        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale as they go (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
-    noise : float
-        Estimated noise variance; not to be relied on when ``at_bound`` says so.
-    at_bound : tuple of str
-        Settings that ended at a bound of the search, or at zero; empty when the optimum is inside.
-    interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: of profiles (for "q[..]/r", "mu", "forgetting"
-        and a single "q" or "r"), or from curvature (for "q[..]" and "r" found together). NaN for other methods.
-    level : float
-        The level of the intervals.
-    """
-
-    tracker: Tracker
-    method: str
-    loglik: float
-    noise: float
-    at_bound: tuple[str, ...]
-    interval: dict[str, tuple[float, float]]
-    level: float
-    _search: Search = field(repr=False, compare=False)
-
-    @property
-    def table(self) -> polars.DataFrame:
-        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square."""
-        import polars
-
-        points, values = self._search.tried()
-        settings = np.array([self._search.knobs.values(x) for x in points])
-        columns = dict(zip(self._search.knobs.names, settings.T, strict=True))
-        name = {"ml": "loglik", "h-step": "mean_square"}.get(self.method, self.method)
-        return polars.DataFrame({**columns, name: self._criterion(values)})
-
-    @property
-    def chosen(self) -> dict[str, float]:
-        """What was found, by name of setting as in ``interval``; drifts are relative to the noise variance."""
-        names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
-        return {name: float(value) for name, value in zip(names, values, strict=True)}
-
-    def _criterion(self, values: Array) -> Array:
-        """Values of the objective as what they are called."""
-        return -values if self.method == "ml" else np.exp(values)
-
-    def curves(self) -> list[tuple[str, Array, Array]]:
-        """(name, values of the setting, criterion) along each knob, what `plot` draws."""
-        curves = []
-        for i in range(len(self._search.x)):
-            points, values = self._search.sweep(i)
-            entry = int(np.flatnonzero(self._search.knobs.owner == i)[0])
-            settings = np.array([self._search.knobs.values(x)[entry] for x in points])
-            curves.append((self._search.knobs.names[entry], settings, self._criterion(values)))
-        return curves
-
-    def plot(self) -> Figure:
-        """The criterion along each setting, the others following where it is a likelihood; a matplotlib figure."""
-        from driftfit.tune.plots import plot_tuned
-
-        return plot_tuned(self)
 
 
 def tune(
@@ -182,26 +107,24 @@ def tune(
     if method != "h-step" and not tracker.covariance:
         raise ValueError(f"tune: {type(tracker).__name__} has no variance, so {method!r} is undefined; use 'h-step'.")
     if len(model.outputs) > 1:
-        from driftfit.tune.outputs import tune_outputs
-
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        found = tune_outputs(model, tracker, y, u, known, lambda record: _tuned(record, tracker, *options))
+        found = tune_outputs(model, tracker, y, u, known, lambda task: _tuned(task, tracker, *options))
         return cast("Tuned", found)
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    return _tuned(_record(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
+    return _tuned(_task(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
-    record: Record, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
+    task: Task, tracker: Tracker, method: str, groups: Any, h: int, bounds: Any, level: float, order_by: Any
 ) -> Tuned:
-    """Tune a checked record."""
+    """Tune on a checked record."""
     if order_by is not None:
-        record = along(record, tracker, order_by)
-    knobs = find_knobs(record, tracker, groups, bounds)
-    f = Counted(Criterion(record, knobs, method, h))
+        task = along(task, tracker, order_by)
+    knobs = find_knobs(task, tracker, groups, bounds)
+    f = Counted(Criterion(task, knobs, method, h))
     search = Search(f, knobs, minimise(f, knobs))
-    final = score(record, [knobs.run(search.x)], h)
+    final = score(task, [knobs.run(search.x)], h)
     sigma2 = float(final.sigma2()[0])
     tuned = Tuned(
         tracker=knobs.build(search.x, sigma2),
@@ -209,7 +132,7 @@ def _tuned(
         loglik=float(final.loglik(knobs.profiled)[0]) if tracker.covariance else float("nan"),
         noise=sigma2 if knobs.profiled else float(getattr(knobs.run(search.x), "r", np.nan)),
         at_bound=tuple(name for name, i in zip(knobs.names, knobs.owner, strict=True) if search.at_bound(i)),
-        interval=intervals_of(search, record, method, tracker, level),
+        interval=intervals_of(search, task, method, tracker, level),
         level=level,
         _search=search,
     )
@@ -234,8 +157,7 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _record(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Record:
+def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Task:
     records = one_series(y, u, reading).for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
-    records = with_drifts(bound, [tracker], records)
-    return Record(bound, records.y, records.u, records.known)
+    return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))

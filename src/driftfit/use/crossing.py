@@ -32,20 +32,18 @@ import numpy as np
 from numba import types
 from scipy import special
 
-from driftfit.data import storage
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
-from driftfit.engine.drivers import INPUTS, drivers, tile_type
+from driftfit.engine.drivers import INPUTS, tile_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
-from driftfit.use.forecast import final_state
+from driftfit.run.program import state_of
+from driftfit.run.result import Track
 from driftfit.use.simulate import noise_at
 
 if TYPE_CHECKING:
     import polars
-
-    from driftfit.run.result import Track
 
 DRAWS = 2000
 
@@ -153,7 +151,7 @@ def crossing(
     if what in run.names:
         h = len(run) if horizon is None else whole("crossing", "horizon", horizon, 1)
         place = run.names.index(what)
-        lane = {name: values[0, ..., 0] for name, values in _fields(final_state(run)).items()}
+        lane = state_of(run.program.resting(run.state))
         drawn = "slope" in lane
         by = (_along_slopes if drawn else _reflected)(run, lane, place, sign, limit, h)
     elif what in ("y", run.labels.y):
@@ -161,7 +159,7 @@ def crossing(
         by = _of_output(run, sign, limit, whole("crossing", "horizon", h, 1), u)
     else:
         raise ValueError(f"crossing: there is no {what!r}; {near(str(what), (*run.names, run.labels.y))}")
-    times = None if run._time is None else Clock.of(run.labels.dt, run.labels.zone).ahead(run._time[-1], h)
+    times = Clock.of(run.labels.dt, run.labels.zone).ahead(run.last, h) if run.timed else None
     return Crossing(what, limit, side, level, h, by, times, run.labels.zone)
 
 
@@ -174,10 +172,6 @@ def _limit(below: float | None, above: float | None) -> tuple[float, str]:
     return float(limit), side
 
 
-def _fields(tile: Array) -> dict[str, Array]:
-    return {name: tile[name] for name in storage.fields(tile)}
-
-
 def _known(run: Track, cov: Array, place: int | None = None) -> Array:
     """A covariance; ValueError where nothing is known yet of what it is about."""
     if not np.isfinite(cov if place is None else cov[place, place]).all():
@@ -187,10 +181,9 @@ def _known(run: Track, cov: Array, place: int | None = None) -> Array:
 
 def _covariances(run: Track) -> tuple[Array, Array]:
     """(covariance of theta at the end, what a nominal sample without an observation adds to it), (n, n) each."""
-    tile = final_state(run)
-    lane = {name: values[0, ..., 0] for name, values in _fields(tile).items()}
-    steps = drivers(run.model.steps, run.tracker.steps_for(run.model))
-    update = steps.update.entry(tile_type(tile), types.float64, INPUTS)
+    tile = run.program.resting(run.state)
+    lane = state_of(tile)
+    update = run.program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
     now = run.tracker.cov(lane).copy()
     update(tile, np.nan, np.full(run.model.m, np.nan))
     with np.errstate(invalid="ignore"):
@@ -238,7 +231,7 @@ def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
         raise ValueError(
             f"crossing: the output depends on {model.m} inputs; give their future values, u= ({h}, {model.m})."
         )
-    if run.tracker.output_error or "slope" in storage.fields(run._tile):
+    if run.tracker.output_error or "slope" in run.state:
         raise ValueError(
             "crossing: the crossing of the output needs parameters that are random walks; ask for a parameter."
         )

@@ -11,17 +11,15 @@ nobody knows: an output block is inverted on their range, widened by a fifth. Co
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.use.simulate import Prediction, drift, moved, unbroken
+from driftfit.run.result import Track
+from driftfit.use.prediction import Prediction, drift, moved, unbroken
 from driftfit.use.system import covariances, taken
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
 
 Span = tuple[Any, Any]
 

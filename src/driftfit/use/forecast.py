@@ -20,29 +20,23 @@ psi_j^2, psi the response of 1 / A(z) to one noise, and everything is divided by
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from driftfit.data import storage
 from driftfit.data.labels import inputs_for
-from driftfit.data.signals import as_numbers
-from driftfit.engine.drivers import INPUTS, drivers, make_tile, tile_type
+from driftfit.engine.arrays import as_numbers
+from driftfit.engine.drivers import INPUTS, tile_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-
-if TYPE_CHECKING:
-    from driftfit.models.base import Model
-    from driftfit.run.live.outputs import LiveOutputs
-    from driftfit.run.outputs import Outputs
-    from driftfit.run.result import Track
-    from driftfit.run.shared_outputs import Shared
-    from driftfit.trackers.base import Tracker
-
-
-STANDING = ("interval", "noise", "drift", "each")
-"""Fields that hold what is known of one sample."""
+from driftfit.models.base import Model
+from driftfit.run.live.live import Live
+from driftfit.run.live.outputs import LiveOutputs
+from driftfit.run.outputs import Outputs
+from driftfit.run.program import Program, state_of
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
 
 
 class Forecast(NamedTuple):
@@ -75,7 +69,12 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
     ValueError
         If h is below 1, or u has not h rows and the model's number of inputs.
     """
-    return forecast_from(run.model, run.tracker, final_state(run), future(run.model, h, u))
+    return forecast_from(run.program, run.program.resting(run.state), future(run.model, h, u))
+
+
+def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
+    """`forecast` from where a stream stands; while `apply` is outstanding the first row of u is what that brings."""
+    return forecast_from(live.program, *live.driven_on(future(live.model, h, u)))
 
 
 def future(model: Model, h: int, u: Any) -> Array:
@@ -87,14 +86,14 @@ def future(model: Model, h: int, u: Any) -> Array:
     return inputs
 
 
-def forecast_from(model: Model, tracker: Tracker, tile: Array, inputs: Array) -> Forecast:
+def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     """Forecast from the state in a tile of one lane, which is driven on."""
+    model, tracker = program.model, program.tracker
     look, h, now = tile.copy(), len(inputs), tile["theta"][0, :, 0].copy()
-    lane = {name: tile[name][0, ..., 0] for name in storage.fields(tile)}
+    lane = state_of(tile)
     lagged = LagErrors.of(model, len(now)) if tracker.covariance else None
-    steps = drivers(model.steps, tracker.steps_for(model))
-    update = steps.update.entry(tile_type(tile), types.float64, INPUTS)
-    noise = tile["r"][0, 0] * tile["scale"][0, 0] if "r" in storage.fields(tile) else np.nan
+    update = program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
+    noise = lane["r"] * lane["scale"] if "r" in lane else np.nan
     result = Forecast(np.empty((h, len(now))), np.empty((h, len(now))), np.empty(h), np.empty(h))
     for k in range(h):
         look[...] = tile
@@ -117,14 +116,11 @@ def forecast_from(model: Model, tracker: Tracker, tile: Array, inputs: Array) ->
 
 def forecast_outputs(run: Outputs | Shared, h: int, u: Any = None) -> Forecast:
     """Forecast h nominal samples of several outputs: theta and std (h, ny, n) or (h, n), y_hat and y_std (h, ny)."""
-    from driftfit.run.live.outputs import LiveOutputs
-
-    end: Any = run.end()
+    if isinstance(run, Outputs):
+        tracker = dict(zip(run.outputs, run.trackers, strict=True))
+        return drive_on(LiveOutputs(run.model, tracker, warm_start=run), h, u)
     model: Any = run.model
-    tracker = end.tracker[0] if model.shared else dict(zip(run.outputs, end.tracker, strict=True))
-    if model.shared:
-        model = replace(model, regressors=run.rows.model.m)
-    return drive_on(LiveOutputs(model, tracker, warm_start=run), h, u)
+    return drive_on(LiveOutputs(replace(model, regressors=run.rows.model.m), run.tracker, warm_start=run), h, u)
 
 
 def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
@@ -137,10 +133,11 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
     if live.awaits:
         live.apply(inputs[0])
         inputs = [*inputs[1:], None]
-    apart = () if model.shared else [model.alone(output) for output in model.outputs]
-    if apart and None not in apart:
-        rows = [np.full(model.m, np.nan) if row is None else live._inputs(row) for row in inputs]
-        return _each_alone(live, apart, np.array(rows))
+    apart = live.alone()
+    if apart:
+        rows = np.array([live.inputs_of(row) for row in inputs])
+        found = [forecast_from(program, tile, rows) for program, tile in apart]
+        return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
     parts: list[tuple[Array, ...]] = []
     lagged = None if model.shared or not live.trackers[0].covariance else LagErrors.of(model, model.n)
     for row in inputs:
@@ -150,14 +147,6 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
         parts.append((live.theta, live.std, y_hat, s))
     theta, std, means, variances = (np.array(part) for part in zip(*parts, strict=True))
     return Forecast(theta, std, means, np.sqrt(variances))
-
-
-def _each_alone(live: LiveOutputs, models: list[Model], inputs: Array) -> Forecast:
-    """The forecast of outputs of which none is a regressor of another."""
-    found = []
-    for lane, (model, tracker) in enumerate(zip(models, live.trackers, strict=True)):
-        found.append(forecast_from(model, tracker, resting(model, tracker, live._tile, lane), inputs))
-    return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
 
 
 class LagErrors:
@@ -209,17 +198,3 @@ class LagErrors:
         tl[:, :, place] = self._tl[:, :, kept]
         tl[:, :, new] = np.moveaxis(with_theta, 0, 2)
         self._ll, self._tl = ll, tl
-
-
-def final_state(run: Track) -> Array:
-    """The state after the last sample, as a tile of one lane."""
-    return resting(run.model, run.tracker, run._tile, run._lane)
-
-
-def resting(model: Model, tracker: Tracker, from_tile: Array, lane: int = 0) -> Array:
-    """The state of a lane as a tile of one lane; what was known of its last sample alone is left behind."""
-    tile = make_tile(model.n, model.m, model.memory(), [tracker.state_for(model)])
-    for name in storage.fields(tile):
-        if name not in STANDING:
-            tile[name][0, ..., 0] = from_tile[name][0, ..., lane]
-    return tile

@@ -17,8 +17,7 @@ drawn from (`driftfit.use.draws`).
 
 from __future__ import annotations
 
-from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -26,36 +25,13 @@ from driftfit.data.labels import inputs_for
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.models.arx import ARX, GAP
+from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.result import Track
+from driftfit.use.draws import ahead_by_draws, simulate_by_draws
+from driftfit.use.prediction import Prediction, drift, moved, unbroken
 from driftfit.use.system import covariances, taken
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
-
-
-class Prediction(NamedTuple):
-    """Outputs with what is known of their errors; NaN where inputs or lags are missing."""
-
-    y_hat: Array
-    """(T,): at the sample that is predicted."""
-    theta_std: Array
-    """(T,): standard deviation from the parameters alone, the band of the mean."""
-    y_std: Array
-    """(T,): with the noise, the band of the output."""
-    paths: Array | None = None
-    """(D, T): outputs that were drawn, for models whose predictions bend in their parameters."""
-
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high) of the output, (T,) each: normal, or quantiles of the drawn outputs."""
-        if self.paths is not None:
-            known = np.isfinite(self.paths).all(axis=0)
-            ends = np.quantile(np.where(known, self.paths, 0.0), [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
-            low, high = np.where(known, ends, np.nan)
-            return low, high
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.y_std
-        return self.y_hat - half, self.y_hat + half
 
 
 def ahead(run: Track, k: int) -> Prediction:
@@ -72,8 +48,6 @@ def ahead(run: Track, k: int) -> Prediction:
             "ahead: predictions over a record assume a constant theta, but here it follows its slope; use run.forecast."
         )
     if not isinstance(run.model, ARX | Regression):
-        from driftfit.use.draws import ahead_by_draws
-
         return ahead_by_draws(run, k)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     T, theta, cov = len(run), run.theta, covariances(run)
@@ -124,8 +98,6 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
     given = np.zeros(0) if y is None else np.asarray(y, float)
     if not isinstance(run.model, ARX | Regression):
-        from driftfit.use.draws import simulate_by_draws
-
         return simulate_by_draws(run, inputs, at, given)
     na, U = input_regressors(run.model, inputs, rest=0.0)
     (theta,), (cov,) = taken(run, at)
@@ -187,44 +159,12 @@ def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int,
     return model.na, np.column_stack([np.zeros((len(u), 0)), *columns, *one])
 
 
-def moved(values: Array, by: int, rest: float = np.nan) -> Array:
-    """Values (T, ..) so many samples later (earlier where negative)."""
-    out = np.full(values.shape, rest)
-    T = len(values)
-    if by >= 0:
-        out[by:] = values[: max(T - by, 0)]
-    else:
-        out[: max(T + by, 0)] = values[-by:]
-    return out
-
-
 def _known(values: Array) -> Array:
     """Values with NaN for what is not finite."""
     return np.where(np.isfinite(values), values, np.nan)
-
-
-def drift(run: Track, r: Array) -> Array:
-    """q per sample, (1, n, n) or (T, n, n); zero where theta itself does not walk at random."""
-    n = len(run.names)
-    try:
-        walk = run.tracker.random_walk(run.model)
-    except ValueError:
-        return np.zeros((1, n, n))
-    if walk.slopes:
-        return np.zeros((1, n, n))
-    scale = np.ones(1) if walk.r is not None else np.where(np.isfinite(r), r, 0.0)
-    return np.asarray(walk.q * scale[:, None, None])
 
 
 def _filled(values: Array) -> Array:
     """NaN replaced by the last number before it."""
     place = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
     return np.where(place >= 0, values[place], np.nan)
-
-
-def unbroken(run: Track, na: int, k: int) -> Array:
-    """Samples whose k steps, and the lags before them, have no gap in time."""
-    gaps = np.broadcast_to(run._known[:, 0], len(run)) > GAP
-    total = np.concatenate([[0], np.cumsum(gaps)])
-    first = np.maximum(np.arange(len(run)) - k - max(na, 1) + 2, 0)
-    return np.asarray(total[1:] == total[first])

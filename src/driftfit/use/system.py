@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from driftfit.engine.drivers import drivers, output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
@@ -33,14 +32,15 @@ if TYPE_CHECKING:
 
 
 class Followed(Protocol):
-    """What has parameters over time: a `Track`, or the present of a stream (`driftfit.run.live.system`)."""
+    """What has parameters over time: a `Track`, or the present of a stream (`driftfit.use.live_system`)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
     @property
     def theta(self) -> Array: ...
 
-    model: Model
+    @property
+    def model(self) -> Model: ...
 
     def __len__(self) -> int: ...
     def cov(self, t: int) -> Array: ...
@@ -92,14 +92,7 @@ def covariances(run: Track) -> Array:
     n = len(run.names)
     if not run.tracker.covariance:
         return np.full((len(run), n, n), np.nan)
-    if "P" in (run._out.dtype.names or ()):
-        return _finite(run._written("P"))
-    tile = run._fresh_tile()
-    out = np.empty(len(run), output_type(tile, run.tracker.outputs, "cov"))
-    known = run._known[:, :, None]
-    steps = drivers(run.model.steps, run.tracker.steps_for(run.model), "cov")
-    steps.run(tile, run.y[:, None], run.u[:, :, None], known, out)
-    return _finite(out["P"][..., 0])
+    return _finite(run.covariances())
 
 
 def _finite(cov: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.data.signals import as_output
 from driftfit.engine.kernel import Array
-from driftfit.show.plots import BLUE, GREY, RED, frame, named, new_figure, settled
+from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, new_figure, settled
 from driftfit.use.simulate import fit, simulate
 from driftfit.use.system import arx_of, dc_gain, frequency_response, input_of, largest_pole, poles, step_response
 
@@ -137,7 +137,7 @@ def _plane(axis: Axes, run: Track, first: int) -> None:
 
 
 def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
-    from driftfit.show.plots import date_axis, time_label
+    from driftfit.show.parts.axes import date_axis, time_label
 
     gain, pole = dc_gain(run), largest_pole(run)
     low, high = (part[:, j] for part in gain.band(level))

@@ -130,7 +130,7 @@ class Given:
 
     def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
         """The run that the options ask for: a Track, an Outputs or a fleet."""
-        from driftfit.run.track import track
+        from driftfit.tracking import track
 
         model, chosen, before = self._begun()
         signals: Any = self.signals(rows)
@@ -171,8 +171,8 @@ class Given:
 
 def saved(path: Path) -> Any:
     """A run, or a live state, from a file."""
-    from driftfit.run.live.live import Live
-    from driftfit.run.result import Track
+    from driftfit.results import Track
+    from driftfit.streams import Live
 
     try:
         return Track.load(path)

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from driftfit import __version__
-from driftfit.show.summary import WIDTH
+from driftfit.show.parts.text import WIDTH
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, help="Follow the parameters of a system while they change.",

@@ -16,7 +16,6 @@ that the rate is known to about 1 / sqrt(TIMES).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,11 +25,9 @@ from driftfit.judge.alarms.onsets import onsets
 from driftfit.judge.statistics.scale import core
 from driftfit.models.arx import ARX
 from driftfit.models.regression import Regression
-from driftfit.run.track import drive
-from driftfit.use.simulate import input_regressors, moved
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
+from driftfit.run.result import Track, burn_in
+from driftfit.use.prediction import moved
+from driftfit.use.simulate import input_regressors
 
 TIMES = 50.0
 """Expected false alarms in all simulated records together."""
@@ -52,11 +49,11 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
     rng = np.random.default_rng(seed)
     na, U = input_regressors(run.model, np.where(np.abs(run.u) < LARGEST, run.u, np.nan))
     pool, U, theta = residuals(run, na, U), _last_known(U), run.theta[at]
-    noise = np.broadcast_to(np.where(np.isfinite(run._known[:, 1]), np.sqrt(run._known[:, 1]), 1.0), len(run))
+    noise = np.broadcast_to(np.where(np.isfinite(run.known.noise), np.sqrt(run.known.noise), 1.0), len(run))
 
     def played() -> tuple[Array, Track]:
         v = rng.choice(pool, len(run))
-        return v, _tracked(run, _played(theta, na, U, noise * v))
+        return v, run.again(_played(theta, na, U, noise * v))
 
     v, made = played()
     # innovations are larger than noise, by what the parameters add to them: scale until they are as large as those seen
@@ -66,19 +63,10 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
         yield played()[1]
 
 
-def _tracked(run: Track, y: Array) -> Track:
-    """The run's tracker over another output."""
-    from driftfit.run.result import Track
-
-    tile = run._fresh_tile()
-    out = drive(run.model, run.tracker, tile, y, run.u, run._known)
-    return Track(run.model, run.tracker, y, run.u, None, run._known, out, tile)
-
-
 def innovations(run: Track) -> Array:
     """Innovations after the start, at weight 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return _later(run, run.innovation / np.sqrt(run._known[:, 1]))
+        return _later(run, run.innovation / np.sqrt(run.known.noise))
 
 
 def residuals(run: Track, na: int, U: Array) -> Array:
@@ -89,12 +77,12 @@ def residuals(run: Track, na: int, U: Array) -> Array:
         e = run.innovation
         later = y - np.sum(phi * moved(run.theta, -LATER), axis=1)
         smaller = np.where(np.abs(later) < np.abs(e), later, e)
-        return _later(run, smaller / np.sqrt(run._known[:, 1]))
+        return _later(run, smaller / np.sqrt(run.known.noise))
 
 
 def _later(run: Track, e: Array) -> Array:
     """The finite ones after the start."""
-    e = e[min(max(50, 5 * run.model.n), len(run) // 2) :]
+    e = e[min(burn_in(run.model.n), len(run) // 2) :]
     e = e[np.isfinite(e)]
     if len(e) < 20:
         raise ValueError(f"detect: a calibration needs at least 20 innovations after the start; this run has {len(e)}.")

@@ -17,7 +17,7 @@
   its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
   rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
 
-What was found stands in ``said.rule`` (`driftfit.judge.alarms.rule.AlarmRule`), a small frozen object: `Live.detect`
+What was found stands in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
 watches a stream by it, and ``other.detect(said.rule)`` another record.
 
 Which kind when: docs/alarms.md. A tracker that finds its own drift follows a fault, and takes it for drift: its
@@ -45,11 +45,12 @@ from driftfit.engine.settings import numbers, one_of, whole
 from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
-from driftfit.judge.alarms.rule import KINDS, AlarmRule, check_fits, value_text
 from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of
+from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
+from driftfit.run.live.rule import KINDS, AlarmRule, check_fits, value_text
 from driftfit.run.result import Track
-from driftfit.show.summary import Printed, facts, table_of
+from driftfit.show.parts.text import Printed, facts, table_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -168,9 +169,7 @@ class Alarms(Printed):
 
     def plot(self, labels: Any = None) -> Figure:
         """Statistics over their limits, alarms marked; labels (T,) are shaded."""
-        from driftfit.judge.plots import plot_alarms
-
-        return plot_alarms(self, labels)
+        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, labels)
 
 
 def detect(
@@ -253,7 +252,7 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     """Alarms of a run by a rule; ``start`` as for `detect`."""
     check_fits(rule, run.tracker, run.names)
     if start is None:
-        start = burn(run) if run._start is None else 0
+        start = burn(run) if run.start is None else 0
     statistic = statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")

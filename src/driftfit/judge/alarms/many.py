@@ -33,7 +33,7 @@ from driftfit.engine.settings import numbers
 from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.many import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
-from driftfit.show.summary import Printed, facts, key_text, table_of
+from driftfit.show.parts.text import Printed, facts, key_text, table_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

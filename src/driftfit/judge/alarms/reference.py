@@ -9,6 +9,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from driftfit.engine.settings import whole
+from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -19,7 +20,7 @@ LEAST = 20
 
 def burn(run: Track) -> int:
     """Samples at the beginning of a run that judge nothing: an estimate that has just begun is no alarm."""
-    return max(50, 5 * run.model.n)
+    return burn_in(run.model.n)
 
 
 def in_samples(run: Track, reference: Any) -> Any:

@@ -22,8 +22,9 @@ from driftfit.judge.alarms.onsets import (
     power_rate,
 )
 from driftfit.judge.alarms.reference import burn, stretch
-from driftfit.judge.alarms.rule import CHANGE, AlarmRule, check_fits, power_and_mean
+from driftfit.run.live.rule import CHANGE, AlarmRule, check_fits, power_and_mean
 from driftfit.run.result import Track
+from driftfit.trackers.bank.results.results import Hypotheses
 
 Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
@@ -104,7 +105,7 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
         return rule.outside(run.theta[:, columns], run.std[:, columns])
     if rule.kind == "probability":
         bank: Any = run
-        p = bank._written(CHANGE) if CHANGE in run.tracker.outputs else bank.hypotheses.window
+        p = bank.written(CHANGE) if CHANGE in run.tracker.outputs else Hypotheses(bank).window
         return np.asarray(np.reshape(p, (len(run), -1))[:, :1])
     g = rule.scores(run.innovation, run.innovation_std)
     used = np.flatnonzero(np.isfinite(g) & (np.arange(len(g)) >= start))

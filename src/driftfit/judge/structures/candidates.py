@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from driftfit.data.record import Records
+from driftfit.data.known import Known
+from driftfit.data.record import Record, Records
 from driftfit.engine.kernel import Array
 from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.fleet import run_fleet
-from driftfit.run.result import Track
-from driftfit.run.track import drive
-from driftfit.run.warm_start import fresh_tile
+from driftfit.run.program import Program
+from driftfit.run.result import Track, track_record
 from driftfit.trackers.base import Tracker
 
 TOGETHER = 32
@@ -54,12 +54,15 @@ class Predicted(NamedTuple):
 class Pool:
     """A record, and the regressors (T, N) of the union of the structures that are made of columns."""
 
-    y: Array
-    u: Array
-    known: Array
+    record: Record
     phi: Array
     names: tuple[str, ...]
     gaps: Array
+
+    @property
+    def y(self) -> Array:
+        """(T,)"""
+        return self.record.y
 
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
         """Run structures and return what they predicted."""
@@ -80,20 +83,17 @@ class Pool:
         count, T, n = len(structures), len(self.y), structures[0].n
         columns = [s.columns for s in structures]
         u = np.concatenate([self.phi[:, list(chosen or ())] for chosen in columns])
-        factors = np.broadcast_to(self.known, (T, 3)).copy()
-        factors[:, 0] = self.gaps
+        known = self.record.known.changed(interval=self.gaps)
         records = Records(
             tuple(range(count)), np.arange(count) * T, np.full(count, T), np.tile(self.y, count), u,
-            np.tile(factors, (count, 1)),
+            Known(np.tile(known.columns, (count, 1))),
         )  # fmt: skip
-        fleet = run_fleet(Regression(n), [tracker] * count, records)
+        fleet = run_fleet([Program(Regression(n), tracker)] * count, records)
         return [fleet[k] for k in range(count)]
 
     def _alone(self, tracker: Tracker, structure: Structure) -> Track:
         assert structure.model is not None
-        tile = fresh_tile(structure.model, tracker)
-        out = drive(structure.model, tracker, tile, self.y, self.u, self.known)
-        return Track(structure.model, tracker, self.y, self.u, None, self.known, out, tile)
+        return track_record(Program(structure.model, tracker), self.record)
 
 
 def predicted(run: Track) -> Predicted:
@@ -103,19 +103,17 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
-def pool_of(
-    models: Sequence[Model], names: Sequence[str], y: Array, u: Array, known: Array
-) -> tuple[Pool, list[Structure]]:
+def pool_of(models: Sequence[Model], names: Sequence[str], record: Record) -> tuple[Pool, list[Structure]]:
     """The record with the union of the models' regressors, and the models as structures; models are bound."""
     linear = [model for model in models if _terms(model) is not None]
     if not linear:
-        empty = Pool(y, u, known, np.zeros((len(y), 0)), (), np.ones(len(y)))
+        empty = Pool(record, np.zeros((len(record), 0)), (), np.ones(len(record)))
         return empty, [Structure(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
-    seen = constant_least_squares(union, y, u, known)
+    seen = constant_least_squares(union, record)
     phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
-    pool = Pool(y, u, known, phi, union.names, seen["dt"][:, 0].copy())
+    pool = Pool(record, phi, union.names, seen["dt"][:, 0].copy())
     structures = []
     for name, model in zip(names, models, strict=True):
         terms = _terms(model)

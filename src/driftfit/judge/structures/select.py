@@ -34,14 +34,17 @@ from rich.text import Text
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, one_series
-from driftfit.data.signals import check_ready, factor
+from driftfit.data.signals import check_ready
+from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
+from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.show.summary import Printed, table_of
+from driftfit.run.result import burn_in
+from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 
@@ -156,9 +159,10 @@ class Selection(Printed):
 
     def plot(self, most: int = 20) -> Figure:
         """How far structures are below the best, with standard errors, and where in time they lost it."""
-        from driftfit.judge.plots import plot_selection
-
-        return plot_selection(self, most)
+        rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
+        terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
+        below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
+        return plot_selection([row.name for row in rows], below, std, terms)
 
 
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
@@ -239,7 +243,7 @@ def select(
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
     names = [repr(model) for model in candidates]
-    pool, structures = pool_of(bound, names, records.y, records.u, records.known)
+    pool, structures = pool_of(bound, names, replace(records.part(0), time=None))
     if isinstance(models, Model):
         structures, predictions = subsets(pool, tracker, structures[0], keep, most)
     else:
@@ -262,7 +266,7 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    judged = np.arange(len(pool.y)) >= max(50, 5 * max(s.n for s in structures))
+    judged = np.arange(len(pool.y)) >= burn_in(max(s.n for s in structures))
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]

@@ -14,6 +14,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure
+from driftfit.run.result import burn_in
 from driftfit.trackers.base import Tracker
 
 ALL = 5
@@ -52,7 +53,7 @@ class Tried:
         self.structures: list[Structure] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
-        self._start = min(max(50, 5 * len(pool.names)), len(pool.y) // 2)
+        self._start = min(burn_in(len(pool.names)), len(pool.y) // 2)
 
     def __call__(self, subsets: Sequence[frozenset[int]]) -> Array:
         """logliks of subsets, after the start, (k,)."""

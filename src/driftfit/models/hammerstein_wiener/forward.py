@@ -9,15 +9,13 @@ O(n + 64).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Thresholds
-
-if TYPE_CHECKING:
-    from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.products import Structure
 
 GRID = 64
 WIDER = 0.2
@@ -26,7 +24,23 @@ INSIDE = 0.97
 """Share of u_max within which the thresholds of a dead zone are held."""
 
 
-def play(model: HammersteinWiener, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+class Blocks(Protocol):
+    """What a `HammersteinWiener` model has for this."""
+
+    @property
+    def structure(self) -> Structure: ...
+    @property
+    def bases(self) -> tuple[Basis, ...]: ...
+    @property
+    def delays(self) -> tuple[int, ...]: ...
+    @property
+    def out(self) -> Basis: ...
+    @property
+    def linear(self) -> bool: ...
+    def output_weights(self, theta: Array) -> Array: ...
+
+
+def play(model: Blocks, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
     """Outputs (D, h); arguments as for `driftfit.models.base.Model.play`."""
     na, nbs, n_ins, n_out, intercept = model.structure
     at_b, (_, at_bc, at_ad) = na, model.structure.starts
@@ -71,7 +85,7 @@ def _inputs(basis: Basis, B: Array, u: Array) -> Array:
 class Inverse:
     """The output blocks of D systems, weights d (D, n_out), inverted on a grid over the span of each."""
 
-    def __init__(self, model: HammersteinWiener, d: Array, span: tuple[Any, Any]) -> None:
+    def __init__(self, model: Blocks, d: Array, span: tuple[Any, Any]) -> None:
         self.basis, self.d = model.out, d
         least, most = (np.atleast_1d(np.asarray(end, float)) for end in span)
         margin = WIDER * np.maximum(most - least, 1e-9)

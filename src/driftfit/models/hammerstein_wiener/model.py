@@ -35,7 +35,6 @@ the input carry a minus sign, without which the regression gives -b. Cost per sa
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -45,7 +44,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import numbers, output_names, whole
+from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.memory import memory, places_of
@@ -345,22 +344,20 @@ class HammersteinWiener(Model):
             outside = int(np.sum((seen < low) | (seen > high))) if low > -np.inf or high < np.inf else 0
             if outside:
                 effect = "are missing" if basis.limits == basis.expected else "are beyond what it was made for"
-                warnings.warn(
+                warn(
                     f"{outside} of {seen.size} samples of {what} lie outside the range ({low:g}, {high:g}) of "
                     f"{type(basis).__name__} and {effect}; {what} spans {seen.min():g} to {seen.max():g}.",
                     UserWarning,
-                    stacklevel=4,
                 )
             size = float(np.sqrt(seen @ seen / seen.size)) if seen.size else 0.0
             if isinstance(basis, Polynomial) and basis.degree > 1 and size and not 1.0 / UNIT <= size <= UNIT:
                 powers = np.abs(seen[:, None] ** [1, basis.degree])
                 lost = int(np.sum(powers[:, 1] >= DIGITS * np.maximum(powers[:, 0], 1.0)))
                 said = f", and {lost} samples, whose powers span more than 13 digits, are missing" if lost else ""
-                warnings.warn(
+                warn(
                     f"{what} has a root mean square of {size:g}: raw powers of data far from unit size are badly "
                     f"scaled{said}; scale it, or use Legendre({basis.degree}, ({seen.min():g}, {seen.max():g})).",
                     UserWarning,
-                    stacklevel=4,
                 )
 
 

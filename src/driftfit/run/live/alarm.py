@@ -13,7 +13,7 @@ import numpy as np
 
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.rule import AlarmRule, change_probability, check_fits, last_power_and_mean
+from driftfit.run.live.rule import AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
 KEPT = 256

@@ -10,7 +10,7 @@ is, bit for bit, the record in which u_t stands beside y_t.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba import types
@@ -19,20 +19,24 @@ from driftfit.data.arguments import check_roles
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.labels import by_name
 from driftfit.data.limits import Gate
-from driftfit.data.signals import as_numbers, check_ready, factor, noise_of
-from driftfit.data.storage import Kept, describe, fields, rebuild, restore
-from driftfit.engine.drivers import INPUTS, drivers, tile_type
+from driftfit.data.signals import check_ready, noise_of
+from driftfit.data.storage import Kept, describe, rebuild, restore
+from driftfit.engine.arrays import as_numbers, factor
+from driftfit.engine.drivers import INPUTS, tile_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
+from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.fixed_lag import FixedLag, Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
-from driftfit.run.live.operator import HELD, ORDINARY, Asked, Operated
-from driftfit.run.warm_start import End, Run, carried, fresh_tile
-from driftfit.smooth.fixed_lag import FixedLag, Window
+from driftfit.run.live.operator import HELD, ORDINARY, Operated
+from driftfit.run.live.outputs import LiveOutputs
+from driftfit.run.live.rule import AlarmRule
+from driftfit.run.plain import Plain
+from driftfit.run.program import Program, state_of
+from driftfit.run.result import burn_in
+from driftfit.run.warm_start import End, Run, carried
 from driftfit.trackers.base import Tracker
-
-if TYPE_CHECKING:
-    from driftfit.run.live.alarm import LiveAlarm
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
@@ -40,7 +44,7 @@ Step = tuple[float, float, float, bool]
 _FLOAT = np.dtype(np.float64)
 
 
-class Live(Operated, Asked, Kept):
+class Live(Operated, Plain, Kept):
     """Track a stream.
 
     A stream can be copied, pickled and sent to another process, as it is saved: it goes on as if never stopped.
@@ -63,14 +67,17 @@ class Live(Operated, Asked, Kept):
 
     _kind: ClassVar[str] = "state"
 
+    @classmethod
+    def _kinds(cls) -> Mapping[str, type[Kept]]:
+        """A file of a stream with several outputs gives that."""
+        return {cls._kind: cls, LiveOutputs.public()._kind: LiveOutputs.public()}
+
     def __new__(cls, model: Model, *args: Any, **kwargs: Any) -> Any:
         """A stream with several outputs is a `LiveOutputs`."""
         tracker = args[0] if args else kwargs.get("tracker")
         check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         if len(model.outputs) == 1:
             return super().__new__(cls)
-        from driftfit.run.live.outputs import LiveOutputs
-
         return LiveOutputs(model, *args, **kwargs)
 
     def __init__(
@@ -88,15 +95,14 @@ class Live(Operated, Asked, Kept):
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
         self._ignored = 0
-        self._separator: Any = None
         self._place: Any = None
         self._alarms: tuple[LiveAlarm, ...] = ()
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
         self._window = Window(self.model, tracker, lag) if lag else None
-        start = None if warm_start is None else carried(warm_start, self.model, tracker)
-        self._open(fresh_tile(self.model, tracker, start))
+        self.program = Program(self.model, self.tracker)
+        self._open(self.program.tile(*carried(warm_start, [self.program])))
 
     def _open(self, tile: Array) -> None:
         """Take a state and compile the step for it."""
@@ -106,7 +112,7 @@ class Live(Operated, Asked, Kept):
         self._m = self.model.m
         self._unknown = np.full(self._m, np.nan)
         self._shape = (self._m,)
-        compiled = drivers(self.model.steps, self.tracker.steps_for(self.model))
+        compiled = self.program.drivers()
         kind = tile_type(tile)
         f8 = types.float64
         self._update = compiled.update.entry(kind, f8, INPUTS)
@@ -117,6 +123,11 @@ class Live(Operated, Asked, Kept):
         """Whether a sample is more than a call of the compiled step."""
         more = self._window, self._gate
         self._careful = more != (None, None) or bool(self._alarms) or self._awaits != NOTHING
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.program.names
 
     def update(
         self,
@@ -262,14 +273,58 @@ class Live(Operated, Asked, Kept):
             raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
         return self._window.smooth(self._tile)
 
+    def detect(self, rule: AlarmRule, wait: int | None = None) -> LiveAlarm:
+        """Watch the stream from the next sample on by the rule of a reference run, ``run.detect(...).rule``.
+
+        The alarm says after every update whether it is on, has just begun, and for what cause (`LiveAlarm`). It is
+        saved with the state; `alarms` gives all of them. Over the same samples it says what ``Track.detect(rule,
+        start=...)`` says of the record, bit for bit.
+
+        Parameters
+        ----------
+        rule : AlarmRule
+            Limits and settings. The tracker should be that of the reference run.
+        wait : int or None
+            Samples that are not judged. None: those of a start from nothing, max(50, 5 n); 0 after a warm start.
+
+        Raises
+        ------
+        ValueError
+            For a tracker or model that has not what the rule compares.
+        """
+        start = burn_in(self.model.n) if self._cold else 0
+        wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
+        alarm = LiveAlarm(check_rule(rule), self.tracker, self.names, wait)
+        self._alarms = (*self._alarms, alarm)
+        self._be_careful()
+        return alarm
+
+    @property
+    def alarms(self) -> tuple[LiveAlarm, ...]:
+        """The alarms that watch this stream, in the order in which `detect` made them."""
+        return self._alarms
+
     def lane(self) -> dict[str, Array]:
         """The fields of the record, as views."""
-        return {name: self._tile[name][0, ..., :1][..., 0] for name in fields(self._tile)}
+        return state_of(self._tile)
 
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
         state = {name: np.array(value) for name, value in self.lane().items()}
-        return End(self.model, self.tracker, state, self._last, self._awaits)
+        return End((self.program,), (state,), self._last, self._awaits)
+
+    def before(self, steps: float) -> Any:
+        """The time so many nominal intervals before the last sample; None where samples have no times."""
+        time = None if self._last is None else self._clock.moved(self._last, np.array([-steps]))
+        return None if time is None else time[0]
+
+    def driven_on(self, inputs: Array) -> tuple[Array, Array]:
+        """(a copy of the state to be driven on, inputs (h, m) then): what `apply` is to bring is the first of them."""
+        tile = self.program.resting(self.lane())
+        if self._awaits == INPUT:
+            self._placing()(tile, inputs[0])
+            inputs = np.vstack([inputs[1:], np.full((1, self._m), np.nan)])
+        return tile, inputs
 
     def _inputs(self, u: Any) -> Array:
         """u as floats (m,)."""
@@ -349,10 +404,7 @@ class Live(Operated, Asked, Kept):
             live._window.restore(extra["window"])
         live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra.get("cold", True)
         live._awaits = extra.get("awaits", NOTHING)
-        if extra.get("alarms"):
-            from driftfit.run.live.alarm import LiveAlarm
-
-            live._alarms = tuple(LiveAlarm.of(state, tracker, live.names) for state in extra["alarms"])
+        live._alarms = tuple(LiveAlarm.of(state, tracker, live.names) for state in extra.get("alarms", ()))
         restore(source, tracker, arrays, "state_", live.lane())
         live._be_careful()
         return live

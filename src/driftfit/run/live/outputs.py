@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import copy
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from dataclasses import replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -12,29 +12,29 @@ from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.labels import by_name, order_of
 from driftfit.data.limits import Gate
-from driftfit.data.signals import as_numbers, factor, noise_of
-from driftfit.engine.drivers import drivers, output_type
+from driftfit.data.signals import noise_of
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.fixed_lag import FixedLag, Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
-from driftfit.run.output_lanes import end_of, joint_tile, parameter_names, taken_over, trackers_of
+from driftfit.run.live.rule import AlarmRule
+from driftfit.run.output_lanes import programs_of
+from driftfit.run.plain import Plain
+from driftfit.run.program import Program, state_of, tile_of
+from driftfit.run.result import burn_in
 from driftfit.run.shared_outputs import row_model
-from driftfit.run.warm_start import End, Run
-from driftfit.smooth.fixed_lag import FixedLag, Window
+from driftfit.run.warm_start import End, Run, carried
 from driftfit.trackers.base import Tracker
-
-if TYPE_CHECKING:
-    from driftfit.judge.alarms.rule import AlarmRule
-    from driftfit.run.live.alarm import LiveAlarm
-    from driftfit.use.forecast import Forecast
 
 Steps = tuple[Array, Array, Array, Array]
 """(y_hat, e, s, ok), each (ny,)."""
 
 
-class LiveOutputs(storage.Kept):
+class LiveOutputs(Plain, storage.Kept):
     """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
 
     ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
@@ -49,7 +49,7 @@ class LiveOutputs(storage.Kept):
         limits: Mapping[Any, Any] | None = None,
     ) -> None:  # fmt: skip
         self.model = model if model.shared else model.bind(model.m)
-        self.trackers = trackers_of(self.model, tracker)
+        given = programs_of(self.model, tracker)
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, model.reach)
@@ -63,13 +63,19 @@ class LiveOutputs(storage.Kept):
         self._ignored = 0
         self._alarms: dict[str, LiveAlarm] = {}
         self._place: Any = None
-        self._rows = row_model(self.model, self.trackers[0]) if self.model.shared else self.model
+        self._rows = row_model(self.model, given[0].tracker) if self.model.shared else self.model
+        self.programs = tuple(replace(one, model=self._rows) for one in given)
         self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
-        self._tile = joint_tile(self._rows, self.trackers, taken_over(warm_start, self._rows, self.trackers))
-        self._out = np.empty(1, output_type(self._tile, self.trackers[0].outputs))
-        self._run = drivers(self._rows.steps, self.trackers[0].steps_for(self._rows)).run
+        self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+        self._out = self.programs[0].written(self._tile, 1)
+        self._run = self.programs[0].drivers().run
         rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
         self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
+
+    @property
+    def trackers(self) -> tuple[Tracker, ...]:
+        """The tracker of each output, or of the theta that they share."""
+        return tuple(one.tracker for one in self.programs)
 
     def update(self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
         """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
@@ -174,24 +180,13 @@ class LiveOutputs(storage.Kept):
         y_hat, _, s, _ = self._step(tile, missing, inputs, self._known(), [])
         return y_hat, s
 
-    def forecast(self, h: int, u: Any = None) -> Forecast:
-        """The next h nominal samples, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny).
-
-        While `apply` is outstanding the first row of u is what it would bring.
-        """
-        from driftfit.use.forecast import drive_on
-
-        return drive_on(copy(self), h, u)
-
     def detect(self, rules: Mapping[str, AlarmRule], wait: int | None = None) -> dict[str, LiveAlarm]:
         """Watch outputs by the rules of reference runs, by name: ``{"flow": run["flow"].detect(...).rule}``.
 
         One rule an output; ``wait`` and the alarms are those of `Live.detect`. ValueError where the outputs share one
         theta, or for a name that is not there.
         """
-        from driftfit.run.live.alarm import LiveAlarm, check_rule
-
-        start = max(50, 5 * self._rows.n) if self._cold else 0
+        start = burn_in(self._rows.n) if self._cold else 0
         wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
         absent = [name for name in rules if name not in self.model.outputs]
         if self.model.shared or absent:
@@ -246,6 +241,15 @@ class LiveOutputs(storage.Kept):
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
 
+    def alone(self) -> list[tuple[Program, Array]]:
+        """Each output with its state as a tile of its own; none where outputs are regressors of each other."""
+        found = [(one.alone, lane) for lane, one in enumerate(self.programs)]
+        return [(one, one.resting(state_of(self._tile, lane))) for one, lane in found if one is not None]
+
+    def inputs_of(self, u: Any) -> Array:
+        """u as floats (m,), NaN where it is not known."""
+        return self._inputs(u)
+
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each from all samples so far: theta and std.
 
@@ -275,8 +279,7 @@ class LiveOutputs(storage.Kept):
     def cov(self) -> Array:
         """Covariance of theta, (ny, n, n), or (n, n) where the outputs share one theta."""
         lanes = range(self._tile["theta"].shape[-1])
-        states = ({name: self._tile[name][0, ..., l] for name in storage.fields(self._tile)} for l in lanes)
-        cov = np.array([tracker.cov(state) for tracker, state in zip(self.trackers, states, strict=True)])
+        cov = np.array([self.trackers[l].cov(state_of(self._tile, l)) for l in lanes])
         return cov[0] if self.model.shared else cov
 
     @property
@@ -288,7 +291,7 @@ class LiveOutputs(storage.Kept):
     @property
     def names(self) -> tuple[Any, ...]:
         """Names of the parameters, of each output where they have one theta each."""
-        return self._rows.names if self.model.shared else parameter_names(self.model, self.trackers)
+        return self._rows.names if self.model.shared else tuple(one.names for one in self.programs)
 
     @property
     def ignored(self) -> int:
@@ -302,7 +305,9 @@ class LiveOutputs(storage.Kept):
 
     def end(self) -> End:
         """Where the stream stands, for a run to begin (`warm_start`)."""
-        return end_of(self._rows, self.trackers, self._tile, self._last)._replace(awaits=self._awaits)
+        lanes = range(len(self.programs))
+        states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
+        return End(self.programs, states, self._last, self._awaits)
 
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         extra = {
@@ -340,8 +345,6 @@ class LiveOutputs(storage.Kept):
         for window, state in zip(live._windows, extra["windows"], strict=True):
             window.restore(state)
         for name, state in extra.get("alarms", {}).items():
-            from driftfit.run.live.alarm import LiveAlarm
-
             lane = model.outputs.index(name)
             live._alarms[name] = LiveAlarm.of(state, trackers[lane], live.names[lane])
         into = {name: live._tile[name][0] for name in storage.fields(live._tile)}

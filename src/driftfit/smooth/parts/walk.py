@@ -1,29 +1,19 @@
-"""The problem that smoothers solve: a regression whose coefficients walk at random, as a run left it.
+"""The problem that smoothers solve: a regression whose coefficients walk at random. Arrays only, no runs.
 
-    y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
-    theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(each_t)
-    theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
-
-The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
-once to collect them.
+y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
+theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(each_t)
+theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.data.signals import as_numbers
-from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type
-from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.engine.arrays import as_numbers
+from driftfit.engine.kernel import Array
 from driftfit.trackers.base import RandomWalk
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
-
-COLLECTED = ("phi", "y", "dt", "valid")
 
 NONE = np.zeros((0, 0))
 """No parameter drifts otherwise than q says, and none has a slope."""
@@ -119,87 +109,6 @@ class Path(NamedTuple):
     """(T, n), per nominal interval; empty where theta has none."""
     slope_var: Array = NONE
     """(T, n), or empty."""
-
-
-@kernel
-def collect(o: State, s: State, l: int) -> None:
-    """Store what the tracker saw, after the model and the missing-data rule have spoken."""
-    for i in range(s.phi.shape[0]):
-        o.phi[i, l] = s.phi[i, l]
-    o.y[l] = s.y[l]
-    o.dt[l] = s.dt[l]
-    o.valid[l] = s.valid[l]
-
-
-@lru_cache
-def attentive(steps: TrackerSteps) -> TrackerSteps:
-    """Steps that note the factor of the noise variance when the tracker is at work, and what the tracker notes itself.
-
-    A model may make it larger than what the user gave (measurement noise that comes in through a curve).
-    """
-    predict, begin, note = steps.predict, steps.begin, steps.note
-
-    @kernel
-    def collect_all(o: State, s: State, l: int) -> None:
-        collect(o, s, l)
-        note(o, s, l)
-        o.used_noise[l] = s.used_noise[l]
-
-    @kernel
-    def noting(s: State, l: int) -> None:
-        s.used_noise[l] = s.noise[l]
-        predict(s, l)
-
-    if begin is None:
-        return steps._replace(predict=noting, store=collect_all)
-    first: Step = begin
-
-    @kernel
-    def noting_first(s: State, l: int) -> None:
-        s.used_noise[l] = s.noise[l]
-        first(s, l)
-
-    return steps._replace(predict=noting, begin=noting_first, store=collect_all)
-
-
-def replay(run: Track) -> Array:
-    """Run the tracker over its record again and return what it saw, (T,) records.
-
-    Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
-    """
-    model, tracker = run.model, run.tracker
-    tile = make_tile(model.n, model.m, model.memory(), [{**tracker.state_for(model), "used_noise": 1.0}])
-    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *tracker.noted)))
-    steps = attentive(tracker.steps_for(model))
-    drivers(model.steps, steps).run(tile, run.y[:, None], run.u[:, :, None], run._known[:, :, None], out)
-    return out
-
-
-def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
-    """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
-
-    ``prior`` replaces what the tracker takes theta to be.
-    """
-    own, tracker = prior is None, run.tracker
-    each = run._known[:, 3:] if own and run._known.shape[1] > 3 else NONE
-    if prior is None:
-        prior = free(run.model.n) if tracker.noted else tracker.random_walk(run.model)
-    seen = replay(run)
-    dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
-    weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
-    drift = dt * run._known[:, 2]
-    if own and tracker.noted:
-        noted = {name: seen[name][..., 0] for name in tracker.noted}
-        q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
-        each, weight, drift = np.sqrt(q), weight / r_of, np.ones(len(drift))
-    trend = dt if prior.slopes else NONE
-    if prior.at_first_sample or prior.p0 is None:
-        first = int(np.argmax(dt > 0.0)) + 1
-        drift[:first], trend[:first] = 0.0, 0.0
-    r = 1.0 if prior.r is None else prior.r
-    p0 = None if prior.p0 is None else prior.p0 / r
-    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
-    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
 
 
 def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:

@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
@@ -136,7 +136,7 @@ class Bank(Tracker):
         nominal, others = self.all_sensors[0], self.all_sensors[1:]
         if nominal.kind != "nominal" or any(other.kind == "nominal" for other in others):
             raise ValueError("Bank: the first sensor, and only that, must be Sensor.nominal(...).")
-        self._shape, self._events  # noqa: B018  (both refuse what does not fit)
+        self._shape, self.event_probabilities  # noqa: B018  (both refuse what does not fit)
         if self.all_changes[0].reset:
             raise ValueError("Bank: the first change is the normal course of events and cannot be a reset.")
         if isinstance(self.reduction, reductions.FirstFloor) and any(one.forgets for one in self.all_changes):
@@ -181,12 +181,12 @@ class Bank(Tracker):
         return self.reduction.shape(len(self.all_changes), len(self.all_sensors))
 
     @property
-    def _events(self) -> tuple[Array, Array]:
+    def event_probabilities(self) -> tuple[Array, Array]:
         return events("Bank", self.all_changes, self.all_sensors, self.transition, self.initial)
 
     @property
     def _alike(self) -> bool:
-        P = self._events[0]
+        P = self.event_probabilities[0]
         return bool((P[0] == P).all())
 
     @property
@@ -195,7 +195,7 @@ class Bank(Tracker):
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
             return False
-        P = self._events[0].reshape(-1, Hd, Hm)
+        P = self.event_probabilities[0].reshape(-1, Hd, Hm)
         product = P.sum(axis=2)[0, :, None] * P.sum(axis=1)[:, None, :]
         return self._alike or bool(np.allclose(P, product, rtol=1e-12, atol=1e-15))
 
@@ -205,7 +205,7 @@ class Bank(Tracker):
         return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
 
     @property
-    def _chained(self) -> bool:
+    def chained(self) -> bool:
         """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
         merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
         walks = not any(one.forgets for one in self.all_changes)
@@ -304,7 +304,7 @@ class Bank(Tracker):
                 columns[:, H : H + Hd * Hd] = chains("Bank", given, T, Hd)
             else:
                 given = np.broadcast_to(given, (T, given.shape[-1]))
-                columns[:, :H] = per_sample("Bank", given, self._events[1], Hd)
+                columns[:, :H] = per_sample("Bank", given, self.event_probabilities[1], Hd)
         if drift is not None:
             factors = np.asarray(factor("drift", as_numbers("drift", drift).ravel(), np.size(drift)))
             if factors.size not in (Hd, T * Hd):
@@ -382,12 +382,12 @@ class Bank(Tracker):
         kinds = [event.kind for event in told.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
-        faults = int(run._tile["many"][0, FAULTS, run._lane])
+        faults = int(run.state["many"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
             said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
-        lane = run.end().state
+        lane = run.state
         if (never := np.isinf(lane["var"])).any():
             names = ", ".join(np.array(run.names)[never])
             said.append(("Not learned", f"{names}: never varied separately from the others; std is inf"))

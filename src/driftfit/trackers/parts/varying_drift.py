@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.data.signals import as_numbers, factor
+from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array, State, kernel
 
 

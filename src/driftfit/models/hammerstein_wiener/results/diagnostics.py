@@ -26,7 +26,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of, covariances
-from driftfit.smooth.parts.walk import replay
+from driftfit.smooth.problem import replay
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track

@@ -22,6 +22,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.settings import numbers
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.run.fleet import Fleet
 from driftfit.run.track import track
 from driftfit.trackers.kalman import Kalman
 
@@ -72,7 +73,8 @@ def track_ratios(
     if not keep < 1.0:
         raise ValueError(f"track_ratios: fade must lie between 0 and 1; got {fade!r}.")
     trackers = [Kalman(q=rho, r=1.0, p0=p0, theta0=theta0) for rho in rhos]
-    grid: Any = track(model, trackers, y, u)
+    grid = track(model, trackers, y, u)
+    assert isinstance(grid, Fleet)
     found = [grid[j] for j in range(len(trackers))]
     score = np.stack([_score(run, keep) for run in found], axis=1)
     leads = np.argmax(score, axis=1)

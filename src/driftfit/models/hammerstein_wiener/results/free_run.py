@@ -24,6 +24,7 @@ from driftfit.models.hammerstein_wiener.memory import GRID
 from driftfit.models.hammerstein_wiener.output_curve import FAR, WIDER
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -49,7 +50,7 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
     """
     found = blocks_of(run, method)
     T, na = len(run), found.a.shape[1]
-    begin = min(max(50, 5 * run.model.n), T) if start is None else max(int(start), 1)
+    begin = min(burn_in(run.model.n), T) if start is None else max(int(start), 1)
     y, w, v = np.full((3, T), np.nan)
     result = FreeRun(y, w, v, np.ones(T, bool), np.ones(T, bool))
     nks, curves = found.model.delays, [inputs(found, run.u[:, i], i) for i in range(found.model.m)]

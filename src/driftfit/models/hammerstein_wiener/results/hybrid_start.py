@@ -12,21 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.data.record import PLAIN
+from driftfit.data.known import Known
+from driftfit.data.record import Record
 from driftfit.data.signals import as_inputs, as_output
-from driftfit.engine.drivers import known_factors
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.hammerstein_wiener.memory import MINIMAL
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.diagnostics import LEAST, excitation_of
-from driftfit.models.hammerstein_wiener.results.run_blocks import WEAK
+from driftfit.models.hammerstein_wiener.results.run_blocks import WEAK, blocks_of
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
-from driftfit.run.result import Track
-from driftfit.run.track import drive, track
-from driftfit.run.warm_start import fresh_tile
-from driftfit.smooth.parts.walk import replay
+from driftfit.run.program import Program
+from driftfit.run.result import Track, track_record
+from driftfit.run.track import track_one
+from driftfit.smooth.problem import replay
 from driftfit.trackers.base import Tracker
 
 
@@ -41,7 +41,7 @@ class HandOff:
     @property
     def xi(self) -> Array:
         """The minimal parameters over the whole record, (T, n_x): separated, then filtered."""
-        return np.concatenate([self.first.blocks("gls").xi, self.then.theta])
+        return np.concatenate([blocks_of(self.first, "gls").xi, self.then.theta])
 
 
 def hand_off(
@@ -71,10 +71,11 @@ def hand_off(
     last = _sufficient(model, first, output, inputs, limit) if at is None else whole("hand_off", "at", at, 1)
     if not last < len(output) - 1:
         raise ValueError(f"hand_off: at={last} leaves none of the {len(output)} samples for the second filter.")
-    before = track(model, first, output[: last + 1], inputs[: last + 1])
-    found = before.blocks("gls")
+    before = track_one(model, first, output[: last + 1], inputs[: last + 1])
+    found = blocks_of(before, "gls")
     assert found.cov is not None
     bound = before.model
+    assert isinstance(bound, HammersteinWiener)
     head = np.abs(found.c[-1, bound.structure.leads]).min()
     if head < WEAK:
         raise ValueError(
@@ -87,24 +88,20 @@ def hand_off(
     assert cov is not None
     P = widen * 0.5 * (cov[-1] + cov[-1].T)
     tracker = replace(then, theta0=found.xi[-1], p0=P)
-    ends, own = before.end().state, tracker.state_for(bound)
+    ends, own = before.state, tracker.state_for(bound)
     lags = {name: ends[name] for name in bound.memory() if name not in own}
     blocks = np.array(ends["blocks"])
     blocks[MINIMAL] = 1.0
     start = {**lags, "blocks": blocks}
-    tile = fresh_tile(bound, tracker, start)
-    rest = slice(last + 1, None)
-    known = known_factors()
-    out = drive(bound, tracker, tile, output[rest], inputs[rest], known)
-    second = Track(bound, tracker, output[rest], inputs[rest], None, known, out, tile, 0, PLAIN, start)
-    return HandOff(before, second, last)
+    rest = Record(output[last + 1 :], inputs[last + 1 :], Known.of())
+    return HandOff(before, track_record(Program(bound, tracker), rest, start=start), last)
 
 
 def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, limit: float) -> int:
     """The first sample at which a window of 3 n has excited every product."""
     n = model.n
     for T in (20 * n, len(y)):  # most records excite soon
-        run = track(model, first, y[:T], u[:T])
+        run = track_one(model, first, y[:T], u[:T])
         seen = replay(run)
         phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)
         at = np.arange(3 * n, len(run))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.show.plots import date_axis, frame, new_figure, settled, time_label
+from driftfit.show.parts.axes import date_axis, frame, new_figure, settled, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
     left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     u, y = (_points(signal) for signal in (run.u[:, 0], run.y))
     for t, colour in zip(chosen, colours, strict=True):
-        label = run.time_text(t) if run._time is not None else f"sample {t}"
+        label = run.time_text(t) if run.timed else f"sample {t}"
         left.plot(u, found.input_curve(u, t), color=colour, lw=1.3, label=label)
         right.plot(found.output_curve(y, t), y, color=colour, lw=1.3)
     left.set(xlabel=run.labels.u[0] if run.labels.u else "u", ylabel="v", title="input block")

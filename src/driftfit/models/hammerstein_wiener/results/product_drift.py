@@ -22,10 +22,11 @@ from driftfit.data.signals import as_inputs, as_output
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Separator, minimal
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
-from driftfit.run.track import track
+from driftfit.run.track import track_one
 from driftfit.trackers.kalman import Kalman
 
 FLOOR = 1e-3
@@ -90,8 +91,8 @@ def track_products(
         tracker = Kalman(q=Q, r=r, p0=p0, theta0=theta0)
         with warnings.catch_warnings():  # a piece is too short for what is said about records
             warnings.simplefilter("ignore", UserWarning)
-            run = track(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
-            paths.append(run.blocks("gls").xi)
+            run = track_one(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
+            paths.append(blocks_of(run, "gls").xi)
         runs.append(run)
         xi = _separated(model, run.theta[-1], xi)
     return ProductTrack(np.concatenate(paths), np.concatenate([one.theta for one in runs]), tuple(runs))

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.engine.drivers import drivers, output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation.least_squares import refine
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks, Groups, deviations, split
 from driftfit.models.hammerstein_wiener.separation.separate import METHODS
+from driftfit.run.program import lane_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -90,10 +90,10 @@ def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
     at = structure.na + sum(structure.nb)
     leads = at + structure.leads - np.arange(model.m)
     fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 stand
-    var = np.insert(run._written("var"), fixed, 0.0, axis=1)
+    var = np.insert(run.var, fixed, 0.0, axis=1)
     cov = None
-    if "P" in (run._out.dtype.names or ()):
-        cov = np.insert(np.insert(run._written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
+    if run.keeps_cov:
+        cov = np.insert(np.insert(run.written("P"), fixed, 0.0, axis=1), fixed, 0.0, axis=2)
     a, b, c, d = structure.groups(run.theta)
     exact, std = np.zeros((len(run), 2)), deviations(model, var)
     return Blocks(model, "minimal", a, b, c, d, exact, std, _intercept(run), cov, gauged=("c1", "d1"))
@@ -124,14 +124,13 @@ def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
 def covariances(run: Track) -> Any:
     """(first sample, P (k, n, n)) for the pieces of a run, replayed unless the run kept them."""
     T = len(run)
-    if "P" in (run._out.dtype.names or ()):
-        yield 0, np.ascontiguousarray(run._written("P"))
+    if run.keeps_cov:
+        yield 0, np.ascontiguousarray(run.written("P"))
         return
-    tile = run._fresh_tile()
-    out = np.empty(min(BLOCK, T), output_type(tile, run.tracker.outputs, "cov"))
-    drive = drivers(run.model.steps, run.tracker.steps_for(run.model), "cov").run
+    tile = run.fresh()
+    out = run.program.written(tile, min(BLOCK, T), "cov")
+    drive = run.program.drivers("cov").run
     for first in range(0, T, BLOCK):
         last = min(first + BLOCK, T)
-        known = run._known if len(run._known) == 1 else run._known[first:last]
-        drive(tile, run.y[first:last, None], run.u[first:last, :, None], known[:, :, None], out[: last - first])
+        drive(tile, *lane_of(run.record.part(slice(first, last))), out[: last - first])
         yield first, np.ascontiguousarray(out["P"][: last - first, ..., 0])

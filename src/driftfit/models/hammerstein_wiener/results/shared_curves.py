@@ -19,6 +19,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks, split
 
 METHODS = ("svd", "svd-joint")
@@ -52,7 +53,7 @@ def shared_curves(run: Any, method: str = "svd-joint") -> dict[str, Blocks]:
     found = {}
     for o, one in enumerate(runs):
         own = [all_b[:, o * nb : (o + 1) * nb] for all_b, nb in zip(apart, structure.nb, strict=True)]
-        blocks = one.blocks(method)
+        blocks = blocks_of(one, method)
         worst = np.column_stack([quality[:, 0], blocks.quality[:, 1]])
         found[run.outputs[o]] = replace(
             blocks, b=np.concatenate(own, axis=1) / weights[:, o, None], c=c.copy(), quality=worst

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
@@ -17,10 +18,8 @@ from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gap import SINCE
 from driftfit.trackers.bank.machine.layout import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
 from driftfit.trackers.bank.machine.lookahead import NODES
-from driftfit.trackers.bank.sensor import table_of
-
-if TYPE_CHECKING:
-    from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.reduction import Reduction
+from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
@@ -28,15 +27,35 @@ RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
 
-def arrays_of(bank: Bank, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
+class Settings(Protocol):
+    """The settings of a `Bank`, as far as its memory depends on them."""
+
+    @property
+    def all_changes(self) -> tuple[Change, ...]: ...
+    @property
+    def all_sensors(self) -> tuple[Sensor, ...]: ...
+    @property
+    def reduction(self) -> Reduction: ...
+    @property
+    def event_probabilities(self) -> tuple[Array, Array]: ...
+    @property
+    def chained(self) -> bool: ...
+    @property
+    def lag_variance(self) -> bool: ...
+    @property
+    def form(self) -> str: ...
+
+
+def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
     """What `driftfit.trackers.bank.machine.advance` works on, before the first sample; covariances are multiplied by
     ``unit``.
     """
-    shape, Hd, Hm, H = bank._shape, len(bank.all_changes), len(bank.all_sensors), bank._count
-    chained = bank._chained
+    Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
+    shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
+    chained = bank.chained
     tri, K, W = n * (n + 1) // 2, shape.children * (2 if chained else 1), shape.floors
     wide, links = _eights(tri), _eights(K + 1)
-    chain, initial = bank._events
+    chain, initial = bank.event_probabilities
     rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
     steps = [one.increments(n) for one in bank.all_changes]
     Q = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])

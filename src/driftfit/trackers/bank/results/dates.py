@@ -54,7 +54,8 @@ def posterior(around: Around) -> Array:
     free = int(used.sum()) - n
     if not k or free < 2:
         return np.zeros(N)
-    scale = np.sqrt(np.maximum(np.mean(phi[used] ** 2, axis=0), np.finfo(float).tiny))
+    scale = np.sqrt(np.mean(phi[used] ** 2, axis=0))
+    scale[scale == 0.0] = 1.0
     Z = phi / scale * np.sqrt(weight)[:, None]
     d = y * np.sqrt(weight)
     products = np.einsum("ti,tj->tij", Z, Z)

@@ -17,17 +17,18 @@ Source: Rauch, Tung and Striebel (1965); the covariance of an increment from the
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, shared
-from driftfit.smooth.parts.walk import replay
-
-if TYPE_CHECKING:
-    from driftfit.run.result import Track
-    from driftfit.trackers.bank.bank import Bank
-    from driftfit.trackers.bank.results.events import Event
+from driftfit.engine.settings import matrix
+from driftfit.run.result import Track
+from driftfit.smooth.problem import replay
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.leaves.leaves import NU, WEIGHT, S
+from driftfit.trackers.bank.results.events import Event
 
 WIDER, CLOSE = 1e7, 0.05
 """Largest factor of a drift that is fitted, and how closely, in its natural logarithm."""
@@ -65,12 +66,11 @@ class EventSmoothed:
 
     @property
     def std(self) -> Array:
-        return np.asarray(np.sqrt(np.einsum("tii->ti", self.covs)))
+        """inf for what the record never told apart."""
+        return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(np.einsum("tii->ti", self.covs)))
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high), each (T, n)."""
-        from statistics import NormalDist
-
         half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
         return self.theta - half, self.theta + half
 
@@ -139,13 +139,13 @@ def measurements(run: Track, events: list[Event]) -> Measured:
     bank: Any = run.tracker
     seen = replay(run)
     ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
-    known = np.broadcast_to(run._known[:, :3], (len(phi), 3))
     noise = noise_variance(bank, run)
     squares = np.mean(phi[ok] ** 2, axis=0) if ok.any() else np.ones(phi.shape[1])
     unit = np.where(squares > 0.0, noise / np.where(squares > 0.0, squares, 1.0), noise)
     relative = noise if bank.all_sensors[0].r is None and bank.all_sensors[0].guess is None else 1.0
     r = np.where(ok, noise * seen["used_noise"][:, 0], np.inf) * faults(bank, run, events)
-    return Measured(phi, seen["y"][:, 0].copy(), r, seen["dt"][:, 0].copy(), known[:, 2].copy(), unit, relative)
+    drift = run.known.over(len(phi)).drift.copy()
+    return Measured(phi, seen["y"][:, 0].copy(), r, seen["dt"][:, 0].copy(), drift, unit, relative)
 
 
 def steps_of(run: Track, measured: Measured) -> list[Array]:
@@ -157,8 +157,6 @@ def steps_of(run: Track, measured: Measured) -> list[Array]:
 
 def noise_variance(bank: Bank, run: Track) -> float:
     """The known one, or what the bank thinks of it at the end."""
-    from driftfit.trackers.bank.leaves.leaves import NU, WEIGHT, S
-
     r = bank.all_sensors[0].r
     if r is not None:
         return float(r)
@@ -186,8 +184,6 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
 
 
 def _full(bank: Bank, n: int) -> Array:
-    from driftfit.engine.settings import matrix
-
     return matrix("Bank", "p0", bank.p0, n)
 
 

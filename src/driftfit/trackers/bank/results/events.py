@@ -10,14 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 
-if TYPE_CHECKING:
-    from driftfit.trackers.bank.results.decided_path import EventSmoothed
+
+class Shifts(Protocol):
+    """What says how far parameters moved: a smoothed path."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    def increment(self, t: int) -> tuple[Array, Array]: ...
+
 
 FAINT = 0.02
 """Probability below which a sample does not count to a cluster."""
@@ -97,7 +104,7 @@ class Event:
         """The same with times, from sample numbers to which."""
         return replace(self, times=tuple(time(sample) for sample in self.span))
 
-    def measured(self, smoothed: EventSmoothed) -> Event:
+    def measured(self, smoothed: Shifts) -> Event:
         """The same, with how far each parameter moved."""
         mean, cov = smoothed.increment(self.span.date)
         std = np.sqrt(np.maximum(np.diag(cov), 0.0))

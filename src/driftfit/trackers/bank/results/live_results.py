@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.run.live.live import Live
+from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
 from driftfit.trackers.bank.machine.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
-
-if TYPE_CHECKING:
-    from driftfit.run.live.live import Live
-    from driftfit.trackers.bank.bank import Bank
 
 
 class LiveHypotheses:
@@ -26,6 +24,8 @@ class LiveHypotheses:
     """
 
     def __init__(self, live: Live) -> None:
+        if not live.tracker.weighs:
+            raise ValueError(f"hypotheses: {type(live.tracker).__name__} has no hypotheses; track with a Bank.")
         self._live = live
         self.tracker: Bank = live.tracker  # type: ignore[assignment]
         self._lane = live.lane()
@@ -62,9 +62,6 @@ class LiveHypotheses:
 
     def _time(self, ring: Array, sample: int) -> Any:
         """When a sample of the ring was; its number where the stream is given no times."""
-        last, lane = self._live._last, self._lane
-        if last is None:
-            return sample
-        back = float(lane["now"][ELAPSED] - ring[sample % len(ring), 2])
-        time = self._live._clock.moved(last, np.array([-back]))
-        return sample if time is None else time[0]
+        back = float(self._lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        time = self._live.before(back)
+        return sample if time is None else time

@@ -7,29 +7,31 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.show.plots import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
+from driftfit.run.live.live import Live
+from driftfit.run.result import Track
+from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
 from driftfit.trackers.bank.leaves.leaves import CODE, WEIGHT
+from driftfit.trackers.bank.machine.layout import LEAVES
+from driftfit.trackers.bank.reduction import GPB, Decide
+from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.mixture import mixture_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from driftfit.run.live.live import Live
-    from driftfit.trackers.bank.results.results import Hypotheses
-
 COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8c6d46", "#5fb5c4")
 """Of events, the ordinary course first."""
 
 
-def plot_hypotheses(told: Hypotheses, threshold: float, level: float) -> Figure:
-    """Parameters with bands; under them the probabilities of events; changes as lines, faults as shades."""
-    run, n = told.run, told.run.model.n
+def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: list[Event], level: float) -> Figure:
+    """Parameters with bands; under them the probabilities (T, H) of events; changes as lines, faults as shades."""
+    n = run.model.n
     figure = new_figure(9.0, 1.4 * n + 2.6)
     axes = figure.subplots(n + 1, 1, sharex=True, height_ratios=[*[1.4] * n, 1.6])
     for i in range(n):
         draw_parameter(axes[i], run, i, level)
-    stack(axes[n], run.time, np.nan_to_num(told.latest), told.names)
-    for event in told.found(threshold):
+    stack(axes[n], run.time, np.nan_to_num(latest), names)
+    for event in events:
         if event.kind == "change":
             for axis in axes[:n]:
                 axis.axvline(event.date, color=RED, linewidth=1.0, linestyle=":")
@@ -59,9 +61,6 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
     """
     bank: Any = live.tracker
     lane = live.lane()
-    from driftfit.trackers.bank.machine.layout import LEAVES
-    from driftfit.trackers.bank.reduction import GPB, Decide
-
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)

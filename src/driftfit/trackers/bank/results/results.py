@@ -14,15 +14,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
+from driftfit.run.result import Track
+from driftfit.trackers.bank.bank import Bank
+from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
+from driftfit.trackers.bank.reduction import Decide
+from driftfit.trackers.bank.results import dates
+from driftfit.trackers.bank.results.decided_path import EventSmoothed, measurements, steps_of
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
+from driftfit.trackers.bank.results.pictures import plot_hypotheses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.run.result import Track
-    from driftfit.trackers.bank.bank import Bank
-    from driftfit.trackers.bank.results.decided_path import EventSmoothed
 
 
 class Alarm(NamedTuple):
@@ -71,9 +74,11 @@ class Hypotheses:
     """
 
     def __init__(self, run: Track) -> None:
+        if not run.tracker.weighs:
+            raise ValueError(f"hypotheses: {type(run.tracker).__name__} has no hypotheses; track with a Bank.")
         self.run = run
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
-        self._report = run._written("report")
+        self._report = run.written("report")
         self.names = self.tracker.event_names
         self.lags = self.tracker.floors_told
         self.sensors = len(self.tracker.all_sensors)
@@ -119,9 +124,7 @@ class Hypotheses:
     def latest(self) -> Array:
         """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
         p, oldest = self.prob(self.lags[-1]), self.lags[-1]
-        tile, run = self.run._tile, self.run
-        lane = {name: tile[name][0, ..., run._lane] for name in ("memory", "table")}
-        now = self.tracker.array(run.model, lane, "lag_prob")
+        now = self.tracker.array(self.run.model, self.run.state, "lag_prob")
         for k in range(min(oldest, len(p))):
             p[len(p) - 1 - k] = now[k] if now[k].sum() > 0.5 else np.nan
         return p
@@ -150,9 +153,7 @@ class Hypotheses:
     @property
     def impossible(self) -> int:
         """Samples that no leaf allowed; they were not used."""
-        from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
-
-        return int(self.run._tile["many"][0, IMPOSSIBLE, self.run._lane])
+        return int(self.run.state["many"][IMPOSSIBLE])
 
     @cached_property
     def decisions(self) -> list[Decision]:
@@ -168,8 +169,6 @@ class Hypotheses:
 
         Also where the record is shorter than the depth; empty for reductions that decide nothing.
         """
-        from driftfit.trackers.bank.reduction import Decide
-
         reduce = self.tracker.reduction
         if not isinstance(reduce, Decide) or not len(self.run):
             return []
@@ -180,8 +179,6 @@ class Hypotheses:
 
     def smooth(self, threshold: float = 0.5) -> EventSmoothed:
         """The path of the whole record given the events."""
-        from driftfit.trackers.bank.results.decided_path import EventSmoothed
-
         return EventSmoothed(self.run, self.dated(threshold))
 
     def events(self, threshold: float = 0.5) -> list[Event]:
@@ -193,8 +190,6 @@ class Hypotheses:
         found = self.dated(threshold)
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
             return found
-        from driftfit.trackers.bank.results.decided_path import EventSmoothed
-
         smoothed = EventSmoothed(self.run, found)
         return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
 
@@ -203,12 +198,9 @@ class Hypotheses:
         found = self.found(threshold)
         if not any(event.kind == "change" for event in found):
             return found
-        from driftfit.trackers.bank.results.dates import dated
-        from driftfit.trackers.bank.results.decided_path import measurements, steps_of
-
         measured = measurements(self.run, found)
         jumps = dict(zip(self.tracker.change_names, steps_of(self.run, measured), strict=True))
-        return self._timed(dated(found, measured, jumps))
+        return self._timed(dates.dated(found, measured, jumps))
 
     def found(self, threshold: float = 0.5) -> list[Event]:
         """`events` as they were known when they were found: with the dates that the leaves say, and no shifts."""
@@ -258,7 +250,7 @@ class Hypotheses:
         return Alarm(float(threshold), onsets(on), on)
 
     def _threshold(self, rate: float, reference: Track | None) -> float:
-        window = self.window if reference is None else reference.hypotheses.window
+        window = self.window if reference is None else Hypotheses(reference).window
         for level in np.unique(np.r_[0.0, np.round(window, 4), 1.0]):
             at = onsets(window > level)
             false = len(at) if reference is not None else float(np.sum(1.0 - window[at]))
@@ -273,9 +265,7 @@ class Hypotheses:
 
     def plot(self, threshold: float = 0.5, level: float = 0.95) -> Figure:
         """Parameters with bands, probabilities of events stacked under them, events marked."""
-        from driftfit.trackers.bank.results.pictures import plot_hypotheses
-
-        return plot_hypotheses(self, threshold, level)
+        return plot_hypotheses(self.run, self.latest, self.names, self.found(threshold), level)
 
 
 def onsets(on: Array) -> Array:

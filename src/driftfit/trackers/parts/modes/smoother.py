@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.drift_ladder import TOP
+from driftfit.trackers.parts.modes.ladder import TOP
 from driftfit.trackers.parts.noise_levels import level_chain
 
 NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled")

@@ -26,7 +26,7 @@ import numpy as np
 from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.diffuse import LEFT
-from driftfit.trackers.parts.drift_ladder import TOP, leap
+from driftfit.trackers.parts.modes.ladder import TOP, leap
 from driftfit.trackers.parts.noise_levels import OUTLIER
 from driftfit.trackers.parts.resolution import lasting
 

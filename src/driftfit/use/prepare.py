@@ -26,7 +26,7 @@ import numpy as np
 from scipy import signal, stats
 
 from driftfit.data.clock import Clock, instants
-from driftfit.data.signals import as_numbers
+from driftfit.engine.arrays import as_numbers
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of, whole
 from driftfit.run.result import Track

@@ -1,0 +1,93 @@
+"""What is known of every sample beside its signals: how much time has passed, how noisy it is, how much may move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+
+INTERVAL, NOISE, DRIFT, COMMON = 0, 1, 2, 3
+"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker understands."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more where a tracker takes more.
+
+    ``interval``, ``noise`` and ``drift`` are its first columns: nominal intervals since the sample before, factors of
+    the noise variance, and factors of the drift. ``more`` (T, k - 3) is what `Tracker.beside` made.
+    """
+
+    columns: Array
+
+    @classmethod
+    def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
+        """From numbers or arrays (T,)."""
+        parts = (np.atleast_1d(np.asarray(part, float)) for part in (interval, noise, drift))
+        return cls(np.stack(np.broadcast_arrays(*parts), axis=1))
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    @property
+    def constant(self) -> bool:
+        """Whether one row holds for every sample."""
+        return len(self.columns) == 1
+
+    @property
+    def interval(self) -> Array:
+        """(T,) or (1,): nominal intervals since the sample before."""
+        return self.columns[:, INTERVAL]
+
+    @property
+    def noise(self) -> Array:
+        """(T,) or (1,): factors of the noise variance."""
+        return self.columns[:, NOISE]
+
+    @property
+    def drift(self) -> Array:
+        """(T,) or (1,): factors of the drift."""
+        return self.columns[:, DRIFT]
+
+    @property
+    def more(self) -> Array:
+        """(T, k - 3): what a tracker is told beside these."""
+        return self.columns[:, COMMON:]
+
+    @property
+    def common(self) -> Known:
+        """Without what only some trackers understand."""
+        return Known(self.columns[:, :COMMON])
+
+    def part(self, rows: slice | Array) -> Known:
+        """Of some samples."""
+        return self if self.constant else Known(self.columns[rows])
+
+    def over(self, T: int) -> Known:
+        """With a row for each of T samples; not to be written to."""
+        return Known(np.broadcast_to(self.columns, (T, self.columns.shape[1])))
+
+    def changed(self, interval: Any = None, noise: Any = None) -> Known:
+        """With other intervals or factors of the noise; those of a single row hold for all."""
+        given = {INTERVAL: interval, NOISE: noise}
+        T = max(len(self), *(np.size(values) for values in given.values() if values is not None))
+        columns = self.over(T).columns.copy()
+        for place, values in given.items():
+            if values is not None:
+                columns[:, place] = values
+        return Known(columns)
+
+    def begun(self, factors: Mapping[int, float]) -> Known:
+        """With the interval before some samples, by their number, multiplied by a factor."""
+        columns = self.columns.copy()
+        for place, factor in factors.items():
+            columns[place, INTERVAL] *= factor
+        return Known(columns)
+
+    def with_more(self, columns: Array) -> Known:
+        """With what a tracker is told beside interval, noise and drift, (T, k)."""
+        return Known(np.hstack([self.common.over(len(columns)).columns, columns]))

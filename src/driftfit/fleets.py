@@ -1,0 +1,200 @@
+"""Many results with their verbs: fleets, records of several outputs, and fleets of these."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator, Mapping
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+from driftfit.engine.kernel import Array
+from driftfit.judge.alarms.many import ManyAlarms, alarms
+from driftfit.judge.diagnose import Diagnosis, diagnose
+from driftfit.judge.many import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.verdict import Verdict, verdict
+from driftfit.results import Track
+from driftfit.run import fleet, outputs, result, shared_outputs, track_outputs
+from driftfit.show.fleet_summary import FleetSummary, summarise
+from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
+from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
+from driftfit.show.report import check_path, report
+from driftfit.show.report_many import page_of_many
+from driftfit.smooth.shared_theta import SmoothedShared
+from driftfit.smooth.smoothed import Smoothed
+from driftfit.use.crossing import crossings
+from driftfit.use.forecast import Forecast, forecast_outputs
+
+if TYPE_CHECKING:
+    import polars
+    from matplotlib.figure import Figure
+
+
+class Judged(fleet.Many):
+    """Questions to many runs at once, by key; see `driftfit.judge.many`."""
+
+    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
+        """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
+        return verdicts(self.runs(), level, lags, burn)
+
+    def diagnose(self) -> ManyDiagnoses:
+        """What `Track.diagnose` says of each, and how often each number is out of bounds."""
+        return diagnoses(self.runs())
+
+    def detect(
+        self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
+        **settings: Any,
+    ) -> ManyAlarms:  # fmt: skip
+        """Alarms of all of them, one false in ``every`` samples of all together, and which of them had something.
+
+        ``level`` is a false discovery rate, ``reference`` one for all or a mapping from every key to its own; kinds and
+        other settings are those of `driftfit.judge.alarms.detect`.
+        """
+        return alarms(self.runs(), kind, every=every, level=level, reference=reference, **settings)
+
+    def report(
+        self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
+        labels: Mapping[Hashable, Array] | None = None,
+    ) -> None:  # fmt: skip
+        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        """
+        text = page_of_many(self.runs(), title, self.failed, alarms, labels)
+        check_path(path).write_text(text, encoding="utf-8")
+
+    def crossing(
+        self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,
+        level: float = 0.9,
+    ) -> polars.DataFrame:  # fmt: skip
+        """When a parameter or the output of every run crosses a limit, as one polars table, the first on top.
+
+        Limits are one for all, or a mapping from every key. Columns: what tells the runs apart, ``probability``
+        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times where the
+        record has them. See `driftfit.use.crossing`.
+        """
+        return crossings(self.runs(), self.by, what, below, above, horizon, u, level)
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
+        from driftfit.show.export import to_table  # polars takes as long to import as all the rest
+
+        return to_table(self, kind)
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """The same table as an Arrow stream, for whatever reads one."""
+        return self.to_table().__arrow_c_stream__(requested_schema)
+
+    def to_parquet(self, path: str | PathLike[str]) -> None:
+        """Write the same table as Parquet."""
+        from driftfit.show.export import to_parquet
+
+        to_parquet(self, path)
+
+
+class Fleet(fleet.Fleet, Judged, public=True):
+    __doc__ = fleet.Fleet.__doc__
+
+    def __getitem__(self, key: Hashable) -> Track:
+        return _public(super().__getitem__(key))
+
+    def values(self) -> Iterator[Track]:
+        """The results."""
+        return map(_public, super().values())
+
+    def items(self) -> Iterator[tuple[Hashable, Track]]:
+        """Keys and results."""
+        return ((key, _public(run)) for key, run in super().items())
+
+    def forecast(self, h: int, u: Any = None) -> polars.DataFrame:
+        """The h nominal samples after the end of every series as one polars table, a row a sample.
+
+        Columns: what tells the series apart, ``step`` (1 .. h), the time where the record has one, ``y_hat`` and
+        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
+        inputs (h,) or (h, m), or one array for all; a key that is not in it has none. See `driftfit.use.forecast`.
+        """
+        from driftfit.show.export import forecasts_table
+
+        return forecasts_table(self.runs(), self.records.labels, h, u)
+
+    def summary(self) -> FleetSummary:
+        """Series ranked by how much their parameters moved; print it."""
+        return summarise(self)
+
+    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
+        """Small multiples of one parameter for the series that moved most; a matplotlib figure."""
+        return plot_fleet(self, which, most, level)
+
+
+class Outputs(outputs.Outputs, Judged, public=True):
+    __doc__ = outputs.Outputs.__doc__
+
+    def __getitem__(self, output: str | int) -> Track:
+        """The record of one output, by name or place."""
+        return _public(super().__getitem__(output))
+
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
+        """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""
+        return {name: Smoothed.of(run, keep, order_by, undetermined) for name, run in self.items()}
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
+        return forecast_outputs(self, h, u)
+
+    def summary(self) -> OutputsSummary:
+        """The summaries of all outputs, by name; print it."""
+        return summarise_outputs(self)
+
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters with bands: a row of pictures for each output."""
+        return plot_outputs(self, level)
+
+
+class Shared(shared_outputs.Shared, public=True):
+    __doc__ = shared_outputs.Shared.__doc__
+
+    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
+        """The smoothed path: theta (T, n) as here, residuals of every output (T, ny)."""
+        return SmoothedShared.of_shared(self, keep, order_by, undetermined)
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """The h nominal samples after the record, u (h, ny, m): theta, std (h, n), y_hat, y_std (h, ny)."""
+        return forecast_outputs(self, h, u)
+
+    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
+        """Do the shared parameters move? The verdict of the rows; see `driftfit.judge.verdict`."""
+        return verdict(self.rows, level, lags, burn)
+
+    def diagnose(self) -> Diagnosis:
+        """What `Track.diagnose` says of the rows."""
+        return diagnose(self.rows)
+
+    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
+        """The page of the rows; see `driftfit.show.report`."""
+        report(self.rows, path, title)
+
+    def summary(self) -> SharedSummary:
+        """Parameters now, and the one-step error of each output; print it."""
+        return summarise_shared(self)
+
+    def plot(self, level: float = 0.95) -> Figure:
+        """Parameters with bands, predictions and innovations of the rows."""
+        return plot_track(self.rows, level)
+
+    def to_table(self, kind: str = "polars") -> Any:
+        """The results as one table, a row a sample; see `driftfit.show.export`."""
+        from driftfit.show.export import to_table
+
+        return to_table(self, kind)
+
+
+class OutputsFleet(track_outputs.OutputsFleet, Judged, public=True):
+    __doc__ = track_outputs.OutputsFleet.__doc__
+
+    def summary(self) -> FleetSummary:
+        """Which outputs of which records moved most; printing it shows the first twenty."""
+        return summarise(self)
+
+
+def _public(run: result.Track) -> Track:
+    """A run as users know it: once the facade is there every run is made so (`driftfit.run.plain`)."""
+    assert isinstance(run, Track)
+    return run

@@ -1,0 +1,18 @@
+"""What a tracker saw of every sample, after the model and the missing-data rule have spoken."""
+
+from __future__ import annotations
+
+from driftfit.engine.kernel import State, kernel
+
+COLLECTED = ("phi", "y", "dt", "valid")
+"""Fields that `collect` stores."""
+
+
+@kernel
+def collect(o: State, s: State, l: int) -> None:
+    """Store what the tracker saw, after the model and the missing-data rule have spoken."""
+    for i in range(s.phi.shape[0]):
+        o.phi[i, l] = s.phi[i, l]
+    o.y[l] = s.y[l]
+    o.dt[l] = s.dt[l]
+    o.valid[l] = s.valid[l]

@@ -1,0 +1,202 @@
+"""Results as tables: polars, pandas, pyarrow, Arrow streams, CSV and Parquet.
+
+One row a sample. The columns: what tells the series of a fleet apart, the time (or the sample number) and the signals
+under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
+``theta_<name>`` and ``std_<name>``. Units stand where each format has room for them: ``attrs`` in pandas, the metadata
+of fields in pyarrow, the metadata of the file in Parquet.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from driftfit.data.clock import Clock
+from driftfit.data.record import Labels
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import one_of
+from driftfit.run.fleet import Fleet, Many
+from driftfit.run.outputs import Outputs
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
+from driftfit.run.track_outputs import OutputsFleet
+from driftfit.trackers.base import Tracker
+from driftfit.use.forecast import forecast
+
+Result = Track | Shared | Many
+Single = Track | Outputs | Shared
+"""One record."""
+
+ENDINGS = (".csv", ".parquet", ".npz")
+_OWN = ("prediction", "innovation", "innovation_std", "ok")
+
+
+def as_table(result: Result) -> pl.DataFrame:
+    """A result as a polars table."""
+    records, keys = _records(result)
+    columns: dict[str, Any] = {}
+    lengths = [len(one) for one in records]
+    for place, name in enumerate(result.by if isinstance(result, Fleet | OutputsFleet) else ()):
+        values = [key[place] if isinstance(key, tuple) else key for key in keys]
+        columns[name] = pl.Series(values).gather(np.repeat(np.arange(len(records)), lengths))
+    signals = [_of_track(one) if isinstance(one, Track) else _of_outputs(one) for one in records]
+    for name in signals[0]:
+        columns[name if name not in columns else f"{name}_"] = np.concatenate([part[name] for part in signals])
+    table = pl.DataFrame(columns)
+    zone, time = records[0].labels.zone, _time_name(records[0])
+    if zone is not None:
+        table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
+    return table
+
+
+def _records(result: Result) -> tuple[list[Single], list[Any]]:
+    """(records, keys); no keys for a single one."""
+    if isinstance(result, Fleet | OutputsFleet):
+        return list(result.values()), list(result)
+    assert isinstance(result, Track | Outputs | Shared)
+    return [result], []
+
+
+def _time_name(run: Single) -> str:
+    return run.labels.time or ("time" if run.timed else "sample")
+
+
+def _of_track(run: Track) -> dict[str, Array]:
+    """The columns of a run, by name; a signal that is called like a result gets a trailing underscore."""
+    columns = {_time_name(run): run.time, _free(run.labels.y): run.y}
+    columns |= {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
+    columns |= {name: getattr(run, name) for name in _OWN}
+    for i, name in enumerate(run.names):
+        columns |= {f"theta_{name}": run.theta[:, i], f"std_{name}": run.std[:, i]}
+    return columns
+
+
+def _of_outputs(run: Outputs | Shared) -> dict[str, Array]:
+    """The same of several outputs: each result with its output in brackets, inputs and parameters under their names."""
+    columns: dict[str, Array] = {_time_name(run): run.time}
+    for j, output in enumerate(run.outputs):
+        columns[_free(output)] = run.y[:, j]
+        columns |= {f"{name}[{output}]": getattr(run, name)[:, j] for name in _OWN}
+    if isinstance(run, Outputs):
+        inputs = {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
+        columns |= {name: column for name, column in inputs.items() if name not in columns}
+        parts = [(names, run.theta[:, j], run.std[:, j]) for j, names in enumerate(run.names)]
+    else:
+        parts = [(run.names, run.theta, run.std)]
+    for names, theta, std in parts:
+        for i, name in enumerate(names):
+            columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
+    return columns
+
+
+def _inputs(run: Track | Outputs) -> tuple[str, ...]:
+    return run.labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[1]))
+
+
+def _free(name: str) -> str:
+    return f"{name}_" if name in _OWN else name
+
+
+def units_of(result: Result) -> dict[str, str]:
+    """Units of the columns of a result that have one."""
+    run = _records(result)[0][0]
+    given = run.labels.units
+    signals = (run.labels.y,) if isinstance(run, Track) else run.outputs
+    units = {_free(name): given[name] for name in (*signals, *run.labels.u) if name in given}
+    for name in signals:
+        own = _OWN[:3] if isinstance(run, Track) else [f"{what}[{name}]" for what in _OWN[:3]]
+        units |= dict.fromkeys(own, given[name]) if name in given else {}
+    for one in run.values() if isinstance(run, Outputs) else [run.rows if isinstance(run, Shared) else run]:
+        for name, unit in zip(one.names, one.units, strict=True):
+            units |= {f"theta_{name}": unit, f"std_{name}": unit} if unit else {}
+    return units
+
+
+def forecasts_table(runs: Mapping[Any, Track], labels: Labels, h: int, u: Any) -> pl.DataFrame:
+    """The forecasts of many runs, one after the other, a row a sample."""
+    parts = []
+    for key, run in runs.items():
+        found = forecast(run, h, u.get(key) if isinstance(u, Mapping) else u)
+        columns: dict[str, Any] = {"step": np.arange(1, h + 1)}
+        ahead = Clock.of(labels.dt, labels.zone).ahead(run.last, h) if run.timed else None
+        if ahead is not None:
+            columns[_time_name(run)] = ahead
+        columns |= {"y_hat": found.y_hat, "y_std": found.y_std}
+        for i, name in enumerate(run.names):
+            columns |= {f"theta_{name}": found.theta[:, i], f"std_{name}": found.std[:, i]}
+        keys = zip(labels.by, key if isinstance(key, tuple) else (key,), strict=True)
+        part = pl.DataFrame(columns).select([*(pl.lit(k).alias(name) for name, k in keys), pl.all()])
+        if labels.zone is not None and ahead is not None:
+            shown = pl.col(_time_name(run)).dt.replace_time_zone("UTC").dt.convert_time_zone(labels.zone)
+            part = part.with_columns(shown)
+        parts.append(part)
+    return pl.concat(parts)
+
+
+def to_table(result: Result, kind: str = "polars") -> Any:
+    """A result as a table of polars, pandas or pyarrow (each must be installed)."""
+    one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
+    table = as_table(result)
+    if kind == "polars":
+        return table
+    units = units_of(result)
+    return _to_pandas(table, units) if kind == "pandas" else _to_pyarrow(table, units)
+
+
+def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
+    import pandas as pd
+
+    frame = pd.DataFrame({name: table[name].to_numpy() for name in table.columns})
+    for name, kind in table.schema.items():
+        if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy knows no zones: these are UTC
+            frame[name] = frame[name].dt.tz_localize("UTC").dt.tz_convert(kind.time_zone)
+    frame.attrs["units"] = dict(units)
+    return frame
+
+
+def _to_pyarrow(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
+    import pyarrow as pa
+
+    plain = table.to_arrow()
+    fields = [f.with_metadata({"unit": units[f.name]}) if f.name in units else f for f in plain.schema]
+    return plain.cast(pa.schema(fields))
+
+
+def to_parquet(result: Result, path: str | PathLike[str]) -> None:
+    """Write a result as Parquet; units, model and tracker go into the metadata of the file, under "driftfit"."""
+    records, _ = _records(result)
+    trackers = dict.fromkeys(repr(one) for run in records for one in trackers_of(run))
+    about = {"model": repr(records[0].model), "trackers": list(trackers), "units": units_of(result)}
+    as_table(result).write_parquet(Path(path), metadata={"driftfit": json.dumps(about)})
+
+
+def trackers_of(run: Single) -> tuple[Tracker, ...]:
+    """The trackers of a record."""
+    return run.trackers if isinstance(run, Outputs) else (run.tracker,)
+
+
+def check_ending(path: str | PathLike[str]) -> str:
+    """The ending of a file that results can be written to; ValueError for any other."""
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise ValueError(f"{path}: results are written to {', '.join(ENDINGS)}, by the ending of the name.")
+    return ending
+
+
+def write(result: Result, path: str | PathLike[str]) -> None:
+    """Write a result: a table as .csv or .parquet, or a whole run as .npz, by the ending of the name."""
+    ending = check_ending(path)
+    if ending == ".npz" and isinstance(result, Fleet | OutputsFleet):
+        raise ValueError(f"{path}: an .npz file holds one run; write a fleet as .parquet, or fleet[key].save(...).")
+    if ending == ".npz":
+        _records(result)[0][0].save(path)
+    elif ending == ".parquet":
+        to_parquet(result, path)
+    else:
+        as_table(result).write_csv(Path(path))

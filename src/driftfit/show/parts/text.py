@@ -1,0 +1,95 @@
+"""Text of results: tables no wider than `WIDTH`, the same on a terminal, in a file and in a notebook."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Hashable, Mapping
+from io import StringIO
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.jupyter import JupyterMixin
+from rich.table import Column, Table
+from rich.text import Text
+
+WIDTH = 96
+
+
+def printed(*parts: Any) -> str:
+    """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
+
+    Left to itself rich hands what is printed to the display of a notebook, and takes colours and widths from the
+    environment.
+    """
+    text = StringIO()
+    console = Console(
+        file=text, width=WIDTH, height=100, color_system=None, force_jupyter=False, force_terminal=False,
+        legacy_windows=False,
+    )  # fmt: skip
+    console.print(*parts)
+    return text.getvalue()
+
+
+class Printed(JupyterMixin):
+    """A result that rich draws: ``str`` gives it as plain text, and a notebook shows it as the value of a cell."""
+
+    def __str__(self) -> str:
+        return printed(self)
+
+
+def key_text(key: Hashable) -> str:
+    """The key of a series as text; that of several columns without brackets."""
+    return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
+
+
+def counts(dropped: Mapping[str, int]) -> str:
+    """Counts by reason, as text."""
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+
+
+def shortened(text: str) -> str:
+    """Numbers of more than six digits in six."""
+    return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
+
+
+def facts(*pairs: tuple[str, str]) -> Table:
+    """Names and what they are, side by side; text as it stands, since b1[flow] is not markup."""
+    table = Table.grid(padding=(0, 2), pad_edge=True)
+    for name, value in pairs:
+        table.add_row(Text(name, "bold"), Text(value))
+    return table
+
+
+SHORT = 10
+"""Cells of at most so many signs stand on one line: numbers, and p-values such as < 0.0001."""
+
+
+class Numbers(Table):
+    """A table no wider than `WIDTH` or the terminal, in which nothing is cut: what is too wide is broken at blanks."""
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        """Add a row; every column is at least as wide as its longest word."""
+        super().add_row(*cells, **options)
+        for column, cell in zip(self.columns, cells, strict=False):
+            _widen(column, str(cell))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        return super().__rich_console__(console, options.update(max_width=min(WIDTH, options.max_width)))
+
+
+def _widen(column: Column, text: str) -> None:
+    words = [text] if len(text) <= SHORT else text.split()
+    column.min_width = max(column.min_width or 0, *map(cell_len, words), 0)
+
+
+def table_of(title: str, *heads: str, names: int = 1) -> Table:
+    """A table of numbers over the full width: the first ``names`` columns to the left, numbers to the right."""
+    table = Numbers(
+        title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, expand=True
+    )
+    for place, head in enumerate(heads):
+        table.add_column(Text(head), justify="left" if place < names else "right", overflow="fold")
+        _widen(table.columns[-1], head)
+    return table

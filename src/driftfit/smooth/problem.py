@@ -1,0 +1,89 @@
+"""The problem behind a run, for smoothers: see `driftfit.smooth.parts.walk`.
+
+The regressors are those that the filter used, lags that it filled by its own prediction included: the run is replayed
+once to collect them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from driftfit.engine.drivers import TrackerSteps, output_type
+from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.run.program import lane_of
+from driftfit.run.result import Track
+from driftfit.run.seen import COLLECTED, collect
+from driftfit.smooth.parts.walk import NONE, Walk, free
+from driftfit.trackers.base import RandomWalk
+
+
+@lru_cache
+def attentive(steps: TrackerSteps) -> TrackerSteps:
+    """Steps that note the factor of the noise variance when the tracker is at work, and what the tracker notes itself.
+
+    A model may make it larger than what the user gave (measurement noise that comes in through a curve).
+    """
+    predict, begin, note = steps.predict, steps.begin, steps.note
+
+    @kernel
+    def collect_all(o: State, s: State, l: int) -> None:
+        collect(o, s, l)
+        note(o, s, l)
+        o.used_noise[l] = s.used_noise[l]
+
+    @kernel
+    def noting(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        predict(s, l)
+
+    if begin is None:
+        return steps._replace(predict=noting, store=collect_all)
+    first: Step = begin
+
+    @kernel
+    def noting_first(s: State, l: int) -> None:
+        s.used_noise[l] = s.noise[l]
+        first(s, l)
+
+    return steps._replace(predict=noting, begin=noting_first, store=collect_all)
+
+
+def replay(run: Track) -> Array:
+    """Run the tracker over its record again and return what it saw, (T,) records.
+
+    Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
+    """
+    program = run.program
+    tile = program.tile(used_noise=1.0)
+    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.noted)))
+    program.drivers(steps=attentive(program.steps)).run(tile, *lane_of(run.record), out)
+    return out
+
+
+def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
+    """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
+
+    ``prior`` replaces what the tracker takes theta to be.
+    """
+    own, tracker = prior is None, run.tracker
+    each = run.known.more if own and run.known.more.size else NONE
+    if prior is None:
+        prior = free(run.model.n) if tracker.noted else tracker.random_walk(run.model)
+    seen = replay(run)
+    dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
+    weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
+    drift = dt * run.known.drift
+    if own and tracker.noted:
+        noted = {name: seen[name][..., 0] for name in tracker.noted}
+        q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
+        each, weight, drift = np.sqrt(q), weight / r_of, np.ones(len(drift))
+    trend = dt if prior.slopes else NONE
+    if prior.at_first_sample or prior.p0 is None:
+        first = int(np.argmax(dt > 0.0)) + 1
+        drift[:first], trend[:first] = 0.0, 0.0
+    r = 1.0 if prior.r is None else prior.r
+    p0 = None if prior.p0 is None else prior.p0 / r
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
+    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)

@@ -1,0 +1,54 @@
+"""Streams with their verbs: what users get as `driftfit.Live`."""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property
+from typing import Any
+
+from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
+from driftfit.run.live import live, outputs
+from driftfit.trackers.bank.results.live_results import LiveHypotheses
+from driftfit.use.forecast import Forecast, drive_on, forecast_stream
+from driftfit.use.live_system import LiveSystem
+
+
+class Live(live.Live, public=True):
+    __doc__ = live.Live.__doc__
+
+    @property
+    def hypotheses(self) -> LiveHypotheses:
+        """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
+        return LiveHypotheses(self)
+
+    @cached_property
+    def _separator(self) -> Separator:
+        return Separator(self.model)
+
+    def blocks(self, method: str = "svd-joint") -> Groups:
+        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, but for "gls"."""
+        groups: Groups = self._separator(self.theta, method)
+        return groups
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the inputs then.
+
+        While `apply` is outstanding the first row of u is what it would bring.
+        """
+        return forecast_stream(self, h, u)
+
+    @property
+    def system(self) -> LiveSystem:
+        """The `ARX` system as it stands now: poles, gains, responses with bands; see `driftfit.use.live_system`."""
+        return LiveSystem(self)
+
+
+class LiveOutputs(outputs.LiveOutputs, public=True):
+    __doc__ = outputs.LiveOutputs.__doc__
+
+    def forecast(self, h: int, u: Any = None) -> Forecast:
+        """The next h nominal samples, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny).
+
+        While `apply` is outstanding the first row of u is what it would bring.
+        """
+        return drive_on(copy(self), h, u)

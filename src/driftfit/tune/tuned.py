@@ -1,0 +1,111 @@
+"""What tuning found: settings, their intervals, and everything that was tried."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.trackers.base import Tracker
+from driftfit.tune.search import Search
+
+if TYPE_CHECKING:
+    import polars
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What `tune` returns.
+
+    Attributes
+    ----------
+    tracker : Tracker
+        The tracker with its numbers, ready for `track` and `Live`.
+    method : str
+        The criterion.
+    loglik : float
+        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
+        that estimate their scale as they go (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
+    noise : float
+        Estimated noise variance; not to be relied on when ``at_bound`` says so.
+    at_bound : tuple of str
+        Settings that ended at a bound of the search, or at zero; empty when the optimum is inside.
+    interval : dict of (low, high)
+        By name of setting, the interval of the likelihood at ``level``: of profiles (for "q[..]/r", "mu", "forgetting"
+        and a single "q" or "r"), or from curvature (for "q[..]" and "r" found together). NaN for other methods.
+    level : float
+        The level of the intervals.
+    """
+
+    tracker: Tracker
+    method: str
+    loglik: float
+    noise: float
+    at_bound: tuple[str, ...]
+    interval: dict[str, tuple[float, float]]
+    level: float
+    _search: Search = field(repr=False, compare=False)
+
+    @property
+    def table(self) -> polars.DataFrame:
+        """Every setting that was tried and its criterion, best first: log-likelihood, or mean square."""
+        import polars
+
+        points, values = self._search.tried()
+        settings = np.array([self._search.knobs.values(x) for x in points])
+        columns = dict(zip(self._search.knobs.names, settings.T, strict=True))
+        name = {"ml": "loglik", "h-step": "mean_square"}.get(self.method, self.method)
+        return polars.DataFrame({**columns, name: self._criterion(values)})
+
+    @property
+    def chosen(self) -> dict[str, float]:
+        """What was found, by name of setting as in ``interval``; drifts are relative to the noise variance."""
+        names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
+        return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+    def _criterion(self, values: Array) -> Array:
+        """Values of the objective as what they are called."""
+        return -values if self.method == "ml" else np.exp(values)
+
+    def curves(self) -> list[tuple[str, Array, Array]]:
+        """(name, values of the setting, criterion) along each knob, what `plot` draws."""
+        curves = []
+        for i in range(len(self._search.x)):
+            points, values = self._search.sweep(i)
+            entry = int(np.flatnonzero(self._search.knobs.owner == i)[0])
+            settings = np.array([self._search.knobs.values(x)[entry] for x in points])
+            curves.append((self._search.knobs.names[entry], settings, self._criterion(values)))
+        return curves
+
+    def plot(self) -> Figure:
+        """The criterion along each setting, the others following where it is a likelihood; a matplotlib figure."""
+        return _plot(self)
+
+
+def _plot(tuned: Tuned) -> Figure:
+    """One panel a knob: the criterion over its range, the choice, and its interval."""
+    curves = tuned.curves()
+    figure = new_figure(4.6 * min(len(curves), 2), 3.2 * -(-len(curves) // 2))
+    panels = figure.subplots(-(-len(curves) // 2), min(len(curves), 2), squeeze=False).ravel()
+    for panel, (name, values, criterion) in zip(panels, curves, strict=False):
+        memory = name == "forgetting"
+        axis = (lambda v: 1.0 / (1.0 - np.asarray(v))) if memory else np.asarray
+        best = tuned.chosen[name]
+        with np.errstate(divide="ignore"):
+            panel.semilogx(axis(values), criterion, color=BLUE, lw=1.3)
+            low, high = (float(axis(end)) for end in tuned.interval[name])
+            panel.axvspan(max(low, axis(values).min()), min(high, axis(values).max()), color=BLUE, alpha=0.15, lw=0)
+            if 0.0 < axis(best) < np.inf:
+                panel.axvline(float(axis(best)), color=RED, lw=1.0)
+        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; the top is what matters
+            panel.set_ylim(criterion.max() - 12.0, criterion.max() + 1.0)
+        panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
+        panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(tuned.method, tuned.method))
+        panel.grid(alpha=0.25, lw=0.5)
+    for panel in panels[len(curves) :]:
+        panel.set_visible(False)
+    return figure
