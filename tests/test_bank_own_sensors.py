@@ -84,7 +84,7 @@ def record(T=60):
 def test_own_likelihoods_are_what_the_twin_says(reduce, naive, form):
     y, u = record()
     bank = Bank(changes(), SENSORS, None, reduce, p0=2.0, lag_variance=False, form=form)
-    P, initial = bank._events
+    P, initial = bank.event_probabilities
     twin = Twin(Q, TABLE, P, initial, np.zeros(N), 2.0 * np.eye(N), naive, na=1)
     run = track(ARX(1, 1, start="zero"), bank, y, u)
     total = 0.0
