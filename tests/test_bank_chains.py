@@ -112,7 +112,7 @@ def test_a_stream_with_gaps_says_what_the_record_says(reduce):
     rng = np.random.default_rng(4)
     y, z = rng.standard_normal(80), rng.standard_normal((80, N))
     y[rng.random(80) < 0.4] = np.nan
-    y[40] = 50.0  # refused, in an interval of its own
+    y[40] = 500.0  # refused, in an interval of its own
     time = np.cumsum(rng.choice([1.0, 2.0, 7.0, 0.5], 80))
     P, q = CHAINS["both"]
     bank = Bank([Change(each, prob=None if i == 0 else 0.01) for i, each in enumerate(q)],
