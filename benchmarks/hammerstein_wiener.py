@@ -1,4 +1,4 @@
-"""Speed of Hammerstein-Wiener tracking: stage one beside a regression of its size, separation, a stream with blocks.
+"""Speed of Hammerstein-Wiener tracking: stage one compared with a regression of its size, separation, streams.
 
     python -m benchmarks.hammerstein_wiener [--quick]
 
@@ -30,11 +30,11 @@ MODELS = {
     "linear": HammersteinWiener(2, 2),
 }
 TURNS = 4
-"""Times that a model and its regression are measured in turns; the least counts."""
+"""Number of turns in which a model and its regression are measured; the minimum counts."""
 
 
 def beside_regression(name: str, model: HammersteinWiener, y: Array, u: Array, tracker: Kalman) -> float:
-    """Print what stage one takes beside a regression of its size; returns the nanoseconds a sample."""
+    """Print the time of stage one compared with a regression of its size; returns the nanoseconds per sample."""
     T = len(y)
     phi = np.random.default_rng(0).normal(size=(T, model.n))
     plain, stage = np.inf, np.inf
@@ -57,8 +57,8 @@ def main(T: int = T, names: tuple[str, ...] = tuple(MODELS)) -> None:
     tracker = Kalman(q=10.0, r=0.01, p0=1e8, theta0=0.01)
     stage, *_ = [beside_regression(name, MODELS[name], s.y, s.u, tracker) for name in names]
     run = track(CUBIC, tracker, s.y, s.u)
-    *groups, quality = empty(CUBIC, T)
-    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, tuple(groups), quality)
+    groups, quality = empty(CUBIC, T)
+    theta, parts = np.ascontiguousarray(run.theta), (CUBIC.structure.sizes, CUBIC.rise, groups, quality)
     for place, method in enumerate(METHODS[:3]):
         cost = least(partial(separate, theta, (CUBIC.na, CUBIC.out.n, place), *parts), T)
         print(f"{method:10s} {cost:5.0f} ns a sample, {cost / stage:.2f} filter steps")

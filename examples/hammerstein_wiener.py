@@ -1,15 +1,11 @@
-"""A valve, a tank and a sensor that all age: the three blocks of a drifting system, told apart on line."""
+"""A valve, a tank and a sensor that all age: on-line separation of the three blocks of a drifting system."""
 
 from pathlib import Path
 
 import numpy as np
 
-from driftfit import Kalman, track
-from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
-from driftfit.models.hammerstein_wiener.model import HammersteinWiener
-from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
-from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
-from driftfit.systems.drift import Ramp, SineOffset
+from driftfit import HammersteinWiener, Kalman, OutputError, Polynomial, hand_off, track
+from driftfit.systems import Ramp, SineOffset
 from driftfit.systems.hammerstein_wiener import simulate
 
 FIGURE = Path(__file__).parent.parent / "docs" / "figures" / "hammerstein_wiener_blocks.png"

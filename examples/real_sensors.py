@@ -1,5 +1,5 @@
-"""What sensors of a plant do, simulated: an input that stands still, fault codes, a coarse meter, a switching arc; and
-parameters that walk, smoothed.
+"""Typical sensors of a plant, simulated: a constant input, fault codes, a coarse meter, a switching arc; and the
+smoothing of random walks.
 
 Prints the tables of docs/real_sensors.md. Run: python examples/real_sensors.py
 """
@@ -10,11 +10,9 @@ import warnings
 
 import numpy as np
 
-from driftfit import ARX, AdaptiveKalman, Kalman, Regression, Track, track
-from driftfit.engine.kernel import Array
+from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, Track, Tracker, track
+from driftfit.extend import Array
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.base import Tracker
-from driftfit.trackers.rls import RLS
 
 T = 2000
 FORGET, WALK = RLS(0.98), Kalman(q=1e-4, r=0.01)
@@ -62,7 +60,7 @@ def codes() -> None:
 
 
 def coarse() -> None:
-    """A flow of 32 +- 2 read in whole numbers."""
+    """A flow of 32 +- 2 read in integers."""
     rng = np.random.default_rng(2)
     x = np.repeat(rng.normal(size=T // 20), 20)
     u = np.column_stack([x, np.ones(T)])
@@ -80,7 +78,7 @@ def coarse() -> None:
 
 
 def arcs() -> None:
-    """i = g u, g between 0.02 and 4 in turn."""
+    """i = g u, with g alternating between 0.02 and 4."""
     print("\nA conductance that switches between 0.02 and 4: rms error of g u")
     names = ("AdaptiveKalman", "RLS(0.998)", "RLS(0.98)", "Kalman")
     print(f"  {'half period':18}" + "".join(f"{name:>16}" for name in names))
@@ -94,7 +92,7 @@ def arcs() -> None:
 
 
 def smoothing() -> None:
-    """Both parameters walk, in noise of standard deviation 0.3; 20 records of 500 samples."""
+    """Both parameters are random walks, in noise of standard deviation 0.3; 20 records of 500 samples."""
     print("\nParameters that walk, 20 records: rms error, and share of the truth in 95 % bands")
     print(f"  {'step':18}{'followed':>16}{'smoothed':>16}")
     for step in (0.01, 0.03, 0.1):

@@ -182,9 +182,9 @@ def test_a_frozen_sensor_is_named():
 
 
 def test_nothing_else_has_hypotheses():
-    with pytest.raises(ValueError, match="Kalman weighs none"):
+    with pytest.raises(ValueError, match="Kalman has no hypotheses"):
         track(Regression(N), Kalman(0.1, 0.1), *record(5)).hypotheses  # noqa: B018
-    with pytest.raises(ValueError, match="Kalman weighs none"):
+    with pytest.raises(ValueError, match="Kalman has no hypotheses"):
         Live(Regression(N), Kalman(0.1, 0.1)).hypotheses  # noqa: B018
 
 

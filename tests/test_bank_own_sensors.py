@@ -80,7 +80,9 @@ def record(T=60):
 
 
 @pytest.mark.parametrize("form", ["covariance", "sqrt"])
-@pytest.mark.parametrize(("reduce", "naive"), [(GPB(2), naive_bank.gpb(2)), (Beam(9), naive_bank.beam(9))], ids=str)
+@pytest.mark.parametrize(
+    ("reduce", "naive"), [(GPB(2), naive_bank.gpb(2)), (Beam(9), naive_bank.beam(9))], ids=["GPB", "Beam"]
+)
 def test_own_likelihoods_are_what_the_twin_says(reduce, naive, form):
     y, u = record()
     bank = Bank(changes(), SENSORS, None, reduce, p0=2.0, lag_variance=False, form=form)

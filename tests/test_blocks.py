@@ -105,11 +105,11 @@ def test_the_jacobian_against_differences(intercept):
     a, b, c, d = structure.groups(xi)
     zeta = np.concatenate([a, b, c, d[1:], xi[structure.n_x - intercept :]])
     compiled, off = np.empty((len(zeta), structure.n)), np.empty(structure.n)
-    jacobian(zeta, (2, 4), structure.sizes, compiled)
+    jacobian.py_func(zeta, (2, 4), structure.sizes, compiled)
     leads = len(a) + len(b) + structure.leads
     assert same(np.delete(compiled, leads, axis=0).T, J)
     assert_allclose(compiled[leads[0], 2:5], b[:3])  # what c_1 moves, which xi does not have
-    residual(structure.products(xi), zeta, (2, 4), structure.sizes, off)
+    residual.py_func(structure.products(xi), zeta, (2, 4), structure.sizes, off)
     assert_allclose(off, 0.0, atol=1e-15)
 
 
@@ -249,7 +249,7 @@ def test_names_and_refusals():
     assert np.isnan(found.std.b).all()
     with pytest.raises(ValueError, match="method must be one of"):
         run.blocks("pca")
-    with pytest.raises(ValueError, match="Regression has none"):
+    with pytest.raises(ValueError, match="Regression has no blocks"):
         track(Regression(1), AugmentedFLS(1.0), s.y, s.u).blocks()
     with pytest.raises(ValueError, match="output must be one of"):
         run.blocks(output="c1")

@@ -353,7 +353,7 @@ def test_what_does_not_fit_warns_and_names_the_remedy():
         run = track(HammersteinWiener(1, 1, input=BSpline(2, (-1, 0, 1))), Still(), y, u)
     assert np.flatnonzero(~run.ok[2:]).tolist() == [t - 1 for t in np.flatnonzero(np.abs(u[:-1]) > 1) if t > 0]
     for wrong, says in (
-        (lambda: PiecewiseLinear([0.0, 1.0, 1.0]), "twice"),
+        (lambda: PiecewiseLinear([0.0, 1.0, 1.0]), "strictly increasing"),
         (lambda: Legendre(3, (1, 1)), "low below high"),
         (lambda: HammersteinWiener(1, 0), "nb must be a whole number of at least 1"),
         (lambda: HammersteinWiener(1, 1, output=DeadZone(1.0)), "not one-to-one"),

@@ -19,7 +19,7 @@ FLOORS = [
     ["smooth", "tune", "judge", "use", "models.hammerstein_wiener.results", "trackers.bank.results"],
     ["show"],
     # the facade binds verbs to results
-    ["", "results", "fleets", "streams", "tracking", "checks"],
+    ["", "results", "fleets", "streams", "tracking", "checks", "extend"],
     ["demo", "embedded", "bridges", "service", "cli", "__main__"],
 ]
 """Folders and modules by rank, the lowest first; the longest prefix of a module's name counts."""

@@ -1,12 +1,14 @@
 """Several outputs wherever a single one goes: tables, fleets, files, warm starts, forecasts, tuning, windows."""
 
+from copy import copy
+
 import naive_smoother as naive
 import numpy as np
 import polars as pl
 import pytest
 from test_outputs import NAMES, coupled, measured
 
-from driftfit import ARX, FLS, RLS, Kalman, Live, Regression, Track, frontier, track, tune
+from driftfit import ARX, FLS, RLS, Kalman, Live, Regression, Track, frontier, grid, select, track, tune
 from driftfit.fleets import Outputs, Shared
 from driftfit.streams import LiveOutputs
 
@@ -250,3 +252,52 @@ def test_an_output_missing_before_anything_is_known_is_not_taken_for_theta0():
     assert run.ok[3].all()
     y[1, 0], y[40, 0] = 0.0, np.nan
     assert track(JOINT, Kalman(q=1e-4, r=0.01), y, u).ok[41].all()  # and this one the model's own prediction
+
+
+def test_live_loads_a_stream_with_several_outputs(tmp_path):
+    (_, y, u, _), (shared, z, phi, _) = records()
+    for model, out, given in ((ARX(1, 1, inputs=1, ny=NAMES), y, u), (shared, z, phi)):
+        live, never = Live(model, TRACKER), Live(model, TRACKER)
+        for t in range(20):
+            never.update(out[t], given[t])
+            live.update(out[t], given[t])
+        live.save(tmp_path / "state")
+        for again in (Live.load(tmp_path / "state"), Live.from_bytes(live.to_bytes())):
+            assert isinstance(again, LiveOutputs)
+            for a, b in zip(again.update(out[20], given[20]), never.update(out[20], given[20]), strict=True):
+                np.testing.assert_array_equal(a, b)
+            np.testing.assert_array_equal(again.theta, never.theta)
+            never = copy(live)
+    Live(ARX(1, 1, inputs=1), TRACKER).save(tmp_path / "one")
+    with pytest.raises(ValueError, match="holds a state"):
+        LiveOutputs.load(tmp_path / "one")
+
+
+def test_summaries_are_objects():
+    (joint, y, u, _), (shared, z, phi, _) = records()
+    said = track(joint, TRACKER, y, u).summary()
+    assert list(said) == ["level", "flow"]
+    assert said["flow"].rows[0].name == "a1[flow<-level]"
+    assert str(said["flow"]) in str(said)
+    run = track(shared, TRACKER, z, phi)
+    assert run.summary().rows[0][1] == run.theta[-1, 0]
+    assert list(run.summary().errors) == list(run.outputs)
+    assert "One-step prediction error" in str(run.summary())
+
+
+@pytest.mark.filterwarnings("ignore:tune")
+def test_every_verb_of_a_table_of_signals_is_that_of_arrays(tmp_path):
+    (joint, y, u, _), _ = records()
+    path = tmp_path / "record.csv"
+    pl.DataFrame({"level": y[:, 0], "flow": y[:, 1], "u": u, "t": np.arange(80.0)}).write_csv(path)
+    single = ARX(1, 1)
+    arrays, table = {"y": y[:, 0], "u": u}, {"y": "level", "u": "u", "time": "t", "data": path}
+    a, b = (tune(single, FLS(), **given) for given in (arrays, table))
+    assert a.tracker == b.tracker
+    a, b = (tune(joint, FLS(), y=given, u=inputs, **more) for given, inputs, more in (
+        (y, u, {}), (["level", "flow"], "u", {"data": path, "time": "t"})))  # fmt: skip
+    assert a.tracker == b.tracker
+    a, b = (frontier(single, mu=[1.0, 100.0], **given) for given in (arrays, table))
+    np.testing.assert_array_equal(a.measurement, b.measurement)
+    a, b = (select(grid(ARX, na=[1, 2], nb=[1]), tracker=TRACKER, **given) for given in (arrays, table))
+    assert [row.loglik for row in a.rows] == [row.loglik for row in b.rows]

@@ -15,9 +15,8 @@ def test_an_example_is_its_regression_and_the_model_sees_it(name):
     again = example(name, 3)
     np.testing.assert_array_equal(d.y, again.y)
     noise = d.y - np.sum(d.phi * d.theta, axis=1)
-    assert {"sinusoids": 0.1, "rational": 0.2, "switching": 0.2, "exp-ar": 0.1}[name] == pytest.approx(
-        noise.std(), rel=0.35
-    )
+    sigma = {"sinusoids": 0.1, "rational": 0.2, "switching": 0.2, "exp-ar": 0.1}[name]
+    assert noise.std() == pytest.approx(sigma, rel=3.5 / np.sqrt(2.0 * len(noise)))
     np.testing.assert_array_equal(walk_of(track(d.model, FLS(1.0), d.y, d.u)).phi, d.phi)
 
 

@@ -14,7 +14,12 @@ from lab.reproduce.hammerstein_wiener.figures import errors, parameters
 
 
 def test_the_first_examples_have_the_reference_errors():
-    """Medians over seeds that the reference did not use, within 15 %."""
+    """Medians over six seeds that the reference did not use, as they are; the reference lies within their scatter.
+
+    Over thirty seeds the medians of records scatter by 0.0019 (EKF) to 0.0029, so a median of six has a standard error
+    of 0.0015 at the most: that of the difference from the median of 24 that the reference gives is below 0.0017.
+    """
+    exact = {"average": 0.019914, "svd-joint": 0.020095, "gls": 0.018521, "ekf": 0.015873}
     seeds = range(100, 106)
     measured: dict[str, list[float]] = {"average": [], "svd-joint": [], "gls": [], "ekf": []}
     for seed in seeds:
@@ -25,12 +30,14 @@ def test_the_first_examples_have_the_reference_errors():
         measured["ekf"].append(runs.late(runs.off(track(s.model, runs.FAST, s.y, s.u).theta, s)).median)
     reference = {key: median for example_, key, _, median, _ in tables.ROWS if example_ == "1"}
     for key, values in measured.items():
-        assert np.median(values) == pytest.approx(reference[key], rel=0.15), key
+        assert np.median(values) == pytest.approx(exact[key], rel=1e-3), key
+        assert np.median(values) == pytest.approx(reference[key], abs=2.0 * 0.0017), key
     arrived = [runs.second_example(seed, T=1000) for seed in range(100, 104)]
-    for start, most in ((0.01, 16), (10.0, 17), (1000.0, 20)):
-        assert 13 <= np.median([row["two-stage", start] for row in arrived]) <= most
-    assert np.median([row["ekf", 0.01] for row in arrived]) > 40
-    assert np.mean([np.isinf(row["ekf", 1000.0]) for row in arrived]) >= 0.5
+    for start, samples in ((0.01, 15.0), (10.0, 15.0), (1000.0, 17.0)):
+        assert np.median([row["two-stage", start] for row in arrived]) == samples
+    assert np.median([row["ekf", 0.01] for row in arrived]) == pytest.approx(109.0, abs=2.0)
+    assert all(np.isinf(row["ekf", 1000.0]) for row in arrived)
+    assert np.median([row["inflated", 1000.0] for row in arrived]) == pytest.approx(351.0, abs=5.0)
     paths = {"average": runs.separated(run, "average"), "svd": runs.separated(run, "svd")}
     for i, axis in enumerate(parameters(s, paths, slice(0, 4), "a, b").axes):
         truth, *lines = (line.get_ydata() for line in axis.lines)
@@ -91,8 +98,9 @@ def test_the_bias_is_the_mean_error():
     """A tenth of the noise variance is a tenth of the bias, although the errors of single records do not shrink so."""
     few = {db: [runs.misfit(db, 0.0, seed, T=1000) for seed in range(12)] for db in (40.0, 30.0)}
     sizes = {db: np.linalg.norm(np.mean(rows, axis=0)) for db, rows in few.items()}
-    assert 0.06 < sizes[40.0] / sizes[30.0] < 0.16
-    assert np.median(np.linalg.norm(few[40.0], axis=1)) > 2.0 * sizes[40.0]
+    assert sizes[40.0] == pytest.approx(0.0017032, rel=1e-3)
+    assert sizes[30.0] == pytest.approx(0.018280, rel=1e-3)
+    assert np.median(np.linalg.norm(few[40.0], axis=1)) == pytest.approx(0.0059080, rel=1e-3)
 
 
 def test_the_command_runs():

@@ -1,23 +1,48 @@
-"""driftfit follows the parameters of a system while they change."""
+"""driftfit tracks the parameters of a system while they change."""
 
+from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
-from driftfit.fleets import Fleet
+from driftfit.fleets import Fleet, Outputs, OutputsFleet, Shared
 from driftfit.judge.segment import segment
+from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
+from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.curves.basis import (
+    Chebyshev,
+    DeadZone,
+    Legendre,
+    Polynomial,
+    Saturation,
+    Sigmoid,
+)
+from driftfit.models.hammerstein_wiener.curves.curve import Functions
+from driftfit.models.hammerstein_wiener.curves.splines import BSpline, PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.results.diagnostics import diagnose_blocks
+from driftfit.models.hammerstein_wiener.results.drift_ratios import track_ratios
+from driftfit.models.hammerstein_wiener.results.free_run import free_run
+from driftfit.models.hammerstein_wiener.results.hybrid_start import hand_off
+from driftfit.models.hammerstein_wiener.results.product_drift import track_products
+from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curves
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.streams import Live
+from driftfit.smooth.augmented import augmented
+from driftfit.smooth.huber import huber
+from driftfit.smooth.piecewise import piecewise
+from driftfit.smooth.total_variation import total_variation
+from driftfit.streams import Live, LiveOutputs
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
+from driftfit.trackers.bank.results.pictures import plot_tree
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
@@ -25,6 +50,8 @@ from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
+from driftfit.use.rational import rational_model
+from driftfit.use.recover import static_curve
 
 __all__ = [
     "ARX",
@@ -34,28 +61,58 @@ __all__ = [
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
+    "BSpline",
     "Bank",
     "Beam",
     "Change",
+    "Chebyshev",
     "DataWarning",
+    "DeadZone",
     "Decide",
     "ExtendedKalman",
     "FirstFloor",
     "Fleet",
+    "Functions",
     "HammersteinWiener",
     "Hybrid",
     "Kalman",
+    "Legendre",
     "Live",
+    "LiveOutputs",
+    "LiveSelection",
+    "Model",
     "OutputError",
+    "Outputs",
+    "OutputsFleet",
+    "PiecewiseLinear",
+    "Polynomial",
     "Regression",
+    "Saturation",
     "Sensor",
+    "Shared",
+    "Sigmoid",
     "Track",
+    "Tracker",
     "__version__",
+    "augmented",
+    "check_tracker",
+    "diagnose_blocks",
+    "free_run",
     "frontier",
     "grid",
+    "hand_off",
+    "huber",
+    "piecewise",
+    "plot_tree",
     "prepare",
+    "rational_model",
     "segment",
     "select",
+    "shared_curves",
+    "static_curve",
+    "total_variation",
     "track",
+    "track_products",
+    "track_ratios",
     "tune",
 ]

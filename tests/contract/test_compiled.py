@@ -7,14 +7,18 @@ import os
 import pty
 import subprocess
 import sys
+import threading
 import weakref
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
+from numba.core import event
+from numba.core.registry import cpu_target
 
-from driftfit.engine import compile_notice, disk_cache, kernel, linking
-from driftfit.engine.kernel import Driver
+from driftfit.engine import compile_notice, disk_cache, kernel, numba_internals
+from driftfit.engine.kernel import Driver, machine, part
 
 SRC = Path(__file__).parents[2] / "src"
 
@@ -126,7 +130,7 @@ def test_a_cache_that_can_only_be_read_is_read(tmp_path, monkeypatch):
         assert Driver(second)(np.ones((2, 2))) == 1.0
         assert len(list(filled.iterdir())) == 1
         monkeypatch.setattr(disk_cache, "folder", lambda: None)
-        monkeypatch.setattr(kernel, "compiled", None)  # the compiler is not asked
+        monkeypatch.setattr(numba_internals, "emit", None)  # the compiler is not asked
         assert Driver(second)(np.ones((2, 2))) == 1.0
         assert disk_cache.contents()[:2] == (filled, 1)
     finally:
@@ -146,16 +150,14 @@ def test_layouts_are_told_apart(own_cache):
 
 def test_memory_goes_with_the_last_reference(own_cache, monkeypatch):
     monkeypatch.setattr(kernel, "MOST_ENTRIES", 2)
-    monkeypatch.setattr(kernel, "_entries", kernel._Entries())
     driver = Driver(second)
     arrays = [np.ones((3, 3), kind) for kind in ("f8", "f4", "i8")]
-    held = driver.entry(kernel._type(arrays[0]))
-    entries = [weakref.ref(held)]
-    for array in arrays:
-        driver(array)
-    entries += [weakref.ref(one) for one in set(driver._entries.values()) if one is not held]
-    assert len(set(driver._entries.values())) == 2  # the first was let go
-    assert held(arrays[0]) == 1.0  # who holds it goes on
+    held, *others = (driver.entry(numba.typeof(array)) for array in arrays)
+    entries = [weakref.ref(one) for one in (held, *others)]
+    del others
+    gc.collect()
+    assert [entry() is None for entry in entries] == [False, False, False]  # the first was let go, but it is held
+    assert held(arrays[0]) == 1.0
     del held
     gc.collect()
     assert [entry() is None for entry in entries] == [True, False, False]
@@ -173,11 +175,9 @@ def test_what_only_the_compiler_needs_is_forgotten(own_cache):
     assert Driver(user)(np.ones(1)) == 2.0
     assert len(twice.overloads) == 1
     assert twice(1.0) == 2.0  # from Python it has code of its own
-    kept = list(linking._recent)
-    linking.forget(0)
+    numba_internals.forget(0)
     assert len(twice.overloads) == 0
     assert Driver(user)(np.ones(1, "f4")) == 2.0
-    linking._recent.update(dict.fromkeys(kept))
 
 
 def test_files_are_whole_or_not_used_and_are_pruned(own_cache):
@@ -220,6 +220,124 @@ def test_compiling_is_said_once_and_only_where_somebody_looks():
     os.close(ours)
 
 
-def test_compilers_are_called_in_three_files_only():
-    used = {path.name for path in (SRC / "driftfit").rglob("*.py") if "njit(" in path.read_text()}
-    assert used == {"kernel.py", "linking.py", "machine_code.py"}
+def family(number):
+    """Parts that call each other, and a machine that calls them, of their own for every number."""
+
+    @part
+    def inner(x):
+        return x + number
+
+    @part
+    def outer(x):
+        return 2.0 * inner(x)
+
+    def machine_of_family(k: int, x: float) -> None:
+        outer(x)
+
+    machine_of_family.__qualname__ += str(number)
+    return machine(machine_of_family), lambda y: outer(y[0]) if number else y[0]
+
+
+def test_two_threads_that_compile_at_once_do_not_mix(own_cache):
+    """What is replaced in Numba while a part is compiled is put back, whatever another thread replaced meanwhile."""
+    codegen = cpu_target.target_context.codegen()
+    before, barrier, failures = {**vars(codegen)}, threading.Barrier(2), []
+
+    def work(numbers):
+        try:
+            for number in numbers:
+                barrier.wait(60.0)
+                family(number)[0].load()
+        except BaseException as failure:
+            failures.append(failure)
+
+    threads = [threading.Thread(target=work, args=(numbers,)) for numbers in ((1.0, 2.0), (3.0, 4.0))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    assert vars(codegen) == before
+
+
+FORKS = """
+import os, sys, threading
+import numpy as np
+from driftfit.engine.kernel import Driver
+from numba.core import event
+
+def plus(y):
+    return y[0] + 1.0
+
+def times(y):
+    return y[0] * 3.0
+
+inside, forked = threading.Event(), threading.Event()
+
+class Slowly(event.Listener):
+    def on_start(self, happened):
+        inside.set()
+        forked.wait(0.5)  # in the middle of compiling, while the other thread forks
+    def on_end(self, happened):
+        pass
+
+with event.install_listener("numba:compile", Slowly()):
+    thread = threading.Thread(target=Driver(plus), args=(np.ones(1),))
+    thread.start()
+    inside.wait()
+    child = os.fork()
+    forked.set()
+    if child == 0:
+        print(Driver(plus)(np.ones(1)), Driver(times)(np.ones(1)), flush=True)
+        os._exit(0)
+    thread.join()
+_, status = os.waitpid(child, 0)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_fork_while_another_thread_compiles(tmp_path):
+    script = tmp_path / "forks.py"
+    script.write_text(FORKS)
+    code = f"import runpy; runpy.run_path({str(script)!r}, run_name='forks')"
+    said, _ = ended(start(code, NUMBA_CACHE_DIR=str(tmp_path / "cache")))
+    assert said == "2.0 3.0"
+
+
+class Interrupt(event.Listener):
+    """The user's Ctrl-C when the compiler has done so many steps."""
+
+    def __init__(self, steps):
+        self.left = steps
+
+    def on_start(self, happened):
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+
+    def on_end(self, happened):
+        pass
+
+
+@pytest.mark.parametrize("steps", [1, 12, 25])
+def test_an_interrupted_compilation_can_be_repeated(own_cache, steps):
+    codegen = cpu_target.target_context.codegen()
+    before, driver = {**vars(codegen)}, Driver(family(10.0 + steps)[1])
+    with pytest.raises(KeyboardInterrupt), event.install_listener("numba:run_pass", Interrupt(steps)):
+        driver(np.ones(1))
+    assert vars(codegen) == before
+    assert all(path.suffix == disk_cache.ENDING for path in own_cache.glob("*"))
+    assert driver(np.ones(1)) == 2.0 * (11.0 + steps)
+
+
+def test_a_write_that_is_interrupted_leaves_no_file(own_cache, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as while_writing:
+        while_writing.setattr(os, "replace", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            Driver(second)(np.ones((2, 2)))
+    assert list(own_cache.iterdir()) == []
+    assert Driver(second)(np.ones((2, 2))) == 1.0

@@ -57,6 +57,7 @@ def test_no_excitation_stays_within_the_promise(model, tracker):
     """A random walk grows by exactly q a sample; exponential forgetting stops at its cap."""
     y, u = RECORDS["silent"]
     run = track(model, tracker, y, u)
+    assert same(run.theta[600:], np.tile(run.theta[600], (LONG - 600, 1)))  # regressors of zero say nothing
     P = np.diagonal([run.cov(t) for t in (600, LONG - 1)], axis1=1, axis2=2)
     if hasattr(tracker, "q"):
         expected = P[0] + (LONG - 601) * tracker.q

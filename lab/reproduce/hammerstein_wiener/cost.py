@@ -45,8 +45,8 @@ def measure(
         y, u = rng.uniform(-3.0, 3.0, (2, samples))
         xi = rng.normal(size=(samples, model.structure.n_x))
         theta: Array = model.structure.products(xi) + 0.01 * rng.normal(size=(samples, model.n))
-        *groups, quality = empty(model, samples)
-        parts = (model.structure.sizes, model.rise, tuple(groups), quality)
+        groups, quality = empty(model, samples)
+        parts = (model.structure.sizes, model.rise, groups, quality)
         row = {}
         for place, method in enumerate(METHODS[:3]):
             row[method] = least(partial(separate, theta, (na, n_out, place), *parts), samples)

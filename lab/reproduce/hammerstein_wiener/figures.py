@@ -1,9 +1,9 @@
-"""Figures 2 to 10, 12 and 13 of the paper, drawn from this library's runs of seed 0. Truth is grey."""
+"""Figures 1 to 13 of the paper, drawn from this library's runs of seed 0. Truth is grey."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,8 +12,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
-from driftfit.systems.arc_furnace import furnace
-from driftfit.systems.hammerstein_wiener import Simulated, example
+from driftfit.systems.arc_furnace import furnace, resistance, valve
+from driftfit.systems.hammerstein_wiener import CUBIC, START, Simulated, example
 from driftfit.tracking import track
 from lab.reproduce.hammerstein_wiener.runs import FAST, PAPER, STARTS, fourth_example, off, separated
 
@@ -26,11 +26,13 @@ GREEN = "#3a8f4f"
 
 
 def draw(folder: Path) -> None:
-    """Write hammerstein_wiener_02.png .. 10, 12, 13."""
+    """Write hammerstein_wiener_01.png .. 13."""
 
     def save(number: int, figure: Figure) -> None:
         figure.savefig(folder / f"hammerstein_wiener_{number:02d}.png", dpi=80)
 
+    save(1, structure_of_the_model())
+    save(11, structure_of_the_furnace())
     for first, s in ((2, example(1, 0)), (8, example(3, 0, snr_db=20.0))):
         run = track(s.model, PAPER, s.y, s.u)
         paths = {method: separated(run, method) for method in METHODS}
@@ -50,6 +52,47 @@ def draw(folder: Path) -> None:
     raw["Legendre, q = 4"] = fourth_example(f, 4, False, "svd")
     save(12, errors({name: r.a + r.b + r.p for name, r in raw.items()}, "example 4, Er of (67)"))
     save(13, residuals({name: r.equation for name, r in raw.items()}))
+
+
+def structure_of_the_model() -> Figure:
+    """The three blocks, with the curves of examples 1 to 3 at their beginning."""
+    x = np.linspace(-1.5, 1.5, 61)
+    into, out = ([1.0, *START[name]] @ CUBIC.out.value(x).T for name in "cd")
+    blocks = (("F_I,t", (x, into)), ("G_t(z^-1)", None), ("F_O,t", (out, x)))
+    return chain(blocks, ("u_t", "v_t", "w_t", "y_t"), "the Hammerstein-Wiener system, and its static curves at t = 0")
+
+
+def structure_of_the_furnace() -> Figure:
+    """Valve, hydraulic drive and arc, with the curves of valve and arc, the arc at the beginning."""
+    u, L = np.linspace(-12.0, 12.0, 121), np.linspace(5.0, 40.0, 61)
+    arc = (L, resistance(L, np.full(len(L), 6.0)))
+    blocks = (("proportional valve (V)", (u, valve(u))), ("hydraulic system", None), ("arc (cm to mOhm)", arc))
+    return chain(blocks, ("u", "v", "L", "R_arc"), "the electric arc furnace as a Hammerstein-Wiener system")
+
+
+def chain(blocks: Sequence[tuple[str, tuple[Array, Array] | None]], signals: Sequence[str], title: str) -> Figure:
+    """Blocks in series with the signals between them; a curve is drawn in the block it belongs to."""
+    figure = new_figure(7.0, 1.9)
+    figure.set_layout_engine("none")
+    page = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    page.axis("off")
+    page.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+    step, width = 1.0 / len(blocks), 0.2
+    for k, (name, curve) in enumerate(blocks):
+        left = (k + 0.5) * step - 0.5 * width
+        box = figure.add_axes((left, 0.22, width, 0.46), xticks=[], yticks=[])
+        box.set_title(name, fontsize=9)
+        if curve is None:
+            box.text(0.5, 0.5, "linear,\nlags of w and v", ha="center", va="center", fontsize=8)
+        else:
+            box.plot(*curve, color=BLUE, lw=1.2)
+    for k, signal in enumerate(signals):
+        start = max((k - 0.5) * step + 0.5 * width, 0.005)
+        end = min((k + 0.5) * step - 0.5 * width, 0.995)
+        page.annotate("", (end, 0.45), (start, 0.45), arrowprops={"arrowstyle": "->", "color": GREY})
+        page.text(0.5 * (start + end), 0.5, signal, ha="center", fontsize=9)
+    page.text(0.01, 0.05, title, fontsize=9)
+    return figure
 
 
 def errors(paths: Mapping[str, Array], title: str) -> Figure:

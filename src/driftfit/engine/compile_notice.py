@@ -18,7 +18,7 @@ PATIENCE = 2.0
 TEXT = "driftfit: compiling once for this computer ..."
 TEXT_IN_MEMORY = "driftfit: compiling; no folder can be written to keep the code ..."
 
-_lock = threading.RLock()
+lock = threading.RLock()
 _spent = 0.0
 _depth = 0
 _said = False
@@ -28,7 +28,7 @@ _said = False
 def compiling() -> Iterator[None]:
     """Around what compiles; of nested ones the outermost counts."""
     global _depth, _spent
-    with _lock:
+    with lock:
         _depth += 1
         timer = None
         if _depth == 1 and not _said and watched():
@@ -44,7 +44,7 @@ def compiling() -> Iterator[None]:
             gc.enable()
         if timer is not None:
             timer.cancel()
-        with _lock:
+        with lock:
             _depth -= 1
             if _depth == 0:
                 _spent += time.perf_counter() - start

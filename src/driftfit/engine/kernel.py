@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections import OrderedDict
 from collections.abc import Callable
 from threading import Lock
@@ -32,7 +33,7 @@ import numpy.typing as npt
 from numba import types
 from numba.extending import models, register_model
 
-from driftfit.engine import disk_cache
+from driftfit.engine import compile_notice, disk_cache
 from driftfit.engine import numba_internals as internals
 from driftfit.engine.compile_notice import compiling
 from driftfit.engine.identity import identity
@@ -56,7 +57,10 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
         function.__qualname__, function.__doc__ = f"{source.__name__}_{name[:16]}", source.__doc__
     dispatcher = internals.under_ieee(function, **options)
     if cache:
-        file = lambda sig: disk_cache.name_of(function.__name__, name, sig)  # noqa: E731
+
+        def file(signature: Any) -> str:
+            return disk_cache.name_of(function.__name__, name, signature)
+
         internals.store_by(
             dispatcher, lambda sig: disk_cache.read(file(sig)), lambda sig, data: disk_cache.write(file(sig), data)
         )
@@ -77,7 +81,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
     instead of raising, the GIL is released, and there is no fast-math.
     """
-    made = internals.as_part(_compiled(function, forceinline=inline, no_cfunc_wrapper=True), internals.StepDispatcher)
+    made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
 
 
@@ -87,7 +91,8 @@ def shared(function: Callable[..., Any]) -> Any:
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that.
     """
-    return _again(internals.as_part(_compiled(function, cache=True, **internals.LINKED)), shared)
+    compiled = _compiled(function, cache=True, no_cfunc_wrapper=True, no_cpython_wrapper=True)  # it may own arrays
+    return _again(internals.as_part(compiled), shared)
 
 
 def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] = ()) -> Any:
@@ -164,7 +169,7 @@ def _machine(symbol: str) -> Machine:
 def machine(function: Callable[..., Any]) -> Machine:
     """Make a machine of a function of addresses, whole numbers, and arguments annotated as float."""
     assert isinstance(function, FunctionType)
-    dispatcher = _compiled(function, cache=True)
+    dispatcher = _compiled(function, cache=True, no_cpython_wrapper=True, _nrt=False)
     symbol = f"driftfit_{function.__name__}_{dispatcher.identity[:32]}"
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     kinds = [types.float64 if function.__annotations__.get(name) == "float" else types.intp for name in names]
@@ -262,11 +267,11 @@ class _Entries:
 
     def __init__(self) -> None:
         self._owners: OrderedDict[Any, ref[Driver]] = OrderedDict()
-        self._lock = Lock()
+        self.lock = Lock()
 
     def used(self, entry: Any, owner: Driver) -> None:
         """Note that an entry point is in use, and let go of those that were not for longest."""
-        with self._lock:
+        with self.lock:
             self._owners.setdefault(entry, ref(owner))
             self._owners.move_to_end(entry)
             while len(self._owners) > MOST_ENTRIES:
@@ -277,6 +282,23 @@ class _Entries:
 
 
 _entries = _Entries()
+
+_LOCKS = (internals.compiler_lock, _entries.lock, compile_notice.lock)
+"""In the order in which they are taken."""
+
+
+def _acquire_locks() -> None:
+    for lock in _LOCKS:
+        lock.acquire()
+
+
+def _release_locks() -> None:
+    for lock in reversed(_LOCKS):
+        lock.release()
+
+
+if hasattr(os, "register_at_fork"):  # a child has no thread that would release what another one held: fork between them
+    os.register_at_fork(before=_acquire_locks, after_in_parent=_release_locks, after_in_child=_release_locks)
 
 floats = internals.matrix_at("floats", types.float64)
 """floats(address, rows, columns): the array (rows, columns) of floats that begins at an address."""

@@ -1,7 +1,7 @@
-"""Eight numbers at once, or four, for machines whose rows are short.
+"""SIMD vectors of eight numbers, or four, for compiled routines that work on short rows.
 
 A compiler that vectorises a loop of unknown length puts checks before it and a remainder after it, which cost more than
-the loop where rows have a dozen entries. A loop over eights has neither:
+the loop where rows have a dozen entries. A loop over vectors has neither:
 
     for l in range(0, count, 8):
         store(a, i, l, minus(load(b, j, l), times(load(c, k, l), load(d, m, l))))
@@ -22,37 +22,37 @@ from driftfit.engine.numba_internals import ir, named_intrinsic
 
 WIDTH = 8
 _I64 = ir.IntType(64)
-_EIGHT, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
-_FOUR = ir.VectorType(ir.DoubleType(), 4)
+_VECTOR8, _WHOLE = ir.VectorType(ir.DoubleType(), WIDTH), ir.VectorType(_I64, WIDTH)
+_VECTOR4 = ir.VectorType(ir.DoubleType(), 4)
 
 
-class Eight(types.Type):
-    """Eight floats, as the compiler sees them."""
-
-    def __init__(self) -> None:
-        super().__init__(name="driftfit.Eight")
-
-
-class Four(types.Type):
-    """Four floats: amid a filter of single numbers a few eights made the whole filter slower than they saved."""
+class Vector8(types.Type):
+    """A vector of eight floats, as the compiler sees it."""
 
     def __init__(self) -> None:
-        super().__init__(name="driftfit.Four")
+        super().__init__(name="driftfit.Vector8")
 
 
-@register_model(Eight)
-class _Vector(models.PrimitiveModel):
+class Vector4(types.Type):
+    """A vector of four floats: amid a filter of single numbers a few of eight cost more than they saved."""
+
+    def __init__(self) -> None:
+        super().__init__(name="driftfit.Vector4")
+
+
+@register_model(Vector8)
+class _Model8(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _EIGHT)
+        super().__init__(manager, kind, _VECTOR8)
 
 
-@register_model(Four)
-class _Shorter(models.PrimitiveModel):
+@register_model(Vector4)
+class _Model4(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _FOUR)
+        super().__init__(manager, kind, _VECTOR4)
 
 
-eight, four = Eight(), Four()
+vector8, vector4 = Vector8(), Vector4()
 
 
 def _named(name: str, build: Any) -> Any:
@@ -65,22 +65,22 @@ def _place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: 
     inside = context.make_array(kind)(context, builder, array)
     columns = builder.extract_value(inside.shape, 1)
     first = builder.gep(inside.data, [builder.add(builder.mul(row, columns), column)])
-    return builder.bitcast(first, _EIGHT.as_pointer())
+    return builder.bitcast(first, _VECTOR8.as_pointer())
 
 
 def _load(context: Any, array: Any, row: Any, column: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.load(_place(context, builder, signature.args[0], *given), align=8)
 
-    return eight(array, types.intp, types.intp), build
+    return vector8(array, types.intp, types.intp), build
 
 
 def _load_four(context: Any, array: Any, row: Any, column: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         first = _place(context, builder, signature.args[0], *given)
-        return builder.load(builder.bitcast(first, _FOUR.as_pointer()), align=8)
+        return builder.load(builder.bitcast(first, _VECTOR4.as_pointer()), align=8)
 
-    return four(array, types.intp, types.intp), build
+    return vector4(array, types.intp, types.intp), build
 
 
 def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
@@ -88,21 +88,21 @@ def _store(context: Any, array: Any, row: Any, column: Any, value: Any) -> Any:
         builder.store(given[3], _place(context, builder, signature.args[0], *given[:3]), align=8)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, eight), build
+    return types.void(array, types.intp, types.intp, vector8), build
 
 
 def _fill(context: Any, value: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _spread(builder, given[0], _EIGHT)
+        return _spread(builder, given[0], _VECTOR8)
 
-    return eight(types.float64), build
+    return vector8(types.float64), build
 
 
 def _fill_four(context: Any, value: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return _spread(builder, given[0], _FOUR)
+        return _spread(builder, given[0], _VECTOR4)
 
-    return four(types.float64), build
+    return vector4(types.float64), build
 
 
 def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
@@ -114,12 +114,12 @@ def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
         bytes_ = builder.shl(builder.load(indices, align=8), ir.Constant(_WHOLE, [3] * WIDTH))
         kind = ir.VectorType(ir.DoubleType().as_pointer(), WIDTH)
         name, mask = "llvm.masked.gather.v8f64.v8p0", ir.Constant(ir.VectorType(ir.IntType(1), WIDTH), [1] * WIDTH)
-        given_by = ir.FunctionType(_EIGHT, [kind, ir.IntType(32), mask.type, _EIGHT])
+        given_by = ir.FunctionType(_VECTOR8, [kind, ir.IntType(32), mask.type, _VECTOR8])
         gather = builder.module.globals.get(name) or ir.Function(builder.module, given_by, name)
         places = builder.inttoptr(builder.add(start, bytes_), kind)
-        return builder.call(gather, [places, ir.Constant(ir.IntType(32), 8), mask, ir.Constant(_EIGHT, ir.Undefined)])
+        return builder.call(gather, [places, ir.Constant(ir.IntType(32), 8), mask, ir.Constant(_VECTOR8, ir.Undefined)])
 
-    return eight(array, types.intp, order, types.intp), build
+    return vector8(array, types.intp, order, types.intp), build
 
 
 def _spread(builder: Any, value: Any, kind: Any) -> Any:
@@ -137,13 +137,13 @@ def _compare(sign: str) -> Any:
             other = _spread(builder, given[2], _WHOLE)
             return _one_where(builder, builder.icmp_signed(sign, builder.load(first, align=8), other))
 
-        return eight(array, types.intp, types.intp), build
+        return vector8(array, types.intp, types.intp), build
 
     return typed
 
 
 def _one_where(builder: Any, true: Any) -> Any:
-    one, zero = (ir.Constant(_EIGHT, [x] * WIDTH) for x in (1.0, 0.0))
+    one, zero = (ir.Constant(_VECTOR8, [x] * WIDTH) for x in (1.0, 0.0))
     return builder.select(true, one, zero)
 
 
@@ -152,41 +152,41 @@ def _pick(sign: str) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return builder.select(builder.fcmp_ordered(sign, *given), *given)
 
-        return eight(eight, eight), build
+        return vector8(vector8, vector8), build
 
     return typed
 
 
 def _only(context: Any, a: Any, b: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        zero = ir.Constant(_EIGHT, [0.0] * WIDTH)
+        zero = ir.Constant(_VECTOR8, [0.0] * WIDTH)
         return builder.select(builder.fcmp_ordered(">", given[1], zero), given[0], zero)
 
-    return eight(eight, eight), build
+    return vector8(vector8, vector8), build
 
 
 def _power_of_two(context: Any, a: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         whole = builder.add(builder.fptosi(given[0], _WHOLE), ir.Constant(_WHOLE, [1023] * WIDTH))
-        return builder.bitcast(builder.shl(whole, ir.Constant(_WHOLE, [52] * WIDTH)), _EIGHT)
+        return builder.bitcast(builder.shl(whole, ir.Constant(_WHOLE, [52] * WIDTH)), _VECTOR8)
 
-    return eight(eight), build
+    return vector8(vector8), build
 
 
 def _exponent_of(context: Any, a: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         shifted = builder.ashr(builder.bitcast(given[0], _WHOLE), ir.Constant(_WHOLE, [52] * WIDTH))
-        return builder.sitofp(builder.sub(shifted, ir.Constant(_WHOLE, [1023] * WIDTH)), _EIGHT)
+        return builder.sitofp(builder.sub(shifted, ir.Constant(_WHOLE, [1023] * WIDTH)), _VECTOR8)
 
-    return eight(eight), build
+    return vector8(vector8), build
 
 
 def _mantissa_of(context: Any, a: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         digits = builder.and_(builder.bitcast(given[0], _WHOLE), ir.Constant(_WHOLE, [0xFFFFFFFFFFFFF] * WIDTH))
-        return builder.bitcast(builder.or_(digits, ir.Constant(_WHOLE, [0x3FF0000000000000] * WIDTH)), _EIGHT)
+        return builder.bitcast(builder.or_(digits, ir.Constant(_WHOLE, [0x3FF0000000000000] * WIDTH)), _VECTOR8)
 
-    return eight(eight), build
+    return vector8(vector8), build
 
 
 def _two(operation: str) -> Any:
@@ -203,7 +203,7 @@ def _reaches(context: Any, a: Any, b: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return _one_where(builder, builder.fcmp_ordered(">=", *given))
 
-    return eight(eight, eight), build
+    return vector8(vector8, vector8), build
 
 
 def _reached(context: Any, a: Any, b: Any) -> Any:
@@ -222,7 +222,7 @@ def _sum(context: Any, value: Any) -> Any:
             parts = [builder.fadd(parts[k], parts[k + half]) for k in range(half)]
         return parts[0]
 
-    return types.float64(eight), build
+    return types.float64(vector8), build
 
 
 def _sums(context: Any, array: Any, row: Any) -> Any:
@@ -231,7 +231,7 @@ def _sums(context: Any, array: Any, row: Any) -> Any:
         zero = ir.Constant(_I64, 0)
         places = [_place(context, builder, signature.args[0], given[0], row, zero) for row in rows]
         parts = [builder.load(place, align=8) for place in places]
-        for step in (1, 2, 4):  # neighbours, pairs, fours: rows fold into each other
+        for step in (1, 2, 4):  # entries, then pairs, then fours: sums of two rows go into one vector
             even = [
                 k // (2 * step) * 2 * step + k % step + (WIDTH if k % (2 * step) >= step else 0) for k in range(WIDTH)
             ]
@@ -245,15 +245,15 @@ def _sums(context: Any, array: Any, row: Any) -> Any:
             ]
         return parts[0]
 
-    return eight(array, types.intp), build
+    return vector8(array, types.intp), build
 
 
 load = _named("load", _load)
 """Entries [row, column] to [row, column + 7] of a matrix."""
 store = _named("store", _store)
-"""The same, written."""
+"""Write a vector there."""
 fill = _named("fill", _fill)
-"""One number, eight times."""
+"""A vector of one number, eight times."""
 plus, minus, times, over = (
     _named(name, _two(operation))
     for name, operation in (("plus", "fadd"), ("minus", "fsub"), ("times", "fmul"), ("over", "fdiv"))
@@ -265,23 +265,23 @@ equal, below = _named("equal", _compare("==")), _named("below", _compare("<"))
 gathered = _named("gathered", _gather)
 """Entries [row, order[k]] to [row, order[k + 7]] of a matrix."""
 reached = _named("reached", _reached)
-"""How many of the first are at least the second, of eights or of fours."""
+"""How many entries of the first are at least those of the second."""
 load_four, fill_four = _named("load_four", _load_four), _named("fill_four", _fill_four)
-"""Entries [row, column] to [row, column + 3]; one number, four times."""
+"""The same for vectors of four."""
 sum_of = _named("sum_of", _sum)
-"""The sum of the eight, in pairs."""
+"""The sum of the eight entries, added in pairs."""
 lower, higher = (_named(name, _pick(sign)) for name, sign in (("lower", "<"), ("higher", ">")))
-"""The smaller, or the larger, of two; the second where one is not a number."""
+"""The smaller, or the larger, of two entries; the second where one is not a number."""
 only = _named("only", _only)
 """The first where the second is positive, 0 elsewhere."""
 _power, _exponent, _mantissa = (_named(f.__name__, f) for f in (_power_of_two, _exponent_of, _mantissa_of))
 row_sums = _named("row_sums", _sums)
-"""The sums of the first eights of rows row to row + 7 of a matrix: less than a third of the work of eight `sum_of`."""
+"""Of the first eight entries of each of the rows row to row + 7: less than a third of the work of eight `sum_of`."""
 
 
 @kernel
 def exp_of(x: Any) -> Any:
-    """e^x of the eight, with the bits of `kernel.exp`."""
+    """e^x of each entry, with the bits of `kernel.exp`."""
     x = lower(fill(709.0), higher(fill(-708.0), x))
     k = minus(plus(times(x, fill(1.0 / LOG2)), fill(ROUND)), fill(ROUND))
     r = minus(minus(x, times(k, fill(LOG2_HIGH))), times(k, fill(LOG2_LOW)))
@@ -295,7 +295,7 @@ def exp_of(x: Any) -> Any:
 
 @kernel
 def log_of(x: Any) -> Any:
-    """Natural logarithms of eight positive normal numbers, with the bits of `kernel.log`."""
+    """Natural logarithms of positive normal entries, with the bits of `kernel.log`."""
     k, m = _exponent(x), _mantissa(x)
     up = minus(fill(1.0), reaches(fill(1.4142135623730951), m))
     m = minus(m, times(times(fill(0.5), up), m))

@@ -2,6 +2,7 @@
 
 *persistence*   the last output that was seen
 *constant LS*   recursive least squares without forgetting on the same regressors (fitted on the past only)
+*with lags*     the same with the last two outputs and regressors beside them: constants in correlated noise
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
 All are one-step predictions, scored on the samples after max(50, 5 n) that every one of them could predict.
@@ -16,9 +17,12 @@ import numpy as np
 from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
-from driftfit.judge.constant_fit import constant_least_squares
+from driftfit.judge.constant_fit import constant_errors, constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in, root_mean_square
+
+LAGS = 2
+"""Lags of y and of all regressors that are put beside the regressors of a run."""
 
 
 class Comparison(NamedTuple):
@@ -49,14 +53,16 @@ class Errors(NamedTuple):
     tracked: Array
     persistence: Array
     constant_ls: Array
+    lagged_ls: Array
     constant_arx: Array
     scored: Array
 
 
 def errors(run: Track, burn: int | None = None) -> Errors:
-    """One-step errors of a run, of persistence, of constant least squares and of constant ARX.
+    """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
-    The first ``burn`` samples are not scored, max(50, 5 n) unless it is said.
+    Where lags are missing, constants without them predict. The first ``burn`` samples are not scored, max(50, 5 n)
+    unless it is said.
     """
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     steady = constant_least_squares(run.model, run.record)
@@ -65,15 +71,27 @@ def errors(run: Track, burn: int | None = None) -> Errors:
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)
     arx = constant_least_squares(small, Record(y, u, known))
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
-    own = (tracked, y - persistence(y), constant, arx["e"][:, 0])
+    lagged = _with_lags(steady, y, run.known.noise)
+    lagged = np.where(np.isfinite(lagged), lagged, constant)
+    own = (tracked, y - persistence(y), constant, lagged, arx["e"][:, 0])
     scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
     for error in own:
         scored &= np.isfinite(error)
     return Errors(*own, scored)
 
 
+def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
+    """Errors (T,) of constants on the regressors of a run, the last outputs, and the last regressors."""
+    T, phi = len(y), np.where(steady["valid"] > 0.0, steady["phi"][..., 0], np.nan)
+    last = np.full((LAGS, T, 1 + phi.shape[1]), np.nan)
+    for k in range(1, min(LAGS, T - 1) + 1):
+        last[k - 1, k:] = np.column_stack([y, phi])[:-k]
+    return constant_errors(np.column_stack([phi, *last]), y, np.broadcast_to(1.0 / noise, T))
+
+
 def compare(run: Track) -> Comparison:
     """Score a run beside persistence, constant least squares and constant ARX."""
-    *own, scored = errors(run)
-    tracked, last, ls, constant = (root_mean_square(error[scored]) for error in own)
-    return Comparison(tracked, last, ls, constant, int(scored.sum()))
+    made = errors(run)
+    shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
+    tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)
+    return Comparison(tracked, last, ls, constant, int(made.scored.sum()))

@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from driftfit.data.record import Record
-from driftfit.engine.drivers import TrackerSteps, drivers, make_tile, output_type, unknown
-from driftfit.engine.kernel import Array, State, kernel, shared
+from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, unknown
+from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.program import lane_of
 from driftfit.run.seen import COLLECTED, collect
@@ -82,3 +82,26 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     out = np.empty(len(record), output_type(tile, COLLECTED))
     drivers(model.steps, STEPS).run(tile, *lane_of(replace(record, known=record.known.common)), out)
     return out
+
+
+def _predicted(rows: Array, known: Array, e: Array) -> None:
+    """Errors e (T,) of predictions, rows [phi, y] (T, k + 1) used up, of those that are known (T,) only."""
+    k = rows.shape[1] - 1
+    R, size, theta = np.zeros((k, k + 1)), np.zeros(k), np.zeros(k)
+    for t in range(rows.shape[0]):
+        if known[t]:
+            e[t] = rows[t, k]
+            for i in range(k):
+                e[t] -= rows[t, i] * theta[i]
+            rotate(R, rows[t], size, theta)
+
+
+_predictions = Driver(_predicted)
+
+
+def constant_errors(phi: Array, y: Array, weight: Array) -> Array:
+    """One-step errors (T,) of constants on phi (T, k), fitted on the past with weights (T,); NaN for missing rows."""
+    known = (np.abs(phi) < LARGEST).all(axis=1) & (np.abs(y) < LARGEST)
+    root, e = np.sqrt(weight), np.full(len(y), np.nan)
+    _predictions(np.column_stack([phi, y]) * root[:, None], known, e)
+    return e / root

@@ -241,7 +241,7 @@ def verdicts(
     """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
     said = _each(runs, lambda run: verdict(run, level, lags, burn), "verdict")
     q, q_pays = (
-        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.rivals[1].p for v in said.values()])
+        discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.constants.p for v in said.values()])
     )
     rows = [
         Judgement(key, one, float(a), float(b), bool(a < level), bool(b < level))

@@ -1,15 +1,17 @@
-"""Verdict: is the time variation real, which parameters move, by how much and when, and does following them pay?
+"""Verdict: is the time variation real, which parameters move, by how much and when, and does tracking them pay?
 
-Two questions that have different answers:
+The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
-  variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
-  do not enter. Where constants are true, "they move" is said with probability ``level``, as
+  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
+  do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past and a
-  constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`).
+* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
+  same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
+  (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, which a drifting parameter does as well: so
+  following pays where the run beats the better of constants without lags and with them.
 
 The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
 rejects, its own still does when what was named before it is taken into account
@@ -32,7 +34,7 @@ from rich.text import Text
 from driftfit.engine.settings import whole
 from driftfit.judge.compare import errors
 from driftfit.judge.regressors import Rows, regressors
-from driftfit.judge.statistics.attribution import Attribution, attribute
+from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
 from driftfit.judge.statistics.paired import LEAST as COMPARED
 from driftfit.judge.statistics.paired import Paired, paired
@@ -40,20 +42,20 @@ from driftfit.judge.statistics.whiteness import whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, facts, table_of
 
-RIVALS = ("persistence", "constant LS", "constant ARX")
+RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
-"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
+"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What the record says of one parameter.
+    """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
-    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
-    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
-    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
-    after the last step, which is ``before`` again after a fault that passed.
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which separates
+    parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
+    moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
+    first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
+    its value after the last step, which is ``before`` again after a temporary fault.
     """
 
     name: str
@@ -71,30 +73,35 @@ class Moved:
 
 @dataclass(frozen=True)
 class Verdict(Printed):
-    """What `Track.verdict` returns; printing it shows it.
+    """The result of `Track.verdict`; printing it shows the sentences and tables.
 
     Attributes
     ----------
     drifts : bool or None
-        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+        Whether the parameters move: ``p`` is below ``level``. None if the record does not determine it.
     pays : bool or None
-        The run predicts better than constant least squares on the past: its paired p-value is below ``level``. None
-        where there are too few samples to compare.
+        The run predicts better than constant least squares on the past, without lags or with them, whichever is the
+        better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
-        Joint test of all parameters; NaN where the record cannot tell.
+        p-value of the joint test of all parameters; NaN if the record does not determine it.
     statistic : float
-        Its part that is Nyblom's.
+        Nyblom's statistic of all parameters.
     level : float
-        Error rate: how often constants are said to move.
+        Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
+    alike : tuple of str
+        Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
+        which.
+    since : str
+        Time of the step that explains most of it.
     rms : float
         Root mean square one-step error of the run on ``scored`` samples.
     rivals : tuple of Paired
-        The same of persistence, constant LS and constant ARX, with paired tests.
+        The same of persistence, constant LS, LS with lags and constant ARX, with paired tests.
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        The residuals are correlated, also within segments of constant coefficients.
+        Whether the residuals are correlated, even within segments of constant coefficients.
     lags : int
         Lags of correlation that were allowed for.
     burn : int
@@ -107,6 +114,8 @@ class Verdict(Printed):
     statistic: float
     level: float
     parameters: tuple[Moved, ...]
+    alike: tuple[str, ...]
+    since: str
     rms: float
     rivals: tuple[Paired, ...]
     samples: int
@@ -114,6 +123,11 @@ class Verdict(Printed):
     correlated: bool
     lags: int
     burn: int
+
+    @property
+    def constants(self) -> Paired:
+        """The rival that decides whether following pays: constant least squares, or with lags where that is better."""
+        return better_constants(self.rivals)
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -152,23 +166,37 @@ class Verdict(Printed):
     def _which(self) -> str:
         if not self.drifts:
             return ""
+        if not self.moving and len(self.alike) == 1:
+            return f"It probably is {self.alike[0]}, from about {self.since}; its own test alone does not show it."
+        if not self.moving and len(self.alike) < len(self.parameters):
+            return (
+                f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
+                "tell which."
+            )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
         return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
-        steady = self.rivals[1]
+        steady = self.constants
         if self.pays is None:
             return (
                 f"Predictions cannot be compared: {self.scored} samples remain after the first {self.burn}, and "
                 f"at least {COMPARED} are needed; a smaller burn= leaves out fewer."
             )
         change = 100.0 * (self.rms / steady.rms - 1.0)
+        who = "constants" if steady is self.rivals[1] else "constants with lags"
         size = f"{abs(change):.1f} % {'smaller' if change < 0.0 else 'larger'}"
         if self.pays:
-            return f"Tracking them pays: the one-step error is {size} than that of constants ({p_equals(steady.p)})."
+            return f"Tracking them pays: the one-step error is {size} than that of {who} ({p_equals(steady.p)})."
+        if self.rivals[1].p < self.level:
+            return (
+                "Tracking them predicts better than constants, but not than constants with two more lags of "
+                f"everything: its one-step error is {size} than theirs ({p_equals(steady.p)}). "
+                "Lags may be all that is missing."
+            )
         return (
-            f"Tracking them does not clearly pay here: the one-step error is {size} than that of constants "
+            f"Tracking them does not clearly pay here: the one-step error is {size} than that of {who} "
             f"({p_equals(steady.p)})."
         )
 
@@ -188,7 +216,7 @@ class Verdict(Printed):
             yield Text(f" {sentence}")
         table = table_of("Parameters", "", "L", "p", "p own", "moves", "before", "after", "+-", "from")
         for m in self.parameters:
-            shown = (f"{m.statistic:.3g}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
+            shown = (f"{m.statistic:.2f}", p_text(m.p), p_text(m.p_own), "yes" if m.moves else "")
             change = (f"{m.before:.3g}", f"{m.after:.3g}", f"{m.std:.2g}", m.when) if m.moves else ("",) * 4
             table.add_row(Text(m.name), *shown, *change)
         yield table
@@ -200,8 +228,13 @@ class Verdict(Printed):
         yield facts(("Samples", f"{self.samples} tested, {self.scored} scored"))
 
 
+def better_constants(rivals: tuple[Paired, ...]) -> Paired:
+    """Of constant least squares without lags and with them, the one with the smaller error."""
+    return min(rivals[1:3], key=lambda rival: rival.rms)
+
+
 def _told(moved: Moved) -> str:
-    """What one parameter did, in words."""
+    """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:
         return text
@@ -210,7 +243,7 @@ def _told(moved: Moved) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value as it is written."""
+    """A p-value as text."""
     return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -227,12 +260,12 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     run : Track
         What `track` returned.
     level : number
-        Error rate of "the parameters move".
+        Error rate of the statement that the parameters move.
     lags : int or None
-        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        Lags of correlation of the noise to allow for; None estimates them from the record, and 0 is for a model whose
         one-step errors are known to be white.
     burn : int or None
-        So many samples at the beginning are not scored; max(50, 5 n) by default.
+        Number of samples at the beginning that are not scored; max(50, 5 n) by default.
 
     Raises
     ------
@@ -249,15 +282,19 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     test = constancy(rows.phi, rows.y, lags)
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
+    moved = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
+    at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
     own, *others, scored = errors(run, burn)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
-        pays=None if np.isnan(rivals[1].p) else bool(rivals[1].p < level),
+        pays=None if np.isnan(rivals[1].p) else bool(better_constants(rivals).p < level),
         p=test.p_joint,
         statistic=test.joint,
         level=level,
-        parameters=tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p))),
+        parameters=moved,
+        alike=tuple(run.model.names[i] for i in similar),
+        since=run.time_text(int(rows.at[at])) if similar else "",
         rms=root_mean_square(own[scored]),
         rivals=rivals,
         samples=len(rows.y),

@@ -1,4 +1,4 @@
-"""Record mode: whole series in one call, causal at every sample. The public face is `driftfit.track`."""
+"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
 
 Result = Track | Fleet | Outputs | Shared | OutputsFleet
-"""What `track` gives: by the number of series, of settings and of outputs."""
+"""The result of `track`, which depends on the number of series, of settings and of outputs."""
 
 
 def track(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
     by: str | Sequence[str] | None = None, keep: str = "std", warm_start: Any = None, prob: Any = None,
 ) -> Result:  # fmt: skip
-    """Follow the parameters of a model; arguments are those of `driftfit.track`, time and the like in a `Reading`."""
+    """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
     check_roles("track", model, tracker, several=True)
     one_of("track", "keep", keep, ("std", "cov"))
     reading = Reading() if reading is None else reading
@@ -41,7 +41,7 @@ def track(
         raise ValueError("track: prob= is for one series and one tracker.")
     if len(model.outputs) > 1:
         return track_outputs(model, tracker, y, u, data, by, reading, keep, warm_start)
-    records, failed = _records(y, u, data, by, reading)
+    records, failed = records_of(y, u, reading, data, by)
     records = records.for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     bound.inspect(records.y, records.u)
@@ -68,16 +68,20 @@ def track_one(
     model: Model, tracker: Tracker, y: Any, u: Any = None, reading: Reading | None = None, keep: str = "std",
     warm_start: Run | None = None,
 ) -> Track:  # fmt: skip
-    """`track` for one series of one output under one tracker."""
+    """`track` for one series of one output with one tracker."""
     run = track(model, tracker, y, u, reading, keep=keep, warm_start=warm_start)
     assert isinstance(run, Track)
     return run
 
 
-def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Records, dict[Hashable, str]]:
-    """What is to be run, and the reasons of what cannot be."""
+def records_of(
+    y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
+) -> tuple[Records, dict[Hashable, str]]:
+    """What is to be run, from arrays or a table, and the reasons of what cannot be."""
     if data is not None:
-        from driftfit.data.tables import read_records  # narwhals and polars take as long to import as all the rest
+        from driftfit.data.tables import (
+            read_records,
+        )  # importing narwhals and polars takes as long as all other imports
 
         return read_records(data, y, u, by, reading)
     if by not in (None, "row"):
@@ -90,7 +94,7 @@ def _records(y: Any, u: Any, data: Any, by: Any, reading: Reading) -> tuple[Reco
 
 
 def _checked(tracker: Tracker, keep: str) -> Tracker:
-    """The tracker, if its settings are complete and it has what is to be kept."""
+    """The tracker, if its settings are complete and it can keep what is requested."""
     if keep == "cov" and not tracker.covariance:
         raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
     return check_ready(tracker)

@@ -1,13 +1,13 @@
-"""The frontier of flexible least squares: what fit costs in movement, over all mu.
+"""The frontier of flexible least squares: the trade-off between fit and movement over all mu.
 
     r_M^2(mu) = sum w_k (y_k - phi_k' theta_k)^2          r_D^2(mu) = sum |theta_{k+1} - theta_k|^2 / (dt d)
 
-of the smoothed path (with ``differences=2`` its slope is in the place of theta in r_D^2). It is convex; r_M^2 does not
-fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu exactly. There is no corner to choose mu by: in
-logarithms the curve has none, because r_M^2 goes to 0 with mu, and on linear axes the knee depends on the scaling;
-`tune` finds mu.
+of the smoothed path (with ``differences=2`` r_D^2 is of its slope instead of theta). The curve is convex; r_M^2 does
+not fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu exactly. It has no corner at which to choose mu:
+in logarithms there is none because r_M^2 goes to 0 with mu, and on linear axes the bend depends on the scaling;
+`tune` estimates mu.
 
-Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing a point.
+Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing per point.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class Frontier(NamedTuple):
-    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, in the order of mu."""
+    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, sorted by mu."""
 
     mu: Array
     measurement: Array
@@ -45,13 +45,15 @@ class Frontier(NamedTuple):
         return _plot(self)
 
 
-def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, **known: Any) -> Frontier:
+def frontier(
+    model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, data: Any = None, **known: Any
+) -> Frontier:
     """The two costs of the smoothed path for every mu.
 
     Parameters
     ----------
-    model, y, u, and time, dt, weights, drift
-        As for `track`.
+    model, y, u, data, and time, dt, weights, drift
+        As for `track`: with ``data`` the others name its columns.
     mu : (S,) or None
         Weights, positive. None: four per decade, from 1e-4 to 1e5 (1e10 for second differences) times the mean of
         phi' phi.
@@ -61,25 +63,25 @@ def frontier(model: Model, y: Any, u: Any = None, *, mu: Any = None, differences
     Raises
     ------
     ValueError
-        If a mu is not positive, or what `track` refuses.
+        If a mu is not positive, and for everything that `track` does not accept.
     """
     check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
         raise ValueError("frontier: takes one output at a time: use run[name], and frontier(run[name].model, .y, .u).")
     reading = Reading(**known)
     if mu is None:
-        steady = _path(model, FLS(1.0), y, u, reading)
+        steady = _path(model, FLS(1.0), y, u, reading, data)
         used = steady.walk.weight > 0.0
         power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
-    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading) for m in weights]
+    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading, data) for m in weights]
     return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
 
 
-def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading) -> Smoothed:
+def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading, data: Any) -> Smoothed:
     """The smoothed path of a record."""
-    run = track(model, tracker, y, u, reading)
+    run = track(model, tracker, y, u, reading, data=data)
     if isinstance(run, Shared):
         return SmoothedShared.of_shared(run)
     assert isinstance(run, Track)
@@ -87,7 +89,7 @@ def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading) -> Smoot
 
 
 def _movement(path: Smoothed) -> float:
-    """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
+    """r_D^2 from the path itself, because the difference of J and r_M^2 has no accurate digits for large mu."""
     path = path.rows if isinstance(path, SmoothedShared) else path
     walk = path.walk
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2

@@ -1,8 +1,8 @@
-"""Tuning for several outputs: each output by itself, or all rows of a shared theta together.
+"""Tuning for several outputs: each output separately, or all rows of a shared theta together.
 
-Outputs with a theta each have a noise each, so each gets settings of its own: `TunedOutputs.tracker` maps the name of
-an output to its tracker, as `track` and `Live` take it. Regressors are those of constant parameters, whose predictions
-also fill missing lags.
+Outputs with a separate theta have separate noise, so each gets its own settings: `TunedOutputs.tracker` maps the name
+of an output to its tracker, in the form that `track` and `Live` take. Regressors are those of constant parameters,
+whose predictions also fill missing lags.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from driftfit.tune.lanes import Task
 from driftfit.tune.tuned import Tuned
 
 STILL = Kalman(q=0.0, r=1.0)
-"""Constant parameters, of which nothing is known before."""
+"""Constant parameters with a diffuse start."""
 
 
 class TunedOutputs(Mapping[str, Tuned]):
-    """What `tune` returns for a model with several outputs: a `driftfit.tune.Tuned` for each."""
+    """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
         self._each = dict(each)
@@ -44,7 +44,7 @@ class TunedOutputs(Mapping[str, Tuned]):
 
     @property
     def tracker(self) -> dict[str, Tracker]:
-        """The tracker of each output, by name: ready for `track` and `Live`."""
+        """The tracker of each output, by name, ready for `track` and `Live`."""
         return {name: one.tracker for name, one in self.items()}
 
     @property
@@ -58,11 +58,13 @@ class TunedOutputs(Mapping[str, Tuned]):
         return {name: one.at_bound for name, one in self.items() if one.at_bound}
 
 
-def tune_outputs(model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], one: Callable[..., Any]) -> Any:
+def tune_outputs(
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
+) -> Tuned | TunedOutputs:
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known))
+    run = track(model, STILL, y, u, Reading(**known), data=data)
     if isinstance(run, Shared):
         return one(Task(run.rows.model, run.rows.record))
     assert isinstance(run, Outputs)

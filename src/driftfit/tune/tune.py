@@ -1,18 +1,18 @@
-"""Tune: settings from a record.
+"""Tune: estimate settings from a record.
 
-    "ml"       maximum likelihood of the one-step predictions, the noise variance in closed form where it can be
+    "ml"       maximum likelihood of the one-step predictions, with the noise variance in closed form where possible
     "h-step"   least mean square of y_t - phi_t' theta_{t-h} after the start: settings for predicting h samples ahead
     "loo"      least mean square of leave-one-out residuals of the smoothed path, eps / (1 - leverage)
     "gcv"      (r_M^2 / N) / (1 - mean leverage)^2 of the smoothed path
 
-Use "ml" first: where drift is a random walk it is consistent and gives intervals, and where it is not it still was the
-best or close to it in this library's reproductions. "loo" and "gcv" choose for the smoothed path and ask for no
-distribution; "h-step" is the only one for trackers without a variance (`AugmentedFLS`). All look at the whole record:
-for a stream that tunes itself use a tracker that does.
+Use "ml" first. If drift is a random walk it is consistent and gives intervals; if not, it was still the best method or
+close to it in our reproductions. "loo" and "gcv" choose for the smoothed path and assume no distribution; "h-step" is
+the only method for trackers without a variance (`AugmentedFLS`). All of them use the whole record: for a stream, use a
+tracker that tunes itself.
 
-A grid runs as lanes: 32 settings cost about as much as a few. Then a quasi-Newton search on log settings, and profile
-intervals of the likelihood (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start; leave one
-out after Allen (1974), GCV after Craven and Wahba (1979).
+A grid runs as lanes: 32 settings cost about as much as a few. A quasi-Newton search on log settings and profile
+intervals of the likelihood follow (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start;
+leave-one-out after Allen (1974), GCV after Craven and Wahba (1979).
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from typing import Any, cast
 import numpy as np
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, one_series
+from driftfit.data.record import Reading
 from driftfit.engine.settings import one_of, whole
 from driftfit.models.base import Model
+from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.knobs import find_knobs
@@ -51,6 +52,7 @@ def tune(
     bounds: tuple[float, float] | None = None,
     level: float = 0.95,
     order_by: Any = None,
+    data: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -58,46 +60,47 @@ def tune(
     limits: Any = None,
     exclude: Any = None,
 ) -> Tuned:
-    """Find the settings that a tracker was left without: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
+    """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
     ----------
-    model, y, u, time, dt, weights, drift, limits, exclude
-        As for `track`.
+    model, y, u, data, time, dt, weights, drift, limits, exclude
+        As for `track`: with ``data`` the others name its columns.
     tracker : Tracker
-        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays. Of a `Bank` the scales of
-        its changes are found, as factors of the standard deviations that it has, and their prior probabilities, by its
-        log evidence.
+        Settings that are None are estimated: mu, q, r, q and r, or forgetting. All others are kept. For a `Bank` these
+        are the scales of its changes, as factors of their standard deviations, and their prior probabilities; the
+        criterion is its log evidence.
     method : "ml", "h-step", "loo" or "gcv"
         The criterion, see the module.
     groups : None, "each", or n labels
         Which parameters share a drift. None: all. With `Kalman`, and with labels, a shared drift is the same *in the
-        output*: q_i is inverse to the mean square of regressor i. ``FLS`` without groups has one mu for all, as its
-        source has. q of a group may be zero.
+        output*: q_i is proportional to the inverse of the mean square of regressor i. ``FLS`` without groups has one mu
+        for all, as in its source. q of a group may be zero.
     h : int
         Samples ahead, for "h-step".
     bounds : (low, high)
-        Range of the search; of mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
-        T^2)), of r in units of the variance that constant parameters leave, of RLS's memory in samples.
+        Range of the search: for mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
+        T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
     level : number
-        Of the intervals.
+        Level of the intervals.
     order_by : (T,)
-        Tune for ``run.smooth(order_by=...)``: theta walks along this variable instead of along time.
+        Tune for ``run.smooth(order_by=...)``: theta is a random walk along this variable instead of time.
 
     Returns
     -------
-    Tuned. A model with several outputs gives `driftfit.tune.outputs.TunedOutputs`, one for each output (where they
-    share one theta: one `Tuned` for all).
+    Tuned. A model with several outputs gives `driftfit.tune.outputs.TunedOutputs`, one for each output (if they share
+    one theta, one `Tuned` for all).
 
     Warns
     -----
     UserWarning
-        When the optimum is at a bound of the search other than zero.
+        If the optimum is at a bound of the search other than zero.
 
     Raises
     ------
     ValueError
-        Nothing to find, a method that the tracker does not have, no usable sample, or what `track` refuses.
+        If there is nothing to estimate, the tracker does not support the method, no sample is usable, and for
+        everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
     one_of("tune", "method", method, METHODS)
@@ -109,10 +112,10 @@ def tune(
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        found = tune_outputs(model, tracker, y, u, known, lambda task: _tuned(task, tracker, *options))
+        found = tune_outputs(model, tracker, y, u, known, data, lambda task: _tuned(task, tracker, *options))
         return cast("Tuned", found)
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    return _tuned(_task(model, tracker, y, u, reading), tracker, method, groups, h, bounds, level, order_by)
+    return _tuned(_task(model, tracker, y, u, reading, data), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
@@ -141,7 +144,7 @@ def _tuned(
 
 
 def _warn(tuned: Tuned) -> None:
-    """Say which settings ended at a bound of the search; zero is a result."""
+    """Warn of settings that ended at a bound of the search; zero is a valid result."""
     search = tuned._search
     stuck = [
         name
@@ -157,7 +160,7 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading) -> Task:
-    records = one_series(y, u, reading).for_model(model, reading)
+def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any) -> Task:
+    records = records_of(y, u, reading, data)[0].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))

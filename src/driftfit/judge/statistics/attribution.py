@@ -1,16 +1,16 @@
-"""Which parameters move, once it is known that some do: steps are explained one after the other.
+"""Which parameters move, if some do: changes are explained by steps, one at a time.
 
-    1. of the parameters whose own path rejects constancy (Holm's correction), take the one of which a step near the
-       furthest point of its path explains most of y, outliers held
-    2. give it that step: one more regressor, phi_i from that sample on
-    3. test again; until no parameter rejects, or MOST steps are there
+    1. among the parameters whose own path rejects constancy (Holm's correction), choose the one for which a step near
+       the extreme point of its path explains most of y, with outliers limited
+    2. add that step: one more regressor, phi_i from that sample on
+    3. test again, until no parameter rejects or MOST steps are found
 
-A large move of one parameter changes the regressors of an ARX model and its residuals, and makes the paths of others
-look moved too; once the step is in the regression those are still again. A slow drift takes several steps of the same
-parameter, a passing fault two that go back. What is reported is the value before the first step, the one that is
-furthest from it in units of its standard error, and the last. A parameter whose furthest value is within the error of
-the first is not named, whatever its path says. Bai and Perron (1998) estimate several breaks in all parameters that
-way, one after the other; here each step belongs to one parameter.
+A large change of one parameter alters the regressors of an ARX model and its residuals, so the paths of other
+parameters seem to change too; once the step is in the regression they no longer do. A slow drift takes several steps of
+the same parameter, a temporary fault two steps that return. The result contains the value before the first step, the
+value furthest from it in units of its standard error, and the last value. A parameter whose furthest value is within
+the error of the first is not named. Bai and Perron (1998) estimate several breaks in all parameters in this sequential
+way; here each step belongs to one parameter.
 """
 
 from __future__ import annotations
@@ -26,39 +26,41 @@ from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
+ALIKE = 4.0
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters are told apart by nothing."""
 AROUND = 0.03
-"""Share of the record on each side of the furthest point of a path where the date of a step is looked for."""
+"""Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
 """Steps of one parameter within this share of the record are the same step."""
 
 
 class Step(NamedTuple):
-    """A parameter of the n, and the sample (of the N) from which on it is another."""
+    """A parameter (of the n), and the sample (of the N) from which its value is different."""
 
     parameter: int
     at: int
 
 
 class Attribution(NamedTuple):
-    """What moves."""
+    """The parameters that move, and their steps."""
 
     p: Array
-    """(n,): p-value of each parameter when it was named, or at the end where it was not."""
+    """(n,): p-value of each parameter when it was named, or at the end if it was not."""
     steps: tuple[Step, ...]
     """In the order in which they were found."""
     before: Array
-    """(n,): value before its first step; constant value of those that have none."""
+    """(n,): value before the first step; the constant value if there is none."""
     after: Array
-    """(n,): the value furthest from it."""
+    """(n,): the value furthest from that."""
     std: Array
     """(n,): standard error of the difference."""
     last: Array
     """(n,): value after its last step."""
     moves: Array
-    """(n,): whether it has steps, and a difference that is none of chance."""
+    """(n,): whether it has steps, and a significant difference."""
 
     def first(self, i: int) -> int | None:
-        """The date of the step of parameter i that was found first; None where it has none."""
+        """The date of the step of parameter i that was found first; None if it has none."""
         return next((step.at for step in self.steps if step.parameter == i), None)
 
 
@@ -72,7 +74,7 @@ def holm(p: Array, level: float) -> Array:
 
 
 def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
-    """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
+    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
     steps: list[Step] = []
     p, now = test.p_own.copy(), test
@@ -95,21 +97,39 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
 
 
 def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
-    """The step, of a parameter that is rejected and near the furthest point of its path, that explains most."""
+    """The step of a rejected parameter, near the extreme point of its path, that explains most."""
     rejected = np.flatnonzero(holm(test.p_own[:n], level))
     if not len(rejected) or test.noise is None:
         return None
     Q = np.linalg.qr(X)[0]
     e = test.noise.held - Q @ (Q.T @ test.noise.held)
-    found = [_dated(Q, X[:, i], e, int(test.at[i])) for i in rejected]
+    reach = int(AROUND * len(X))
+    found = [_dated(Q, X[:, i], e, int(test.at[i]) - reach, int(test.at[i]) + reach) for i in rejected]
     most = int(np.argmax([gain for _, gain in found]))
     return Step(int(rejected[most]), found[most][0])
 
 
-def _dated(Q: Array, x: Array, e: Array, at: int) -> tuple[int, float]:
-    """The place near ``at`` where a step of x explains most of e, which is orthogonal to Q, and how much."""
+def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
+    """The date of the one step that explains most of y, and the parameters of which a step does so about as well."""
+    N, n = phi.shape
+    if test.noise is None:
+        return 0, ()
+    X, held = phi, test.noise.held
+    if len(test.noise.ar):
+        X, held = whitened(phi, held, test.noise.ar)
+    Q = np.linalg.qr(X)[0]
+    e = held - Q @ (Q.T @ held)
+    found = [_dated(Q, X[:, i], e, n, N - n) for i in range(n)]
+    best = max(range(n), key=lambda i: found[i][1])
+    at, gain = found[best]
+    noise = max(float(e @ e) - gain, 0.0) / N
+    return at, tuple(i for i in range(n) if gain - found[i][1] <= ALIKE * noise)
+
+
+def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:
+    """The place from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
     N = len(x)
-    places = np.arange(max(1, at - int(AROUND * N)), min(N - 1, at + int(AROUND * N)) + 1)
+    places = np.arange(max(1, first), min(N - 1, last) + 1)
     later = np.cumsum((x * e)[::-1])[::-1][places]
     inside = np.cumsum((x[:, None] * Q)[::-1], axis=0)[::-1][places]
     left = np.cumsum((x * x)[::-1])[::-1][places] - np.sum(inside * inside, axis=1)
@@ -119,7 +139,7 @@ def _dated(Q: Array, x: Array, e: Array, at: int) -> tuple[int, float]:
 
 
 def _with(phi: Array, steps: list[Step]) -> Array:
-    """The regressors with one more column a step."""
+    """The regressors with one more column per step."""
     later = [phi[:, step.parameter] * (np.arange(len(phi)) >= step.at) for step in steps]
     return np.column_stack([phi, *later])
 

@@ -39,6 +39,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
@@ -53,6 +54,8 @@ ROWS = 200
 """At most about so many rows of the covariance of the joint path."""
 CELLS = 200
 """At most so many places for breaks, where the noise is looked for."""
+MOST_LAGS = 3
+"""At most so many lags of all regressors are taken in where these are not independent of the noise."""
 EDGE = 0.05
 """Share of a record at each end where no date is looked for."""
 
@@ -112,25 +115,27 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
 
 def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
     N, n = X.shape
-    still = fit
+    still, beside = fit, np.zeros((N, 0))
     if len(found.ar):
-        c = found.level
-        X, y = whitened(X / c[:, None], found.held / c, found.ar)
-        X, y = X * c[:, None], y * c
-        still = robust_fit(X, y)
-    psi = _alternative(found, still)
+        c = found.level[:, None]
+        rows, y = whitened(X / c, found.held / found.level, found.ar)
+        beside = c * missing_lags(X / c, rows, found) if lags is None else beside
+        X, y = rows * c, y * found.level
+        still = robust_fit(np.column_stack([X, beside]), y)
+    psi = _alternative(found, still, beside)
     rest = min(plugged_in(X, psi), rule_of_thumb(N)) if lags is None else 0
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
-    A = _profile(X * still.inside[:, None], X, ends)
-    V = _profile(*(2 * (_summed(X * psi[:, None], rest),)), ends)
-    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < n or np.linalg.matrix_rank(V[-1], 1e-12) < n:
+    whole = np.column_stack([X, beside])
+    A = _profile(whole * still.inside[:, None], whole, ends)
+    V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
+    if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < len(A[-1]) or np.linalg.matrix_rank(V[-1], 1e-12) < n:
         return _nothing(N, n)
-    S, inverse = np.cumsum(X * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
+    S, inverse = np.cumsum(whole * still.psi[:, None], axis=0), np.linalg.inv(A[-1])
     null = _null(A, V, inverse)
-    own = _turned(null, inverse)
-    path = S @ inverse
-    var = np.diag(inverse @ V[-1] @ inverse)
+    own, path = _turned(null, inverse[:n]), S @ inverse[:n].T
+    var = np.diag(inverse @ V[-1] @ inverse)[:n]
+    S, null, V = S[:, :n], np.ascontiguousarray(null[:, :n, :, :n]), V[:, :n, :n]
     least, apart = shortest(n), len(found.breaks) > 0
     mean = np.arange(m)[::-2][::-1]
     L, p = _each(S[ends[mean] - 1], _thinned(null, mean), np.diag(V[-1]))
@@ -146,8 +151,36 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     return Constancy(L, p, np.array(p_own), joint, together(*p_each), p_each, at, z, shown, found, len(found.ar) + rest)
 
 
-def _alternative(found: Noise, still: Fit) -> Array:
-    """Bounded residuals of the segments, on the rows of the test.
+def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
+    """Lags of the regressors X (N, n) that are not in ``rows``, the white rows: (N, q), Q' Q = N I.
+
+    Where regressors hold lags of y, as in ARX, correlated noise is not independent of them, and least squares leaves
+    noise that no autoregression makes white. The regression with one more lag of everything has white noise where that
+    of the first was an autoregression of order one; further lags come in as long as they gain by the criterion of
+    Hannan and Quinn (1979). Their coefficients are not tested: beside other regressors they cost a degree of freedom
+    each.
+    """
+    N, n = X.shape
+    w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
+    basis = linalg.qr(rows, mode="economic")[0]
+    w = w - basis @ (basis.T @ w)
+    for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
+        lagged = np.zeros((N, n))
+        lagged[k:] = X[:-k]
+        lagged[: len(found.ar)] = 0.0
+        lagged -= basis @ (basis.T @ lagged)
+        Q, R, _ = linalg.qr(lagged, mode="economic", pivoting=True)
+        new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
+        explained = new.T @ w
+        gain = -N * np.log1p(-explained @ explained / (w @ w))
+        if k > 1 and gain < 2.0 * new.shape[1] * np.log(np.log(N)):
+            break
+        basis, w = np.column_stack([basis, new]), w - new @ explained
+    return np.asarray(np.sqrt(N) * basis[:, n:])
+
+
+def _alternative(found: Noise, still: Fit, beside: Array) -> Array:
+    """Bounded residuals of the segments, on the rows of the test, without what regressors ``beside`` explain.
 
     Each is that of a fit without it: a short segment fits its own rows too well (MacKinnon and White, 1985).
     """
@@ -158,6 +191,7 @@ def _alternative(found: Noise, still: Fit) -> Array:
     if len(found.ar):
         held = np.clip(v / c, -HELD, HELD)
         v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
+    v = v - beside @ np.linalg.lstsq(beside, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
 
 

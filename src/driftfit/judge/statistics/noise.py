@@ -14,12 +14,14 @@ three are found from segments, and the segments in turn need the three:
        segments
     3. level and correlation anew from their residuals; from 2, until the segments stay
 
-The order of the autoregression is that of least BIC. A fit takes correlation away from its residuals: the first
-autocorrelation r of N residuals is too small by (2 r + sum_i (g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are
-the autocorrelations of the regressors (for a mean alone (1 + 3 r) / N), which is given back.
+The order of the autoregression is that of least BIC. Where what it leaves is correlated at one longer lag s (a day, a
+season), the noise is (1 - a(B)) (1 - b B^s) v = w; s is one of many and must gain 2 log(count) more than BIC asks. A
+fit takes correlation away from its residuals: the first autocorrelation r of N residuals is too small by
+(2 r + sum_i (g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are the autocorrelations of the regressors (for a mean
+alone (1 + 3 r) / N), which is given back.
 
-Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for whitening before the segments; Marriott and Pope (1954) for
-the bias of a mean. Cost: O(T n^2), and that of the partition.
+Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for whitening before the segments; Box and Jenkins (1970) for the
+seasonal factor; Marriott and Pope (1954) for the bias of a mean. Cost: O(T n^2), and that of the partition.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage, optimize, special
+from scipy import special
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
@@ -38,6 +40,8 @@ HELD = 3.0
 """Levels of the noise within which y is held around the fit."""
 ORDER = 8
 """Highest order of the autoregression."""
+SEASON = 200
+"""Longest lag of a seasonal factor, which also is at most an eighth of the record."""
 LARGEST = 0.97
 ROUNDS = 6
 QUIET = 0.01
@@ -242,7 +246,25 @@ class _Search(NamedTuple):
         _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
         if not r[0] > 0.0:
             return r[:0]
-        return _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
+        ar = _chosen(_partial(r[None], self.g, N / (len(breaks) + 1.0))[0], N, self.order)
+        return ar if self.order is not None else self.seasonal(v, ar, breaks)
+
+    def seasonal(self, v: Array, ar: Array, breaks: Array) -> Array:
+        """The autoregression with one more factor, where what it leaves of v is correlated at a longer lag."""
+        N = len(v)
+        longest = min(SEASON, N // 8)
+        if longest <= self.P:
+            return ar
+        w, r = whitened(np.zeros((N, 0)), v, ar)[1], np.zeros(longest + 1)
+        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * 1.4826 * np.median(np.abs(w))]), r)
+        later = r[self.P + 1 :] / r[0] if r[0] > 0.0 else np.zeros(longest - self.P)
+        best = int(np.argmax(np.abs(later)))
+        b = float(np.clip(later[best], -LARGEST, LARGEST))
+        if N * np.log1p(-b * b) + np.log(N) + 2.0 * np.log(longest) > 0.0:
+            return ar
+        season = np.zeros(self.P + best + 2)
+        season[0], season[-1] = 1.0, -b
+        return -np.convolve(np.append(1.0, -ar), season)[1:]
 
     def size(self, v: Array, ar: Array) -> float:
         """Standard deviation of the white noise, outliers held."""
@@ -278,6 +300,8 @@ def penalty(N: int, n: int, least: int, quiet: float) -> float:
 
 
 def _exceeded(excess: Any) -> float:
+    from scipy import optimize  # with ndimage a quarter of the time of importing the package
+
     return float(optimize.brentq(excess, 4.0, 1000.0))
 
 
@@ -291,6 +315,8 @@ def _spans(N: int, n: int) -> tuple[Array, Array]:
 
 def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
     """c (N,) from the levels of windows (W,): medians of five, at least a twentieth of the median of all."""
+    from scipy import ndimage
+
     smooth = ndimage.median_filter(level, 5, mode="nearest") if len(level) > 2 else level
     positive = smooth[smooth > 0.0]
     floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0

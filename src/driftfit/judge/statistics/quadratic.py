@@ -12,7 +12,6 @@ Source: Davies (1980), algorithm AS 155, without its error control. Error below 
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize
 
 from driftfit.engine.kernel import Array, Driver
 
@@ -70,4 +69,6 @@ def quantile(weights: Array, p: float) -> float:
     """The x that is exceeded with probability p."""
     weights = np.asarray(weights, float)
     high = weights.sum() + 80.0 * weights.max()
+    from scipy import optimize  # a tenth of a second to import
+
     return float(optimize.brentq(lambda x: tail(weights, x) - p, 0.0, high, xtol=1e-10 * high))

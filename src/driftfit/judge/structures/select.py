@@ -1,24 +1,27 @@
-"""Select: orders, delays and regressors by how well each structure predicted, and averages over structures in time.
+"""Select: orders, delays and regressors by how well each structure predicted; and averages over structures.
 
-    loglik of a structure = sum over scored samples of -1/2 (log 2 pi s_t + e_t^2 / s_t),   e_t, s_t one step ahead
+    loglik of a structure = sum over t > m of log p(y_t | past) - (n / 2) log m
 
-Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them
-without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. All
-structures are scored on the same samples: those after max(50, 5 n) of the largest that every one could predict.
+Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them without
+a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. log p is the
+tracker's predictive density, a mixture where it has several modes. All structures are scored on the same samples: those
+after the first m that every one could predict, m = max(50, 5 n of the largest, min(100, T / 2)). What learning n
+parameters costs in the first m samples, which are nobody's, is (n / 2) log m (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
-  columns of one regression, the union of their regressors: it is built once, its rows are shared, and structures with
-  as many columns run side by side as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run one by
-  one; a model whose regressors hold the present output brings its Jacobian (``log_jacobian``).
-* `select(model, y, u)` with one model looks for the best subset of its regressors: all subsets up to 5 of them, and
-  from there to 30 a search that adds the best and drops the worst, p runs a round instead of 2^p.
+  columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures with
+  equally many columns run in parallel as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run
+  one by one; a model whose regressors contain the present output supplies its Jacobian (``log_jacobian``).
+* `select(model, y, u)` with one model searches for the best subset of its regressors: all subsets of up to 5
+  regressors, and from there to 30 a search that adds the best and drops the worst, with p runs per round instead of
+  2^p in all.
 
 The table gives for each structure the loglik, its distance from the best with a standard error (Newey and West), and
-the root mean square error. ``best`` has the highest; ``simplest`` has the fewest parameters of those that are within
-one standard error of it. `Selection.average` is dynamic model averaging: see there.
+the root mean square error. ``best`` has the highest loglik; ``simplest`` has the fewest parameters of those within one
+standard error of it. `Selection.average` is dynamic model averaging.
 
-Source: Dawid (1984); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the recursion of the
-weights in closed form. Cost: one run a structure.
+Source: Dawid (1984); Rissanen (1986); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the
+recursion of the weights in closed form. Cost: one run a structure.
 """
 
 from __future__ import annotations
@@ -33,17 +36,17 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, one_series
+from driftfit.data.record import Reading
 from driftfit.data.signals import check_ready
 from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price, unscored
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
-from driftfit.run.result import burn_in
+from driftfit.run.track import records_of
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -55,12 +58,12 @@ if TYPE_CHECKING:
     from driftfit.judge.structures.average import Average
 
 MOST = 30
-"""At most so many regressors are searched."""
+"""Largest number of regressors that can be searched."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One structure: its loglik, how far below the best with a standard error, and its root mean square error."""
+    """One structure: its loglik, its distance from the best with a standard error, and its root mean square error."""
 
     name: str
     n: int
@@ -72,7 +75,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Selection(Printed):
-    """What `select` returns; printing it shows the table.
+    """The result of `select`; printing it shows the table.
 
     Attributes
     ----------
@@ -103,7 +106,7 @@ class Selection(Printed):
         return min(within, key=lambda row: (row.n, row.below)).name
 
     def model(self, name: str | None = None) -> Model:
-        """The model of a structure, the best by default; ValueError for a subset, which is no model by itself."""
+        """The model of a structure, the best by default; ValueError for a subset, which is not a model by itself."""
         found = self._structure(name).model
         if found is None:
             raise ValueError(
@@ -127,7 +130,7 @@ class Selection(Printed):
         raise ValueError(f"select: there is no structure {wanted!r}; the table has {len(self.rows)}.")
 
     def average(self, forgetting: float = 0.99) -> Average:
-        """Average all structures in time; ``forgetting`` in (0, 1] is how fast a structure's past counts less."""
+        """Average all structures; ``forgetting`` in (0, 1] determines how fast past predictions lose weight."""
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"average: forgetting must be in (0, 1]; got {forgetting!r}.")
         from driftfit.judge.structures.average import averaged
@@ -158,7 +161,7 @@ class Selection(Printed):
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
     def plot(self, most: int = 20) -> Figure:
-        """How far structures are below the best, with standard errors, and where in time they lost it."""
+        """Distances from the best structure, with standard errors, and where in time the structures lost."""
         rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
         terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
         below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
@@ -168,8 +171,8 @@ class Selection(Printed):
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
     """Every combination of settings: ``grid(ARX, na=[1, 2], nb=[1, 2], intercept=True)`` is four models.
 
-    A list is a choice; anything else, a tuple too, is one value for all. Combinations that the model refuses are left
-    out; ValueError where none is left.
+    A list is a choice; anything else, including a tuple, is one value for all. Combinations that the model does not
+    accept are left out; ValueError if none remains.
     """
     if not (isinstance(kind, type) and issubclass(kind, Model)):
         raise TypeError(f"grid: give the class of the models, as in grid(ARX, na=[1, 2]); got {kind!r}.")
@@ -194,6 +197,7 @@ def select(
     tracker: Tracker | None = None,
     keep: Sequence[str] = (),
     most: int | None = None,
+    data: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -207,21 +211,21 @@ def select(
     ----------
     models : sequence of models, or one model
         Candidates; or the model whose regressors are to be chosen, at most 30.
-    y, u, time, dt, weights, drift, limits, exclude
-        As for `track`; one number or (T,) for drift.
+    y, u, data, time, dt, weights, drift, limits, exclude
+        As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     tracker : Tracker
-        How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
-        parameters: one q, not a vector.
+        Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
+        q, not a vector.
     keep : names
-        Regressors that every subset has, such as ("intercept",).
+        Regressors that every subset contains, such as ("intercept",).
     most : int or None
-        Most regressors in a subset.
+        Largest number of regressors in a subset.
 
     Raises
     ------
     ValueError
-        No candidate, a tracker without a variance, more than 30 regressors, names that are not there, or what `track`
-        refuses.
+        If there is no candidate, for a tracker without a variance, more than 30 regressors or unknown names, and for
+        everything that `track` does not accept.
     """
     tracker = AdaptiveKalman() if tracker is None else tracker
     candidates = list(models) if isinstance(models, Iterable) else [models]
@@ -233,8 +237,11 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    records = one_series(y, u, reading)
-    factor("drift", drift, len(records.y))
+    records, _ = records_of(y, u, reading, data)
+    if data is None:
+        factor("drift", drift, len(records.y))
+    elif records.drifts is not None:
+        raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
@@ -252,7 +259,7 @@ def select(
 
 
 def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
-    """A candidate for these inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+    """A candidate for these inputs; an ARX model of a grid with nb = 0 has no inputs."""
     m = inputs if isinstance(inputs, int) else len(inputs)
     if isinstance(model, ARX) and model.inputs == 0 and m > 0:
         model = replace(model, inputs=m)
@@ -266,11 +273,12 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    judged = np.arange(len(pool.y)) >= burn_in(max(s.n for s in structures))
+    start = unscored(len(pool.y), max(s.n for s in structures))
+    judged = np.arange(len(pool.y)) >= start
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]
-    totals = np.array([float(np.sum(term)) for term in terms])
+    totals = np.array([float(np.sum(term)) - price(s.n, start) for s, term in zip(structures, terms, strict=True)])
     top, count = int(np.argmax(totals)), int(judged.sum())
     rows = []
     for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):

@@ -1,7 +1,7 @@
-"""The best subset of the regressors of one model: all subsets of a few, a search among many.
+"""The best subset of the regressors of one model: all subsets of a few regressors, a search among many.
 
-The search adds the regressor that helps most and drops what no longer helps, until neither raises the log-likelihood by
-GAIN: p runs a round instead of 2^p. Every subset is run once, and subsets of one size run side by side.
+The search adds the regressor that helps most and drops what no longer helps, until neither raises the log-likelihood
+less its price: p runs a round instead of 2^p. Every subset is run once, and subsets of one size run side by side.
 """
 
 from __future__ import annotations
@@ -13,14 +13,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure
-from driftfit.run.result import burn_in
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, price, unscored
 from driftfit.trackers.base import Tracker
 
 ALL = 5
 """Up to so many regressors all subsets are tried."""
-GAIN = 2.0
-"""A step of the search must raise the loglik by this much."""
 
 
 def subsets(
@@ -53,7 +50,7 @@ class Tried:
         self.structures: list[Structure] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
-        self._start = min(burn_in(len(pool.names)), len(pool.y) // 2)
+        self._start = min(unscored(len(pool.y), len(pool.names)), len(pool.y) // 2)
 
     def __call__(self, subsets: Sequence[frozenset[int]]) -> Array:
         """logliks of subsets, after the start, (k,)."""
@@ -66,11 +63,12 @@ class Tried:
             self.structures.append(structure)
             self.predictions.append(found)
         terms = [self.predictions[self._place[frozenset(s)]].loglik[self._start :] for s in subsets]
-        return np.array([float(np.nansum(term)) for term in terms])
+        costs = [price(len(s), max(self._start, 1)) for s in subsets]
+        return np.array([float(np.nansum(term)) - cost for term, cost in zip(terms, costs, strict=True)])
 
 
 def _search(tried: Tried, kept: frozenset[int], free: Sequence[int], largest: int) -> None:
-    """Add what helps most, drop what no longer helps, until neither raises the loglik."""
+    """Add the regressor that helps most, drop those that no longer help, until neither raises the loglik."""
     chosen = kept
     best = float(tried([chosen])[0]) if chosen else -np.inf
     while True:
@@ -78,7 +76,7 @@ def _search(tried: Tried, kept: frozenset[int], free: Sequence[int], largest: in
         more = [chosen | {i} for i in free if i not in chosen] if len(chosen) < largest else []
         if more:
             logliks = tried(more)
-            if logliks.max() > best + GAIN:
+            if logliks.max() > best:
                 chosen, best = more[int(np.argmax(logliks))], float(logliks.max())
         fewer = [chosen - {i} for i in chosen - kept] if len(chosen) > 2 else []
         if fewer:

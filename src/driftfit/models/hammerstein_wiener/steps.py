@@ -64,7 +64,7 @@ from driftfit.models.hammerstein_wiener.rows import complete, fill, forget, mini
 from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values, usable
 
 INSIDE = 0.97
-"""Share of u_max within which the thresholds of a dead zone are held."""
+"""Limit of the thresholds of a dead zone, as a share of u_max."""
 
 
 @shared

@@ -295,7 +295,7 @@ class LiveOutputs(Plain, storage.Kept):
 
     @property
     def ignored(self) -> int:
-        """Samples that came with a time not after the last."""
+        """Number of samples whose time was not after the last."""
         return self._ignored
 
     @property
@@ -304,7 +304,7 @@ class LiveOutputs(Plain, storage.Kept):
         return {} if self._gate is None else self._gate.counts
 
     def end(self) -> End:
-        """Where the stream stands, for a run to begin (`warm_start`)."""
+        """The present state of the stream, from which another run can continue (`warm_start`)."""
         lanes = range(len(self.programs))
         states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
         return End(self.programs, states, self._last, self._awaits)

@@ -1,24 +1,24 @@
-"""A bank of hypotheses: Kalman filters along the histories of what may have happened, weighed by what they predict.
+"""A bank of hypotheses: Kalman filters along a tree of possible events, weighted by how well they predict.
 
     theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j), sensor j
     p(history, event | data) proportional to N(y_t; phi' m, phi' C- phi + r_j) p(event | history) p(history | data)
 
-(a jump Markov linear system). Every history of events is a leaf with its own Gaussian; a reduction keeps their number
-bounded (`driftfit.trackers.bank.reduction`). What is reported at t, the mixture over all leaves, is computed after the
+(a jump Markov linear system). Every history of events is a leaf of the tree with its own Gaussian; a reduction bounds
+their number (`driftfit.trackers.bank.reduction`). The result at t, the mixture over all leaves, is computed after the
 tree has grown by sample t and before it is reduced.
 
-Use it where parameters stand still and sometimes jump, or where the sensor may fail: jumps are seen by their fit, not
-by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper.
-Jumps show only through the regressors: no excitation, no detection.
+Use it if parameters are constant between occasional jumps, or if the sensor may fail: a jump is detected by its fit,
+without a compromise between tracking and averaging. If parameters drift all the time, `Kalman` is better and cheaper.
+Jumps are visible only through the regressors: without excitation there is no detection.
 
-`Bank()` alone has no scale: see `driftfit.trackers.bank.change`. With unknown noise variance (r of the nominal sensor
-left None) q and p0 are in units of it, unless a ``guess`` of it is given.
+`Bank()` alone depends on no scale: see `driftfit.trackers.bank.change`. If the noise variance is unknown (r of the
+nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it is given.
 
-A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
-Until there are four residuals (with known noise: full rank, or four samples that nothing new is in) only the first
-change acts. Then the tree grows in the directions that the regressors span, and a later one enters as the exact limit
-of a wide prior; a bank with changes that forget, with leaves that have output lags of their own or with form="sqrt"
-waits for full rank.
+A sample that is not used changes no weight: the leaves become wider by what may have happened, and depth counts used
+samples. Until there are four residuals (with known noise: full rank, or four samples without a new direction) only the
+first change acts. The tree then grows in the directions that the regressors span, and a later direction enters as the
+exact limit of a wide prior. A bank with changes that forget, with leaves that have their own output lags, or with
+form="sqrt" waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -26,7 +26,7 @@ time.
 
 Source: fixed-lag decisions and trees of hypotheses after the paper on Bayesian tracking of parameters with alternative
 developments; Bar-Shalom, Li and Kirubarajan (2001), chapter 11; Andersson (1985) for the beam. Departures: leaves are
-merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) a leaf update.
+merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) per leaf update.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
 from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
-from driftfit.trackers.bank.machine.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.machine.start import GROWTH, begin
-from driftfit.trackers.bank.machine.variants import made
+from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
+from driftfit.trackers.bank.variants import made
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
 from driftfit.trackers.parts.excitation import window
@@ -62,7 +62,7 @@ from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.resolution import resolution, unresolved
 
 FAR = 100.0
-"""Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
+"""Standard deviations from its forecast beyond which a sample is a fault code, for a bank without given sensors."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +72,23 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        What may happen to theta between samples; the first is the ordinary course. None: a small drift, and a rare
-        jump of any parameter, free of scale.
+        What may happen to theta between samples; the first is the normal course. None: a small drift, and a rare
+        jump of any parameter, both scale-free.
     sensors : list of Sensor
-        What the sensor may do; the first must be nominal. None: nominal, with unknown noise variance.
+        How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance.
     transition : None, (H_d, H_d), (H, H), or a pair
         Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
-        sensors). None: events are independent, with the probabilities that changes and sensors carry.
+        sensors). None: events are independent, with the probabilities of the changes and sensors.
     reduce : Reduction
-        How histories are kept few. None: Beam(9), or Hybrid(9) with more than one sensor.
+        How the number of leaves is limited. None: Beam(9), or Hybrid(9) with more than one sensor.
     theta0, p0
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
-        Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+        Distribution of the first event. None: the prior probabilities, or the stationary distribution of the
+        transition.
     lag_variance : bool
-        Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
-        are; see `driftfit.trackers.bank.leaves.lags`. False takes them for certain.
+        Whether leaves with their own output lags (additive outliers, a frozen sensor) carry the uncertainty of these
+        lags; see `driftfit.trackers.bank.leaves.lags`. False treats the lags as certain.
     form : "covariance" or "sqrt"
         "sqrt" for collinear or badly scaled regressors, a wide prior and little noise: leaves keep factors U D U' of
         their covariances (`driftfit.trackers.bank.leaves.factored`), whose variances are positive by construction.
@@ -159,17 +160,17 @@ class Bank(Tracker):
 
     @property
     def all_changes(self) -> tuple[Change, ...]:
-        """The changes, also those that `Bank()` supplies."""
+        """The changes, including those that `Bank()` supplies."""
         return self.changes or changes_.usual()
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """The sensors, likewise."""
+        """The sensors, including those that `Bank()` supplies."""
         return self.sensors or (Sensor.nominal(limit=FAR),)
 
     @property
     def reduction(self) -> Reduction:
-        """How histories are kept few, also where none was given."""
+        """How the number of leaves is limited, including the default."""
         return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
 
     @property
@@ -191,7 +192,7 @@ class Bank(Tracker):
 
     @property
     def _apart(self) -> bool:
-        """Whether changes are events that know nothing of earlier ones, so that a gap is one floor."""
+        """Whether changes are independent of earlier ones, so that a gap is one level of the tree."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
             return False
@@ -224,7 +225,7 @@ class Bank(Tracker):
 
     @property
     def event_names(self) -> tuple[str, ...]:
-        """Names of the joint events, in their order."""
+        """Names of the joint events, in order."""
         if len(self.all_sensors) == 1:
             return self.change_names
         return tuple(f"{change}, {sensor.name}" for change in self.change_names for sensor in self.all_sensors)
@@ -253,7 +254,7 @@ class Bank(Tracker):
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         cleans = any(one.cleans for one in self.all_sensors)
-        state = self._state(model.n, getattr(model, "output_lags", 0) if cleans else 0)
+        state = self._state(model.n, (model.output_lags or 0) if cleans else 0)
         if len(model.outputs) == 1 or model.shared:
             return state
         sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
@@ -293,7 +294,7 @@ class Bank(Tracker):
         }  # fmt: skip
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where nothing is given; then
+        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where none are given; then
         factors of the changes (T, H_d).
         """
         Hd, H = len(self.all_changes), self._count
@@ -338,7 +339,7 @@ class Bank(Tracker):
             C += add[np.tril_indices(n)][:, None] * each
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
-        """All leaves are moved alike, so that the mixture stands where it is said to."""
+        """All leaves are moved by the same amount, so that the mixture is at the given value."""
         name = "d" if lane["framed"] else "theta"
         before = lane[name].copy()
         super().place(lane, which, values)
@@ -346,13 +347,13 @@ class Bank(Tracker):
         B[FIRST : FIRST + len(before)] += (lane[name] - before)[:, None]
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
-        """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
+        """The leaves of a lane, as a view; before the tree starts, the single filter."""
         start, rows, columns = lane["table"][PACKED.index("B")]
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return B[:, : max(int(lane["many"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (of the floors `floors_told`, H) or decided (held, 3) from reports
+        """evidence, window, kept, leaves, lag_prob (of the levels `floors_told`, H) or decided (held, 3) from reports
         (.., size).
         """
         if name in SINGLE:
@@ -366,7 +367,7 @@ class Bank(Tracker):
 
     @property
     def floors_told(self) -> tuple[int, ...]:
-        """The floors that a report tells of, counted back from the present: the newest, and the oldest."""
+        """The levels of the tree that a report contains, counted back from the present: the newest, and the oldest."""
         W = self._shape.floors
         return (*range(min(W, TOLD) - 1), W - 1)
 
@@ -394,7 +395,7 @@ class Bank(Tracker):
         return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
-        """Which entries of theta the regressors have told apart so far, (n,) bool."""
+        """Which entries of theta the regressors have distinguished so far, (n,) bool."""
         return np.isfinite(lane["var"])
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:

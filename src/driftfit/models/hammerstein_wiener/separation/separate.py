@@ -1,4 +1,4 @@
-"""Stage two: a, b, c, d from the products theta that stage one follows, for a whole path at once.
+"""Stage two: a, b, c, d from the products theta of stage one, for a whole path at once.
 
     [b, BC] (nb, n_in) = b c'        [a, AD] (na, n_out) = a (1, d_2 ..)'
 
@@ -7,14 +7,14 @@
     "svd-joint"  b, c as "svd"; a, d the nearest array of rank one to [[1, d], [a, AD]] whose corner is 1, by
                  alternating least squares: a = (a0 + AD d) / (1 + d'd), d = (d0 + AD' a) / (1 + a'a)
 
-The scale of c is that of a singular vector, |c| = 1, with the sign of curves that rise, r'c > 0 (`Basis.rise`): no
-coefficient needs to be different from zero. Where r = 0 it is c_1 = 1. The regression is written with d_1 = 1.
+The scale of c is that of a singular vector, |c| = 1, with the sign of rising curves, r'c > 0 (`Basis.rise`): no
+coefficient needs to be different from zero. If r = 0 it is c_1 = 1. The regression is written with d_1 = 1.
 
-Divisors below 1e-12 are put there. "average" is cheap and has large spikes whenever a b_j or c_k passes zero; the guard
-prevents the division, not the spike. All agree on exact products.
+Divisors below 1e-12 are replaced by 1e-12. "average" is cheap and has large spikes whenever a b_j or c_k passes through
+zero; the guard prevents the division by zero, not the spike. All methods agree on exact products.
 
-Singular vectors come from one-sided Jacobi rotations on the smaller side: relative accuracy without the squares of a
-Gram matrix, and no library call. Source: Feng and Hong (2021), eq. 21 to 27; Bai (1998); the rotations Hestenes (1958).
+Singular vectors come from one-sided Jacobi rotations on the smaller side: they have high relative accuracy without the
+squares of a Gram matrix, and need no library. Source: Feng and Hong (2021), eq. 21 to 27; Bai (1998); Hestenes (1958).
 Departures: (21) needs a definition of c; the paper swaps left and right vectors and gives no gauge. Cost per sample:
 O(nb n_in^2 + na n_out^2).
 """
@@ -23,18 +23,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver, shared
 
 METHODS = ("average", "svd", "svd-joint", "gls")
 LEAST = 1e-12
 ROUNDS = 200
-"""Rounds of the alternating least squares, at most."""
+"""Largest number of iterations of the alternating least squares."""
 SWEEPS = 30
 
 
 @shared
 def guard(x: float) -> float:
-    """x, or the nearest number that can be divided by."""
+    """x, or the nearest number by which one can divide."""
     if abs(x) >= LEAST:
         return x
     return LEAST if x >= 0.0 else -LEAST
@@ -42,7 +42,7 @@ def guard(x: float) -> float:
 
 @shared
 def orthogonal(W: Array) -> None:
-    """Rotate pairs of rows until all are orthogonal; their lengths then are the singular values."""
+    """Rotate pairs of rows until all are orthogonal; their lengths are then the singular values."""
     k, length = W.shape
     for _ in range(SWEEPS):
         turned = False
@@ -186,14 +186,20 @@ def joint(M: Array, d0: Array, a: Array, d: Array) -> None:
 
 
 @shared
+def copy(source: Array, to: Array) -> None:
+    """The numbers of one vector into another."""
+    for i in range(to.shape[0]):
+        to[i] = source[i]
+
+
+@shared
 def separate_input(
-    theta: Array, starts: tuple[int, int], method: int, rise: Array, b: Array, c: Array, worst: Array
+    theta: Array, starts: tuple[int, int], method: int, rise: Array, b: Array, c: Array, worst: Array, work: Array
 ) -> None:
     """b (T, nb) and c (T, n_in) of an input, whose b and products begin at ``starts``; ``worst`` takes the quality."""
     at_b, at_bc = starts
     nb, n_in = b.shape[1], c.shape[1]
-    size = max(nb, n_in)
-    B, W = np.empty((nb, n_in)), np.empty((size, size))
+    B, W = work[0, :nb, :n_in], work[1]
     for t in range(theta.shape[0]):
         row = theta[t]
         for j in range(nb):
@@ -211,13 +217,14 @@ def separate_input(
 
 
 @shared
-def separate_output(theta: Array, starts: tuple[int, int], method: int, a: Array, d: Array, quality: Array) -> None:
+def separate_output(
+    theta: Array, starts: tuple[int, int], method: int, a: Array, d: Array, quality: Array, work: Array
+) -> None:
     """a (T, na) and d (T, n_out), the free of which, and whose products, begin at ``starts``; and the quality (T,)."""
     at_d, at_ad = starts
     na, n_out = a.shape[1], d.shape[1]
-    size = max(na, n_out)
-    A, W = np.empty((na, n_out)), np.empty((size, size))
-    d0, read = np.ones(n_out), np.empty(n_out)
+    A, W, d0, read = work[0, :na, :n_out], work[1], work[2, 0, :n_out], work[3, 0, :n_out]
+    d0[0] = 1.0
     for t in range(theta.shape[0]):
         row = theta[t]
         for i in range(na):
@@ -227,41 +234,41 @@ def separate_output(theta: Array, starts: tuple[int, int], method: int, a: Array
         for k in range(1, n_out):
             d0[k] = row[at_d + k - 1]
         quality[t] = 0.0
-        d[t, :] = d0
+        copy(d0, d[t])
         if method == 0:
-            a[t, :] = A[:, 0]
+            copy(A[:, 0], a[t])
             quality[t] = np.nan
         elif na > 0:
             quality[t] = rank_one(A, W, a[t], read)
             headed(a[t], read)
             if method == 1:
-                d[t, :] = read
+                copy(read, d[t])
             else:
                 joint(A, d0, a[t], d[t])
 
 
-@shared
+@Driver
 def separate(
-    theta: Array,
-    orders: tuple[int, int, int],
-    sizes: Array,
-    rise: Array,
-    groups: tuple[Array, Array, Array, Array],
-    quality: Array,
+    theta: Array, orders: tuple[int, int, int], sizes: Array, rise: Array, groups: Array, quality: Array
 ) -> None:
-    """Fill a (T, na), b (T, sum nb), c (T, sum n_in), d (T, n_out), quality (T, 2) from theta (T, n).
+    """Fill ``groups``, a, b, c and d side by side, (T, na + sum nb + sum n_in + n_out), and quality (T, 2).
 
-    ``orders`` are na, n_out and the place of the method in METHODS, ``sizes`` (2, inputs) nb and n_in of the inputs;
-    quality is sigma_2 / sigma_1 of [b, BC], the largest of all inputs, and of [a, AD]; NaN for "average".
+    theta is (T, n), ``orders`` are na, n_out and the place of the method in METHODS, ``sizes`` (2, inputs) nb and n_in
+    of the inputs; quality is sigma_2 / sigma_1 of [b, BC], the largest of all inputs, and of [a, AD]; NaN for
+    "average".
     """
     na, n_out, method = orders
-    a, b, c, d = groups
-    at_d = na + b.shape[1]
+    at_d, most = na, max(na, n_out)
+    for i in range(sizes.shape[1]):
+        at_d, most = at_d + sizes[0, i], max(most, sizes[0, i], sizes[1, i])
+    a, b = groups[:, :na], groups[:, na:at_d]
+    c, d = groups[:, at_d : groups.shape[1] - n_out], groups[:, groups.shape[1] - n_out :]
     at_b, at_c, at_bc = 0, 0, at_d + n_out - 1
     quality[:, 0] = 0.0
+    work = np.empty((4, most, most))
     for i in range(sizes.shape[1]):
         nb, n_in = sizes[0, i], sizes[1, i]
         own_b, own_c = b[:, at_b : at_b + nb], c[:, at_c : at_c + n_in]
-        separate_input(theta, (na + at_b, at_bc), method, rise[at_c : at_c + n_in], own_b, own_c, quality[:, 0])
+        separate_input(theta, (na + at_b, at_bc), method, rise[at_c : at_c + n_in], own_b, own_c, quality[:, 0], work)
         at_b, at_c, at_bc = at_b + nb, at_c + n_in, at_bc + nb * (n_in - 1)
-    separate_output(theta, (at_d, at_bc), method, a, d, quality[:, 1])
+    separate_output(theta, (at_d, at_bc), method, a, d, quality[:, 1], work)

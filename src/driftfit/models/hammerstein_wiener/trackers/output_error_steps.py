@@ -67,7 +67,7 @@ on the usual power of v of each input.
 @part
 def at_d(p: Places) -> int:
     """Where d begins in xi."""
-    found = p[NA] + p[NB]
+    found: int = p[NA] + p[NB]
     for i in range(p[INPUTS]):
         found += p[OWN + EACH * i + OWN_N_IN] - 1
     return found

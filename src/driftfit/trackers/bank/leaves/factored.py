@@ -1,5 +1,5 @@
 """Covariances of leaves as factors, C = U D U': U an upper triangle with ones on its diagonal, D diagonal and never
-negative. So z'C z is a sum of squares, sum_j D_j (U'z)_j^2, and no rounding makes it negative.
+negative. z'C z is therefore a sum of squares, sum_j D_j (U'z)_j^2, and no rounding makes it negative.
 
     add     C + c v v' with c >= 0, for j = n - 1 .. 0:
                 p = v_j,   d = D_j + c p^2,   beta = c p / d,   gamma = D_j / d
@@ -10,12 +10,12 @@ negative. So z'C z is a sum of squares, sum_j D_j (U'z)_j^2, and no rounding mak
             which leaves a = z'C z + noise, and the gain b / a
     condense  sum_k d_k w_k w_k' with d_k >= 0, by weighted Gram-Schmidt on the rows of W
 
-A leaf keeps D_j where a covariance has C_jj, and U_ij where it has C_ji = C_ij, i < j. Leaves are taken by eights;
-vectors of eight leaves lie in the rows of narrow matrices, eight numbers wide, from column 0.
+A leaf stores D_j in the place of C_jj, and U_ij in that of C_ji = C_ij, i < j. Leaves are processed in SIMD vectors of
+eight; such vectors are rows of narrow matrices, eight numbers wide, from column 0.
 
 Source: Bierman (1977), chapters 5 and 6 (Agee and Turner 1972; Thornton 1976 for Gram-Schmidt); the order of operations
-in `add` after Fletcher and Powell (1974), which keeps digits where c p^2 is much larger than D_j. Cost: O(n^2) for the
-first two, O(n^2) a vector for the third.
+in `add` after Fletcher and Powell (1974), which keeps digits if c p^2 is much larger than D_j. Cost: O(n^2) for the
+first two, O(n^2) per vector for the third.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Changes on factors: what may happen to eight leaves whose covariances are U D U'.
 
-A walk is an `add` for every column of its factor, exponential forgetting scales D, the directional one is an `add`, the
-stabilised one n of `absorb`, and a reset of some parameters adds up what is left of the columns. The formulas are those
-of `driftfit.trackers.bank.leaves.forget`, the operations those of `driftfit.trackers.bank.leaves.factored`. Every
-function works on the eight columns from ``l``; V are narrow rows that may be overwritten.
+A random walk is an `add` for every column of its factor, exponential forgetting scales D, directional forgetting is an
+`add`, stabilised forgetting n of `absorb`, and a reset of some parameters adds up what remains of the columns. The
+formulas are those of `driftfit.trackers.bank.leaves.forget`, the operations those of
+`driftfit.trackers.bank.leaves.factored`. Every function works on the eight columns from ``l``; V are narrow rows that
+may be overwritten.
 """
 
 from __future__ import annotations

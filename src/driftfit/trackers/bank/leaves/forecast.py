@@ -1,4 +1,4 @@
-"""What the leaves expect of the next output, whether it comes or not."""
+"""The forecasts of the leaves for the next output, whether or not it is observed."""
 
 from __future__ import annotations
 

@@ -1,17 +1,17 @@
-"""Changes that forget: what may happen to a leaf N(m, C) beside a random walk.
+"""Changes that forget: what may happen to a leaf N(m, C) other than a random walk.
 
-    exponential   C <- C / lam, which is a walk with Q = (1/lam - 1) C; its trace never grows above the cap
+    exponential   C <- C / lam, which is a random walk with Q = (1/lam - 1) C; its trace never grows above the cap
     directional   C <- C + (1/lam - 1) g g' / (z' g),   g = C z, z the regressor of the last sample that was used
     stabilised    C^-1 <- lam C^-1 + (1 - lam) A^-1,   C^-1 m <- lam C^-1 m + (1 - lam) A^-1 theta0
     reset         m <- theta0, C <- Q; of some parameters: these, independent of the others
 
-lam is the forgetting factor of this interval, ``forget`` to the power dt; directional forgetting belongs to samples and
-not to time. Stabilised forgetting is exponential forgetting and then a measurement of theta0 with noise A / (1 - lam):
-n measurements by the rows w_k of W, W'W = A^-1, each with noise 1 / (1 - lam). So C stays below A / (1 - lam), whatever
-the regressors do, and unexcited parameters return to theta0.
+lam is the forgetting factor of this interval, ``forget`` to the power dt; directional forgetting depends on samples and
+not on time. Stabilised forgetting is exponential forgetting followed by a measurement of theta0 with noise
+A / (1 - lam): n measurements by the rows w_k of W, W'W = A^-1, each with noise 1 / (1 - lam). C therefore stays below
+A / (1 - lam), whatever the regressors are, and unexcited parameters return to theta0.
 
 Source: Kulhavy and Zarrop (1993) for stabilised forgetting; Hagglund (1983), Kulhavy and Karny (1984) for directional.
-Cost: O(n^2) a leaf, O(n^3) where it is stabilised.
+Cost: O(n^2) per leaf, O(n^3) if it is stabilised.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""Output lags that leaves keep of their own, and how uncertain they are.
+"""Output lags that leaves keep separately, and their uncertainty.
 
-A leaf that believes its sensor at fault puts its own prediction into its lags. Taken for certain, a wrong prediction is
-worse than a wrong output: while a sensor is frozen, predictions feed on themselves, and the first good sample is
-believed for its huge regressor. So leaves carry the covariance V of their lags too. With a the leaf's coefficients of
-the output lags,
+A leaf with the hypothesis of a sensor fault puts its own prediction into its lags. If a wrong prediction is treated as
+certain, it is worse than a wrong output: while a sensor is frozen, predictions are fed back, and the first good sample
+is trusted because of its huge regressor. Leaves therefore carry the covariance V of their lags too. With a the leaf's
+coefficients of the output lags,
 
     s = z' C z + a' V a + r,          V+ = [[s, (V a)'], [V a, V]]  without its last row and column
 
-after a prediction was put in, and a zero row for an output that was measured. It is a plug-in still: that a and the
-lags are wrong together is left out, and so is what later outputs tell of earlier ones. Merged leaves take the spread of
-their lags into V. A prediction that cannot be an output (`PLAUSIBLE`) is not put in: y is, or where there is none the
-largest that can be.
+after a prediction was stored, and a zero row for an output that was measured. This is a plug-in approximation: joint
+errors of a and the lags are neglected, and so is the information of later outputs about earlier ones. Merged leaves add
+the spread of their lags to V. A prediction that cannot be an output (`PLAUSIBLE`) is not stored: y is, or, if there is
+none, the largest possible output.
 """
 
 from __future__ import annotations

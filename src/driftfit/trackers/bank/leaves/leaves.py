@@ -1,15 +1,15 @@
-"""Leaves: the columns of one matrix, and what all of them together say.
+"""Leaves of the hypothesis tree: the columns of one matrix, and their mixture.
 
-A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves lie side by side along the last axis,
-which is what the compiler vectorises over; the rows of a column are
+A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves are adjacent along the last axis, over
+which the compiler vectorises; the rows of a column are
 
     log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
 
-nu and S are those of the inverse gamma distribution of the noise variance where that is unknown, C then in its units.
-Codes are the newest events as the digits of a number; what they are for is the reduction's business. What a leaf
-remembers of its past floors, for the user and not for the recursion, are marginals of events in a table of their own,
-which the children of a leaf share: block k of it has the joint events k floors back, and the probability of no change
-since.
+nu and S are those of the inverse gamma distribution of the noise variance if that is unknown, and C is then in its
+units. Codes contain the newest events as the digits of a number, for use by the reduction. The past levels that a leaf
+remembers are needed by the user and not by the recursion; they are marginal probabilities of events in a separate
+table, which the children of a leaf share: its block k has the joint events k levels back, and the probability of no
+change since.
 
 Everything here is compiled once for all sizes.
 """

@@ -1,12 +1,12 @@
-"""The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
+"""The compiled routine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the machine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
-that everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
-`driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
-are factorised once a sample.
+It is the routine of `driftfit.trackers.bank.machine.advance` in which the parts that work on covariances are
+substituted, so that everything else (growing, weighting, planning and remembering) has one source for both forms. The
+operations are in `driftfit.trackers.bank.leaves.factored`; every part here names the one that it replaces. Covariances
+of changes are factorised once per sample.
 
 Changes are in `driftfit.trackers.bank.leaves.factored_changes`; merging condenses all columns of the members and their
-distances from the mean. Until the tree begins, the one filter keeps a covariance.
+distances from the mean. Until the tree starts, the single filter keeps a covariance.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import average, blur, develop_eight, walked
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import chain_gap, grow, lookahead, merge, refilter, start
+from driftfit.trackers.bank.machine import grow, lookahead, merge, refilter, start
+from driftfit.trackers.bank.machine.gaps import chain_gap
 
 covariance_begin = start.begin
 

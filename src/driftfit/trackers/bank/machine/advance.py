@@ -2,7 +2,7 @@
 
 What a sample that is not used does is what time does: every leaf takes in the ordinary course, no weight moves, and no
 leaf is dropped; what else may have happened waits, with the reduction that was planned, for the next sample that can be
-used (`driftfit.trackers.bank.machine.gap`).
+used (`driftfit.trackers.bank.machine.gaps.gap`).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from driftfit.trackers.bank.leaves.leaves import (
     variance_factor,
 )
 from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summary, write_out
-from driftfit.trackers.bank.machine.chain_gap import add_covariance, add_variance, further, go_on, origins, split
-from driftfit.trackers.bank.machine.gap import chances, close, covariances, extend, odds, take_back, widen
+from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
+from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.machine.layout import (
     AGAIN,

@@ -17,7 +17,7 @@ from driftfit.engine.kernel import Array, floats, kernel, wholes
 ) = range(18)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
 it begins with the next sample. OPEN floors have passed since the last used sample
-(`driftfit.trackers.bank.machine.gap`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
+(`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
 AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already.
 """
 WAITING, READY = 0, -1

@@ -1,4 +1,4 @@
-"""What a bank of hypotheses tells in a stream: probabilities now, events as they are decided, the mixture."""
+"""Results of a bank of hypotheses in a stream: present probabilities, decided events, the mixture."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
-from driftfit.trackers.bank.machine.memory import SINGLE
+from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
 
 
 class LiveHypotheses:
-    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
+    """The present results of a stream with a `Bank`; `Live.hypotheses` makes it.
 
     ``lag_prob`` (len(lags), H), ``window``, ``evidence``, ``leaves``, ``kept`` and ``impossible`` are those of
     `Hypotheses` after the last sample.
@@ -36,13 +36,13 @@ class LiveHypotheses:
         self.impossible = int(self._lane["many"][IMPOSSIBLE])
 
     def mixture(self) -> Mixture:
-        """The leaves now: what control works with."""
+        """The present leaves, for use in control."""
         return mixture_of(self.tracker, self._live, self._lane)
 
     def events(self, threshold: float = 0.5) -> list[Event]:
-        """Events that were decided since this was asked last: all that can be known of them is known.
+        """Events that were decided since the last call; their information is final.
 
-        A stream remembers the last 256 samples, so ask more often than that.
+        A stream remembers the last 256 samples, so call this more often than that.
         """
         many, bank = self._lane["many"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
@@ -61,7 +61,7 @@ class LiveHypotheses:
         return [event.timed(lambda sample: self._time(ring, sample)) for event in done]
 
     def _time(self, ring: Array, sample: int) -> Any:
-        """When a sample of the ring was; its number where the stream is given no times."""
+        """The time of a sample of the ring; its number if the stream has no times."""
         back = float(self._lane["now"][ELAPSED] - ring[sample % len(ring), 2])
         time = self._live.before(back)
         return sample if time is None else time

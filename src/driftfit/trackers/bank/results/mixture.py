@@ -1,4 +1,4 @@
-"""The leaves of a bank as they stand: the mixture that control works with, and what is still undecided."""
+"""The present leaves of a bank: the mixture that a controller uses, and the undecided events."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
-from driftfit.trackers.bank.machine.gap import SINCE
+from driftfit.trackers.bank.machine.gaps.gap import SINCE
 from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Mixture(NamedTuple):
-    """The leaves after a sample: what control works with."""
+    """The leaves after a sample, for use in control."""
 
     weights: Array
     """(L,), summing to 1."""
@@ -28,7 +28,7 @@ class Mixture(NamedTuple):
     covs: Array
     """(L, n, n)"""
     ages: Array
-    """(L,): samples since the last change of each leaf; inf where there was none (of merged leaves, the heaviest's)."""
+    """(L,): samples since the last change of each leaf; inf if there was none (for merged leaves, the largest's)."""
 
     @property
     def mean(self) -> Array:
@@ -43,7 +43,7 @@ class Mixture(NamedTuple):
 
 
 def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
-    """The leaves in the fields of one lane; before the bank has begun, its one filter."""
+    """The leaves in the fields of one lane; before the tree starts, the single filter."""
     n = len(lane["theta"])
     if lane["many"][SETTLED] != 1:
         return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
@@ -57,7 +57,7 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
         covs[:, i, j] = covs[:, j, i] = C.T
     gap = tracker.array(place.model, lane, "gap")
     since = gap[1:, gap.shape[1] - WIDTH + SINCE]
-    if since.any():  # what else may have happened since the last used sample
+    if since.any():  # further events that are possible since the last used sample
         more = np.zeros((n, n))
         more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
         covs = covs + more
@@ -76,7 +76,7 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
 
 
 def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:
-    """(sample, event, probability) of the events held, decided one after the other from the leaves at the end."""
+    """(sample, event, probability) of the open events, decided one after the other from the leaves at the end."""
     held, H = int(lane["many"][HELD]), len(loss)
     if lane["many"][SETTLED] != 1 or held == 0:
         return []

@@ -1,4 +1,4 @@
-"""Pictures of hypotheses: probabilities stacked under the parameters, events marked; the tree as it stands."""
+"""Plots of hypotheses: probabilities stacked below the parameters, with events marked; the present tree."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8c6d46", "#5fb5c4")
-"""Of events, the ordinary course first."""
+"""Colours of events, the normal course first."""
 
 
 def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: list[Event], level: float) -> Figure:
@@ -46,7 +46,7 @@ def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: l
 
 
 def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
-    """Probabilities of events, one upon the other; the ordinary course below."""
+    """Probabilities of events, stacked, with the normal course at the bottom."""
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
     axis.stackplot(time, p.T, labels=names, colors=colours, step="mid", linewidth=0)
     axis.set_ylim(0.0, 1.0)
@@ -57,7 +57,7 @@ def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
 def plot_tree(live: Live, floors: int = 3) -> Figure:
     """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
 
-    The newest floors are drawn, oldest to the left; each leaf is labelled with its weight and its mean.
+    The newest levels are drawn, with the oldest on the left; each leaf is labelled with its weight and its mean.
     """
     bank: Any = live.tracker
     lane = live.lane()

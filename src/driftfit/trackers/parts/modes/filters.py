@@ -1,4 +1,4 @@
-"""K random-walk filters side by side: what each does with a sample, and what they say together.
+"""K random-walk filters in parallel: the update of each by a sample, and their mixture.
 
     e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_j
     p_kj  proportional to c_k nu_j N(e_k; 0, s_kj),
@@ -6,16 +6,16 @@
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
 with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
-levels. An outlier's level is as wide as the innovation where that is more than it would be: however far off, its
-influence does not grow. The filters stand in the coordinates z = M theta of their start, in which the regressor is x
-(`driftfit.trackers.parts.coordinates`): any units, any offset, and directions that nothing is known of yet. A regressor
-that enters one of those is taken in by all filters, and says nothing about which one is right.
+levels. An outlier's level is as wide as the innovation if that is larger than the level itself: its influence does not
+grow with its distance. The filters use the coordinates z = M theta of their start, in which the regressor is x
+(`driftfit.trackers.parts.coordinates`): any units, any offset, and directions without information. A regressor
+in such a direction is used by all filters, and does not change their probabilities.
 
-The log density of a sample given those before it is that of the mixture as it was predicted,
+The log density of a sample given earlier ones is that of the predicted mixture,
 
     log sum_k c_k (sum_{j<J} nu_j N(e_k; 0, s_kj) + nu_J Cauchy(e_k; s_kJ^(1/2)))
 
-The Cauchy distribution stands for an outlier, since the level that fits each one best has no density that integrates
+The Cauchy distribution represents an outlier, since the level that fits each one best has no density that integrates
 to 1. Cost per sample: O(K n^2 + K J) for K filters and J levels, and O(K n^3 / 6) for the drift.
 """
 

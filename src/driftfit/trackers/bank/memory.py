@@ -15,7 +15,7 @@ from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
 from driftfit.trackers.bank.machine import selection
 from driftfit.trackers.bank.machine.ancestry import news_of
-from driftfit.trackers.bank.machine.gap import SINCE
+from driftfit.trackers.bank.machine.gaps.gap import SINCE
 from driftfit.trackers.bank.machine.layout import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
 from driftfit.trackers.bank.machine.lookahead import NODES
 from driftfit.trackers.bank.reduction import Reduction
@@ -50,9 +50,8 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     """What `driftfit.trackers.bank.machine.advance` works on, before the first sample; covariances are multiplied by
     ``unit``.
     """
-    Hd, Hm = len(bank.all_changes), len(bank.all_sensors)
+    Hd, Hm, chained = len(bank.all_changes), len(bank.all_sensors), bank.chained
     shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
-    chained = bank.chained
     tri, K, W = n * (n + 1) // 2, shape.children * (2 if chained else 1), shape.floors
     wide, links = _eights(tri), _eights(K + 1)
     chain, initial = bank.event_probabilities
@@ -119,14 +118,14 @@ def packed(
 
 
 def path_of(H: int, Hd: int, wide: int, room: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.chain_gap`, with room for so many leaves; empty for none."""
+    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`, with room for so many leaves; empty for none."""
     table = np.zeros((3 * H + Hd + 1 if room else 0, max(H, wide) + 1))
     table[-1:, -1] = room
     return table
 
 
 def _closed(Hd: int, wide: int) -> Array:
-    """The table of a gap (`driftfit.trackers.bank.machine.gap`) where there is none."""
+    """The table of a gap (`driftfit.trackers.bank.machine.gaps.gap`) where there is none."""
     table = np.zeros((Hd, wide + WIDTH))
     table[0, wide + SINCE] = 1.0
     return table

@@ -1,4 +1,4 @@
-"""Eight numbers at once give the bits of one at a time; parts of machines have no code of their own."""
+"""SIMD vectors give the bits of single numbers; parts of compiled routines have no code of their own."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def one_by_one(x, positive, out):
         out[0, l], out[1, l] = exp(x[0, l]), log(positive[0, l])
 
 
-def test_exp_and_log_of_eight_have_the_bits_of_one():
+def test_exp_and_log_of_a_vector_have_the_bits_of_single_numbers():
     x = np.concatenate([RNG.uniform(-720, 720, 4000), RNG.uniform(-1, 1, 4000), [0.0, -np.inf, 709.0, 800.0] * 2])[None]
     positive = np.concatenate([np.exp(RNG.uniform(-600, 600, 4000)), RNG.uniform(0.3, 3, 4000), [1.0, 2.0] * 4])[None]
     eight, one = np.zeros((2, x.size)), np.zeros((2, x.size))
@@ -63,7 +63,7 @@ def others(x, order, events, out):
     store(out, 8, 0, fill(sum_of(a)))
 
 
-def test_the_operations_on_eight():
+def test_the_operations_on_vectors():
     x, order, events = RNG.normal(size=(9, WIDTH + 4)), RNG.integers(0, WIDTH + 4, 12), RNG.integers(0, 4, 12)
     x[1, 3] = 0.0
     out = np.zeros((9, WIDTH))
@@ -78,6 +78,6 @@ def test_the_operations_on_eight():
     np.testing.assert_allclose(out[8], a.sum(), rtol=1e-14)
 
 
-def test_a_part_of_a_machine_says_that_it_cannot_be_called():
+def test_a_part_of_a_compiled_routine_says_that_it_cannot_be_called():
     with pytest.raises(TypeError, match="py_func"):
         digamma(1.0)

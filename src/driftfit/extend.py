@@ -1,0 +1,33 @@
+"""What a tracker, a model or a curve of your own is made of; see docs/design.md and `driftfit.check_tracker`."""
+
+from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, unknown
+from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing
+from driftfit.engine.settings import Settings, numbers, one_of, vector, whole
+from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.curves.curve import Basis
+from driftfit.trackers.base import RandomWalk, Tracker
+from driftfit.trackers.parts.diffuse import prediction
+
+__all__ = [
+    "Array",
+    "Basis",
+    "Model",
+    "ModelSteps",
+    "RandomWalk",
+    "Settings",
+    "State",
+    "Step",
+    "Tracker",
+    "TrackerSteps",
+    "diagonal",
+    "exp",
+    "kernel",
+    "log",
+    "nothing",
+    "numbers",
+    "one_of",
+    "prediction",
+    "unknown",
+    "vector",
+    "whole",
+]

@@ -1,0 +1,119 @@
+"""Orders and bases chosen on line: candidates followed side by side, each weighed by what it predicted of late.
+
+    log w_k <- a log w_k + log p_k(y_t | past),      p_k from before the sample, a just below 1
+
+A candidate that predicts better gains weight; what is long past is forgotten, so that the choice may change: a valve
+that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, as each
+density stands for a prediction that was made before its output was seen. A sample that one candidate cannot use moves
+no weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
+long to come right when a candidate becomes true. Over the same samples the weights are those of
+``select(..).average(a)``.
+
+Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is what Feng
+and Hong (2021), section 6, leave open. Cost: that of the candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from scipy import special
+
+from driftfit.data.arguments import check_roles
+from driftfit.data.storage import Kept
+from driftfit.engine.kernel import Array
+from driftfit.models.base import Model
+from driftfit.run.live.live import Live
+from driftfit.trackers.base import Tracker
+
+
+class LiveSelection(Kept):
+    """Follow several models of one stream and say which predicts best now.
+
+    Parameters
+    ----------
+    models : sequence of models
+        Candidates with one output and the same inputs, as for `Live`; ``grid(..)`` makes some.
+    tracker : Tracker
+        How their parameters are followed, with a variance; its settings fit every number of parameters.
+    forgetting : number in (0, 1]
+        What a log-likelihood is worth one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
+        change sooner and is led astray by noise more often.
+    dt : as for `Live`
+
+    Raises
+    ------
+    ValueError
+        No candidate, several outputs, a tracker that has no variance or weighs hypotheses, or a forgetting outside.
+    """
+
+    _kind: ClassVar[str] = "selection"
+
+    def __init__(self, models: Sequence[Model], tracker: Tracker, forgetting: float = 0.99, dt: Any = None) -> None:
+        for model in models:
+            check_roles("LiveSelection", model, tracker)
+        if not models or any(len(model.outputs) > 1 for model in models):
+            raise ValueError("LiveSelection: takes at least one model, each with one output.")
+        if not tracker.covariance or tracker.density:
+            raise ValueError(
+                f"LiveSelection: {type(tracker).__name__} has no Gaussian prediction to weigh; use Kalman, RLS or FLS."
+            )
+        if not 0.0 < forgetting <= 1.0:
+            raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")
+        self._follow([Live(model, tracker, dt=dt) for model in models], forgetting)
+
+    def _follow(self, streams: Sequence[Live], forgetting: float) -> None:
+        self.streams, self.forgetting = tuple(streams), float(forgetting)
+        self._logs = np.zeros(len(self.streams))
+
+    def update(self, y: float, u: Any = None, **known: Any) -> float:
+        """Take one sample in; the prediction of y from before it, averaged over the candidates by their weights.
+
+        ``u`` and what is ``known`` (time, weight, drift) are as for `Live.update`.
+        """
+        weights = self.weights
+        steps = [live.update(y, u, **known) for live in self.streams]
+        terms = np.array([_log_density(live, y, step) for live, step in zip(self.streams, steps, strict=True)])
+        if np.isfinite(terms).all():
+            logs = self.forgetting * self._logs + terms
+            self._logs = logs - logs.max()
+        return float(weights @ [step[0] for step in steps])
+
+    @property
+    def weights(self) -> Array:
+        """(K,) of the candidates for the next sample; they add up to 1."""
+        return np.asarray(special.softmax(self.forgetting * self._logs))
+
+    @property
+    def best(self) -> Live:
+        """The stream of the candidate that has the largest weight: its model, theta, blocks, forecast."""
+        return self.streams[int(np.argmax(self._logs))]
+
+    def __repr__(self) -> str:
+        return f"LiveSelection among {len(self.streams)}, best now: {self.best.model!r}"
+
+    def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        header = {"kind": self._kind, "forgetting": self.forgetting}
+        streams = {f"stream{k}": np.frombuffer(live.to_bytes(), np.uint8) for k, live in enumerate(self.streams)}
+        return header, streams | {"logs": self._logs}
+
+    @classmethod
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        found = cls.__new__(cls)
+        count = len(arrays["logs"])
+        found._follow([Live.from_bytes(arrays[f"stream{k}"].tobytes()) for k in range(count)], header["forgetting"])
+        found._logs = np.array(arrays["logs"])
+        return found
+
+
+def _log_density(live: Live, y: float, step: tuple[float, float, float, bool]) -> float:
+    """Log density of a sample given those before it, NaN where there is none; as `Track.log_density`."""
+    _, e, s, ok = step
+    if not (ok and np.isfinite(s) and s > 0.0):
+        return float("nan")
+    found = -0.5 * (np.log(2.0 * np.pi * s) + e * e / s)
+    if live.model.implicit and not live.tracker.output_error:
+        found += live.model.log_jacobian(live.theta[None], np.array([y]))[0]
+    return float(found)

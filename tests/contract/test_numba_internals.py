@@ -1,0 +1,224 @@
+"""Canaries: what the engine leans on inside Numba and llvmlite, one test each, which says what broke.
+
+After an upgrade of Numba run this file first: `pytest -n 0 tests/contract/test_numba_internals.py`.
+"""
+
+import ast
+import gc
+import threading
+import weakref
+from pathlib import Path
+from types import FunctionType
+
+import numba
+import numpy as np
+import pytest
+from numba import types
+from numba.core.registry import cpu_target
+
+from driftfit.engine import disk_cache, kernel
+from driftfit.engine import numba_internals as internals
+from driftfit.engine.kernel import Driver, cubes, floats, machine, part, shared, wholes
+from driftfit.engine.simd import fill, load, plus, store
+
+SRC = Path(__file__).parents[2] / "src" / "driftfit"
+VECTOR = types.Array(types.float64, 1, "C")
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "cache",))
+    disk_cache.folder.cache_clear()
+    yield tmp_path / "cache"
+    monkeypatch.undo()
+    disk_cache.folder.cache_clear()
+
+
+def first(y):
+    return y[0]
+
+
+def test_the_lock_is_the_one_that_numba_compiles_under():
+    compiled = numba.njit(first)
+    with internals.compiler_lock, internals.compiler_lock:  # it can be taken twice
+        other = threading.Thread(target=compiled, args=(np.ones(1),))
+        other.start()
+        other.join(0.2)
+        assert other.is_alive(), "Numba compiles without the lock of numba.core.compiler_lock: threads can mix patches."
+    other.join(60.0)
+    assert not other.is_alive(), "The lock of numba.core.compiler_lock is not given back."
+
+
+def test_a_compiled_function_has_the_same_name_in_every_process():
+    def named():
+        made = internals.under_ieee(FunctionType(first.__code__, {"__name__": __name__, "__builtins__": {}}, "first"))
+        internals.name_for_pickle(made, "a name")
+        return internals.dumps(made)
+
+    assert named() == named(), "Dispatcher._set_uuid no longer decides how Numba pickles a function."
+    assert b"floats" in internals.dumps(floats), "_Intrinsic._set_uuid no longer names an intrinsic."
+
+
+def test_what_was_stored_is_found_by_another_dispatcher():
+    kept, compiled = {}, []
+
+    def dispatcher():
+        made = internals.under_ieee(first)
+        internals.store_by(made, lambda sig: kept.get(str(sig)), lambda sig, data: kept.update({str(sig): data}))
+        return made
+
+    with numba.core.event.install_listener("numba:compile", Count(compiled)):
+        assert dispatcher()(np.full(1, 3.0)) == 3.0
+        assert (len(kept), len(compiled)) == (1, 1), "Numba does not ask the dispatcher's _cache to save an overload."
+        assert dispatcher()(np.full(1, 4.0)) == 4.0
+    assert len(compiled) == 1, "CompileResult._reduce and _rebuild, or _Cache.load_overload, no longer restore code."
+
+
+class Count(numba.core.event.Listener):
+    def __init__(self, seen):
+        self.seen = seen
+
+    def on_start(self, event):
+        self.seen.append(event)
+
+    def on_end(self, event):
+        pass
+
+
+@part
+def doubled(y):
+    return 2.0 * y[1:][0]
+
+
+@shared
+def added(y):
+    return doubled(y) + 1.0
+
+
+def test_parts_are_linked_and_not_emitted():
+    def use(y):
+        return added(y)
+
+    codegen = cpu_target.target_context.codegen()
+    before = {**vars(codegen)}
+    assert Driver(use)(np.array([1.0, 2.0])) == 5.0
+    assert vars(codegen) == before, "The codegen's factories are not put back after a compilation."
+    (made,) = doubled.overloads.values()
+    assert isinstance(made.library, internals.Fragment), "codegen.create_library no longer decides on the library."
+    assert not codegen._engine.is_symbol_defined(made.fndesc.llvm_func_name), "Parts are emitted, which takes time."
+    assert "NRT_incref" not in made.library.get_llvm_str(), "_nrt=False leaves reference counts in."
+    assert "cpython" not in made.library.get_llvm_str(), "no_cpython_wrapper leaves the wrapper in."
+    with pytest.raises(TypeError, match="py_func"):
+        doubled(np.ones(2))
+
+
+def test_parts_are_forgotten_and_compiled_again():
+    def use(y):
+        return added(y) * 3.0
+
+    assert Driver(use)(np.array([1.0, 2.0])) == 15.0
+    reference = weakref.ref(next(iter(doubled.overloads.values())).library)
+    internals.forget(0)
+    gc.collect()
+    assert not doubled.overloads, "Dispatcher.overloads is no longer the table of what was compiled."
+    assert reference() is None, "Something else of Numba's keeps the code of parts: memory grows with every driver."
+    assert Driver(use)(np.array([1.0, 3.0])[::1].astype("f4")) == 21.0, "_reset_overloads left a stale table."
+
+
+def test_pass_managers_are_freed():
+    passes = internals.passes
+    for manager in (passes.ModulePassManager, passes.FunctionPassManager):
+        assert manager._dispose is not passes.ffi.ObjectRef._dispose, f"{manager.__name__} is never freed."
+
+
+def test_object_code_is_loaded_and_freed():
+    code = internals.emit(first, (VECTOR,))
+    assert code.lasting, "Code is said to hold addresses of this process: nothing would be kept on disk."
+    entry = internals.load(code)
+    assert entry(np.full(1, 7.0)) == 7.0, "codegen._tm.emit_object, LLVM's ORC or _dynfunc.make_function changed."
+    assert internals.load(internals.Code(*code))(np.full(1, 8.0)) == 8.0
+    reference = weakref.ref(entry)
+    del entry
+    gc.collect()
+    assert reference() is None, "Something keeps the entry point: the memory of drivers is never freed."
+
+
+def test_loaded_code_finds_its_environment():
+    def careful(y):
+        if y[0] < 0.0:
+            raise ValueError("negative")
+        return y[0]
+
+    driver = Driver(careful)
+    with pytest.raises(ValueError, match="negative"):  # the exception is read from the environment
+        driver(np.array([-1.0]))
+    assert driver(np.array([2.0])) == 2.0
+
+
+@machine
+def machine_scale(y: int, n: int, factor: float) -> None:
+    x = floats(y, n, 1)
+    for i in range(n):
+        x[i, 0] *= factor
+
+
+def test_a_machine_is_called_by_its_symbol():
+    def use(y):
+        machine_scale(y.ctypes.data, y.shape[0], 3.0)
+
+    machine_scale.load()
+    y = np.arange(4.0)
+    Driver(use)(y)
+    assert y.tolist() == [0.0, 3.0, 6.0, 9.0], "llvm_cfunc_wrapper_name or add_symbol changed."
+
+
+def test_arrays_at_addresses():
+    def use(a, k, out):
+        m, c, w = floats(a.ctypes.data, 4, 3), cubes(a.ctypes.data, 2, 2, 3), wholes(k.ctypes.data, 2, 3)
+        out[0], out[1], out[2] = m[2, 1], c[1, 0, 1], w[1, 2]
+        m[3, :][2] = 50.0
+        out[3], out[4] = m.shape[0], c[:, :, 1].shape[1]
+
+    a, out = np.arange(12.0), np.zeros(5)
+    Driver(use)(a, np.arange(6), out)
+    assert out.tolist() == [7.0, 7.0, 5.0, 4.0, 2.0], "make_array or populate_array no longer lays out an array."
+    assert a[11] == 50.0, "An array at an address is a copy."
+
+
+def test_instructions_on_vectors():
+    def use(x):
+        store(x, 1, 0, plus(load(x, 0, 0), fill(1.0)))
+
+    x = np.arange(16.0).reshape(2, 8)
+    Driver(use)(x)
+    assert x[1].tolist() == list(range(1, 9)), "llvmlite.ir or Numba's models of primitive types changed."
+
+
+PUBLIC = {"numba", "numba.types", "numba.extending"}
+
+
+def test_one_file_leans_on_the_inside_of_numba():
+    for path in SRC.rglob("*.py"):
+        used, raw = set(), set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                used |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                used |= {node.module}
+                raw |= {alias.name for alias in node.names if node.module == "numba"}
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "numba":
+                raw.add(node.attr)
+        if path.name == "numba_internals.py":
+            assert len(path.read_text().splitlines()) <= 500
+            continue
+        inside = {name for name in used if name and name.split(".")[0] in {"numba", "llvmlite"}} - PUBLIC
+        assert not inside, f"{path.relative_to(SRC)} imports {inside}; that belongs into engine/numba_internals.py."
+        compilers = raw - {"types", "typeof", "config"}
+        assert not compilers, f"{path.relative_to(SRC)} uses numba.{compilers}; use the decorators of engine.kernel."
+
+
+def test_the_decorators_are_five():
+    """`kernel`, `shared`, `part`, `machine` and `Driver` are all that compiles."""
+    makers = {name for name, value in vars(kernel).items() if callable(value) and value.__module__ == kernel.__name__}
+    public = {name for name in makers if not name.startswith("_")}
+    assert public - {"exp", "log", "nothing"} == {"kernel", "shared", "part", "machine", "Machine", "Driver"}

@@ -1,0 +1,95 @@
+"""What a model declares of itself: kept by the models of the house, and each wrong declaration is named."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import driftfit
+from driftfit import ARX, HammersteinWiener, Regression
+from driftfit.checks import check_model
+from driftfit.models import found
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+
+CURVED = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(3), intercept=True, output_noise=0.1)
+SYSTEM = (-0.3, 0.5, 0.2, 0.1, 0.2, 0.1, 0.04, -0.03, -0.06, 0.1)
+READY = {
+    "ARX": (ARX(1, [2, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(2, intercept=True), None),
+    "HammersteinWiener": (CURVED, SYSTEM),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(set(found()) - {"JointARX"}))  # which has several outputs
+def test_models_that_keep_their_promises(name):
+    assert name in READY, f"{name}: give it orders, and a stable system, in READY"
+    assert check_model(*READY[name]) == []
+
+
+@dataclass(frozen=True)
+class Short(ARX):
+    reach = 1
+
+
+@dataclass(frozen=True)
+class Proud(ARX):
+    def touched(self, t, signal):
+        return range(t, t + 1)
+
+
+@dataclass(frozen=True)
+class Lagged(ARX):
+    output_lags = 2
+
+
+@dataclass(frozen=True)
+class Steep(ARX):
+    implicit = True
+
+    def log_jacobian(self, theta, y):
+        return np.full(len(y), 0.5)
+
+
+@dataclass(frozen=True)
+class Drawn(ARX):
+    def play(self, theta, y, u, noise, span):
+        return 1.1 * super().play(theta, y, u, noise, span)
+
+
+@dataclass(frozen=True)
+class Fickle(ARX):
+    def follows(self, other):
+        return False
+
+
+@dataclass(frozen=True)
+class Twice(ARX):
+    @property
+    def names(self):
+        return ("a1", "b1", "b1", "b2")
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        (Short, "reach is 1, but signals of sample 30 are in the regressors of sample 33"),
+        (Proud, r"A missing u at sample 30 makes samples \[31, 32, 33\] unusable; declared: \[30\]"),
+        (Lagged, "output_lags is 2, but regressor 1 is not the output 2 samples before"),
+        (Steep, "log_jacobian is not the logarithm of the slope of the innovation against y, which is 1"),
+        (Drawn, "play gives"), (Fickle, "follows returns False"), (Twice, "names must be 4 different names"),
+    ],
+)  # fmt: skip
+def test_wrong_declarations_are_said(kind, said):
+    broken = check_model(kind(1, 3))
+    assert len(broken) == (2 if kind is Short else 1)  # without its whole reach it cannot be played either
+    assert re.match(said, broken[0]), broken
+
+
+def test_the_package_knows_of_hammerstein_wiener_models_only_what_models_declare():
+    """No isinstance, hasattr or getattr on its class or its own attributes outside its folder."""
+    home = Path(driftfit.__file__).parent
+    own = "log_jacobian|structure|output_noise|out"
+    asks = re.compile(rf"isinstance\([^)]*HammersteinWiener|(has|get)attr\([^,]*(model, \"|, \"({own})\")")
+    outside = [path for path in home.rglob("*.py") if "hammerstein_wiener" not in path.parts]
+    assert [str(path) for path in outside if asks.search(path.read_text())] == []
