@@ -29,8 +29,10 @@ from driftfit.engine.kernel import State, floats, kernel, machine, shared
 from driftfit.trackers.bank.layout import LAST
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
 
-LARGEST = 1e12
-"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing."""
+LARGEST, LEAST = 1e12, 1e-12
+"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing, and those below this
+share of the nominal one as that.
+"""
 LOG_P, NOISE, CLEAN = range(3)
 """What a function says."""
 
@@ -45,7 +47,7 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
     h = expected[0, l]
     call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
     most = LARGEST * (h + r)
-    said[NOISE] = max(said[NOISE] / unit, 0.0) if said[NOISE] < most * unit else most
+    said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
     said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf
     said[CLEAN] = said[CLEAN] if abs(said[CLEAN]) < np.inf else y
 

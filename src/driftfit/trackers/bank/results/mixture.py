@@ -65,7 +65,8 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
     if len(path) and lane["counters"][OPEN] > 0:
         last = tracker.array(place.model, lane, "event")[0, : B.shape[1]]  # events before the gap
         more = np.zeros((B.shape[1], n, n))
-        more[:, i, j] = more[:, j, i] = path[-1 - tracker._count :][last, : len(i)]
+        H = len(tracker.all_changes) * len(tracker.all_sensors)
+        more[:, i, j] = more[:, j, i] = path[-1 - H :][last, : len(i)]
         covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
