@@ -64,6 +64,15 @@ def expect(t: Any, L: int) -> tuple[float, float]:
     return mean, variance if noise < np.inf else np.inf
 
 
+@kernel
+def weighted(B: Array, L: int, X: Array, row: int) -> float:
+    """The sum over leaves of their weights times a row of X."""
+    sums = fill(0.0)
+    for l in range(0, L, WIDTH):
+        sums = plus(sums, times(load(B, WEIGHT, l), load(X, row, l)))
+    return float(sum_of(sums))
+
+
 @shared
 def expect_together(t: Any, L: int) -> tuple[float, float]:
     """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
@@ -101,12 +110,3 @@ def expect_together(t: Any, L: int) -> tuple[float, float]:
         mean += phi[i] * theta[i]
         wide += phi[i] * g
     return mean, wide + rest * (t.sample[R] * t.sample[IN_NOISE])
-
-
-@kernel
-def weighted(B: Array, L: int, X: Array, row: int) -> float:
-    """The sum over leaves of their weights times a row of X."""
-    sums = fill(0.0)
-    for l in range(0, L, WIDTH):
-        sums = plus(sums, times(load(B, WEIGHT, l), load(X, row, l)))
-    return float(sum_of(sums))

@@ -55,25 +55,6 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
 
 
 @shared
-def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
-    """The rest of change c in the columns a .. b of C and m, which have taken in KEEP, RESET and Q.
-
-    ``work`` has n rows, for C z, and one more.
-    """
-    maps, places, n = t.maps, t.places, t.n
-    kind = int(maps[c, KIND])
-    if kind == EXPONENTIAL:
-        guard(t, C, a, b, c, work[n])
-    elif kind == DIRECTIONAL:
-        toward(C, n, a, b, places[BEFORE], maps[c, GAIN], work)
-    elif kind == STABILISED and maps[c, GAIN] > 0.0:
-        for k in range(n):
-            measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], work)
-    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
-        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], t.Q[c])
-
-
-@shared
 def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
     """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
     n, keep, cap, q = t.n, t.maps[c, KEEP], t.places[CAP, 0], t.Q[c]
@@ -161,6 +142,39 @@ def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Arra
 
 
 @shared
+def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
+    """The rest of change c in the columns a .. b of C and m, which have taken in KEEP, RESET and Q.
+
+    ``work`` has n rows, for C z, and one more.
+    """
+    maps, places, n = t.maps, t.places, t.n
+    kind = int(maps[c, KIND])
+    if kind == EXPONENTIAL:
+        guard(t, C, a, b, c, work[n])
+    elif kind == DIRECTIONAL:
+        toward(C, n, a, b, places[BEFORE], maps[c, GAIN], work)
+    elif kind == STABILISED and maps[c, GAIN] > 0.0:
+        for k in range(n):
+            measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], work)
+    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
+        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], t.Q[c])
+
+
+@shared
+def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
+    """The share of one change in the first two moments about the means of the leaves."""
+    B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
+    for i in range(n):
+        for l in range(L):
+            m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
+        for j in range(i + 1):
+            for l in range(L):
+                away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
+                C[at, l] += chance[l] * (one[at, l] + away)
+            at += 1
+
+
+@shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean m and covariance C of every leaf if any change may happen and no data come: the first two moments
 
@@ -201,20 +215,6 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
     for i in range(n):
         for l in range(L):
             m[i, l] += B[FIRST + i, l]
-
-
-@shared
-def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
-    """The share of one change in the first two moments about the means of the leaves."""
-    B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
-    for i in range(n):
-        for l in range(L):
-            m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
-        for j in range(i + 1):
-            for l in range(L):
-                away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
-                C[at, l] += chance[l] * (one[at, l] + away)
-            at += 1
 
 
 @shared

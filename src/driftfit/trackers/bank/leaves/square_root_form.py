@@ -133,6 +133,20 @@ def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
 
 
 @shared
+def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
+    """The columns of a leaf's factor as columns of W, their D times ``share`` below them."""
+    at = FIRST + n
+    for j in range(n):
+        for i in range(j):
+            W[i, to + j] = B[at + i, l]
+        W[j, to + j] = 1.0
+        for i in range(j + 1, n):
+            W[i, to + j] = 0.0
+        W[n, to + j] = share * B[at + j, l]
+        at += j + 1
+
+
+@shared
 def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
     """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
     A, B, n = t.parents, t.leaves, t.n
@@ -150,20 +164,6 @@ def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
         W[n, count + n] = share[k] * (B[NU, l] / B[S, l] if t.unknown > 0 else 1.0)
         count += n + 1
     condense(W, count, n, A, to)
-
-
-@shared
-def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
-    """The columns of a leaf's factor as columns of W, their D times ``share`` below them."""
-    at = FIRST + n
-    for j in range(n):
-        for i in range(j):
-            W[i, to + j] = B[at + i, l]
-        W[j, to + j] = 1.0
-        for i in range(j + 1, n):
-            W[i, to + j] = 0.0
-        W[n, to + j] = share * B[at + j, l]
-        at += j + 1
 
 
 @shared

@@ -94,54 +94,34 @@ FAULTS_IN_A_ROW = 3
 """As many samples in a row may be taken for fault codes."""
 
 
-@machine
-def bank(address: int) -> None:
-    """One sample, by the table of a bank. One that is refused as a fault code is done again, as missing."""
-    t = table_at(address)
-    counters, head = t.counters, t.report
-    begun = counters[SETTLED] == 1
-    counters[AGAIN] = 1 if begun else 0
-    while counters[AGAIN] == 1:
-        counters[AGAIN] = 0
-        advance(t)
-        head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
-    if not begun:
-        t.places[CAP, 0] = GROWTH * trace(t.cov)
-        wait(t)
-        for row in range(len(t.root)):
-            t.root[row, 0] = t.leaves[row, 0]
-        head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
-    t.sample[ELAPSED] += t.sample[IN_DT]
-    summary(t.lag_prob, t.newest)
-    note(t, head[1])
+@shared
+def copy(P: Array, to: Array) -> None:
+    """All entries of a matrix."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            to[i, j] = P[i, j]
 
 
 @shared
-def advance(t: Any) -> None:
-    """One sample of a tree that has begun."""
-    counters, sample = t.counters, t.sample
-    sample[EVIDENCE] = 0.0
-    for k in range(len(t.decided)):
-        t.decided[k, 0] = -1.0
-    prepare(t)
-    forecast(t, counters[LEAVES])
-    if sample[IN_OK] > 0.0:
-        if refused(sample, counters):
-            return
-        take_in(t)
-    else:
-        let_pass(t, counters[LEAVES])
-    counters[CLOCK] += 1
-    L = counters[LEAVES]
-    mixture(t.n, t, L)
-    if counters[OPEN] > 0 and counters[PARTED] > 0:
-        add_covariance(t, L)
-    elif counters[OPEN] > 0:
-        variance_factor(t, t.scratch, 0, L)
-        widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
-    sample[WINDOW] = marginals(t, L)
-    if sample[IN_SEEN] > 0.0:
-        sample[LAST] = sample[IN_Y]
+def increments_now(t: Any) -> None:
+    """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
+    time, dt = t.sample[IN_TIME], t.sample[IN_DT]
+    increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
+
+
+@shared
+def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
+    """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
+    H = len(P)
+    Hd = H // Hm
+    for j in range(Hm):
+        for to in range(Hm):
+            share = 0.0
+            for i in range(Hd):
+                share += P[j, i * Hm + to]
+            for i in range(Hd):
+                for k in range(Hd):
+                    moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
 
 
 @shared
@@ -175,18 +155,16 @@ def prepare(t: Any) -> None:
 
 
 @shared
-def copy(P: Array, to: Array) -> None:
-    """All entries of a matrix."""
-    for i in range(P.shape[0]):
-        for j in range(P.shape[1]):
-            to[i, j] = P[i, j]
-
-
-@shared
-def increments_now(t: Any) -> None:
-    """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
-    time, dt = t.sample[IN_TIME], t.sample[IN_DT]
-    increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
+def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
+    """Probabilities of the events of this interval, or of the ``whole`` gap, for every leaf."""
+    dt, Hm, wide = t.sample[IN_DT], len(t.sensors), t.counters[WIDE] > 0
+    priors(t, L, expanded)
+    if dt == 0.0:
+        standstill(t.prior, L, Hm)
+    elif dt > 1.0 and t.apart == 0 and t.counters[ALIKE] == 0:
+        later(t.prior, L, t.chain, further(dt), t.spare)
+    if wide:
+        chances(t.prior, L, Hm, t.gap, whole)
 
 
 @shared
@@ -215,63 +193,6 @@ def forecast(t: Any, L: int) -> None:
 
 
 @shared
-def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
-    """Probabilities of the events of this interval, or of the ``whole`` gap, for every leaf."""
-    dt, Hm, wide = t.sample[IN_DT], len(t.sensors), t.counters[WIDE] > 0
-    priors(t, L, expanded)
-    if dt == 0.0:
-        standstill(t.prior, L, Hm)
-    elif dt > 1.0 and t.apart == 0 and t.counters[ALIKE] == 0:
-        later(t.prior, L, t.chain, further(dt), t.spare)
-    if wide:
-        chances(t.prior, L, Hm, t.gap, whole)
-
-
-@shared
-def take_in(t: Any) -> None:
-    """A sample that is used: reduce, grow, weigh, and decide which leaves go on."""
-    counters, sample, prior, kind = t.counters, t.sample, t.prior, int(t.reduction[KIND])
-    waits, own, again = t.reduction[WAIT] > 0.0, kind == INTERACT, kind == REFILTER
-    K = reduce(t)
-    if again:
-        increments_now(t)
-        ready(t)
-    if again or waits:
-        keep_sample(t)
-    counters[EXPANDED] = 0
-    if own:
-        for e in range(len(prior)):
-            for l in range(K):
-                prior[e, l] = 1.0 if e == l else 0.0
-    elif counters[PARTED] > 0:
-        origins(t, counters[LEAVES], K)
-        K = split(t, K)
-    elif counters[ALIKE] == 0 or again:
-        outlook(t, K, True, True)
-    if counters[OPEN] > 0 and t.apart > 0:
-        take_back(
-            t.history_2 if counters[FLIPPED] > 0 else t.history,
-            K,
-            counters[OPEN],
-            t.gap,
-            len(t.initial),
-            len(t.sensors),
-        )
-    L = grow(t, K, own, t.phi, sample[IN_Y], sample[LAST], sample[IN_NOISE])
-    gone = normalise(t.leaves, L)
-    counters[PARENTS], counters[LEAVES] = K, L
-    if gone == gone:
-        accept(t, gone)
-    else:
-        reject(t, K)
-    counters[FLOORS] += 1
-    if counters[WIDE] > 0 and waits:  # the interval to come is a nominal one
-        increments(t, 1.0, 1.0)
-        ready(t)
-    choose(t, counters[LEAVES])
-
-
-@shared
 def accept(t: Any, gone: float) -> None:
     """Some leaf allows the sample, whose log density under all of them is ``gone``."""
     counters = t.counters
@@ -288,6 +209,16 @@ def accept(t: Any, gone: float) -> None:
 
 
 @shared
+def recover(A: Array, K: int, B: Array, rows: int) -> int:
+    """The parents again, as if the sample had not come."""
+    for row in range(rows):
+        for l in range(K):
+            B[row, l] = A[row, l]
+    normalise(B, K)
+    return K
+
+
+@shared
 def reject(t: Any, K: int) -> None:
     """No leaf allows what was seen: go on as if it had not been."""
     counters = t.counters
@@ -299,37 +230,6 @@ def reject(t: Any, K: int) -> None:
     push(t, L, True, t.expected[1], t.sample[MOST])
     outlook(t, L, True, False)
     shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
-
-
-@shared
-def let_pass(t: Any, L: int) -> None:
-    """A sample that is not used: what time does to the leaves."""
-    counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
-    shift_covariance(t, B, L, 0, L, not seen)
-    push(t, L, seen, t.expected[1], t.sample[MOST])
-    if dt == 0.0:
-        return
-    if counters[EXPANDED] == 0:
-        write_out(t, L)
-    if apart:
-        outlook(t, L, True, False)
-    shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
-    if counters[PARTED] > 0:
-        counters[OPEN] += 1
-        counters[TAKEN] = 0
-    if apart:  # leaves take in the ordinary course only
-        certain(t.prior, L)
-        foresee(t, L, 1, 1, False)
-        extend(t.gap)
-        counters[OPEN] += 1
-    for k in range(n):
-        t.places[BEFORE, k] = 0.0
-        for l in range(L):
-            B[FIRST + k, l] = t.m[k, l]
-    for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
-        for l in range(L):
-            B[FIRST + n + k, l] = t.C[k, l]
-    counters[FLOORS] += 1
 
 
 @shared
@@ -383,6 +283,98 @@ def reduce(t: Any) -> int:
 
 
 @shared
+def keep_sample(t: Any) -> None:
+    """Store the sample for growing the tree again, or for looking ahead."""
+    kept = t.samples[t.counters[STORED] % len(t.samples)]
+    kept[Y], kept[NOISE], kept[TIME] = t.sample[IN_Y], t.sample[IN_NOISE], t.sample[IN_TIME]
+    for i in range(t.n):
+        kept[TIME + 1 + i] = t.phi[i]
+    t.counters[STORED] += 1
+
+
+@shared
+def take_in(t: Any) -> None:
+    """A sample that is used: reduce, grow, weigh, and decide which leaves go on."""
+    counters, sample, prior, kind = t.counters, t.sample, t.prior, int(t.reduction[KIND])
+    waits, own, again = t.reduction[WAIT] > 0.0, kind == INTERACT, kind == REFILTER
+    K = reduce(t)
+    if again:
+        increments_now(t)
+        ready(t)
+    if again or waits:
+        keep_sample(t)
+    counters[EXPANDED] = 0
+    if own:
+        for e in range(len(prior)):
+            for l in range(K):
+                prior[e, l] = 1.0 if e == l else 0.0
+    elif counters[PARTED] > 0:
+        origins(t, counters[LEAVES], K)
+        K = split(t, K)
+    elif counters[ALIKE] == 0 or again:
+        outlook(t, K, True, True)
+    if counters[OPEN] > 0 and t.apart > 0:
+        take_back(
+            t.history_2 if counters[FLIPPED] > 0 else t.history,
+            K,
+            counters[OPEN],
+            t.gap,
+            len(t.initial),
+            len(t.sensors),
+        )
+    L = grow(t, K, own, t.phi, sample[IN_Y], sample[LAST], sample[IN_NOISE])
+    gone = normalise(t.leaves, L)
+    counters[PARENTS], counters[LEAVES] = K, L
+    if gone == gone:
+        accept(t, gone)
+    else:
+        reject(t, K)
+    counters[FLOORS] += 1
+    if counters[WIDE] > 0 and waits:  # the interval to come is a nominal one
+        increments(t, 1.0, 1.0)
+        ready(t)
+    choose(t, counters[LEAVES])
+
+
+@shared
+def certain(prior: Array, L: int) -> None:
+    """The first event, for sure."""
+    for l in range(L):
+        prior[0, l] = 1.0
+
+
+@shared
+def let_pass(t: Any, L: int) -> None:
+    """A sample that is not used: what time does to the leaves."""
+    counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
+    shift_covariance(t, B, L, 0, L, not seen)
+    push(t, L, seen, t.expected[1], t.sample[MOST])
+    if dt == 0.0:
+        return
+    if counters[EXPANDED] == 0:
+        write_out(t, L)
+    if apart:
+        outlook(t, L, True, False)
+    shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
+    if counters[PARTED] > 0:
+        counters[OPEN] += 1
+        counters[TAKEN] = 0
+    if apart:  # leaves take in the ordinary course only
+        certain(t.prior, L)
+        foresee(t, L, 1, 1, False)
+        extend(t.gap)
+        counters[OPEN] += 1
+    for k in range(n):
+        t.places[BEFORE, k] = 0.0
+        for l in range(L):
+            B[FIRST + k, l] = t.m[k, l]
+    for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
+        for l in range(L):
+            B[FIRST + n + k, l] = t.C[k, l]
+    counters[FLOORS] += 1
+
+
+@shared
 def refused(sample: Array, counters: Array) -> bool:
     """Whether a sample is so far from what was expected that it is taken for a fault code: it counts as missing.
 
@@ -400,30 +392,31 @@ def refused(sample: Array, counters: Array) -> bool:
 
 
 @shared
-def certain(prior: Array, L: int) -> None:
-    """The first event, for sure."""
-    for l in range(L):
-        prior[0, l] = 1.0
-
-
-@shared
-def keep_sample(t: Any) -> None:
-    """Store the sample for growing the tree again, or for looking ahead."""
-    kept = t.samples[t.counters[STORED] % len(t.samples)]
-    kept[Y], kept[NOISE], kept[TIME] = t.sample[IN_Y], t.sample[IN_NOISE], t.sample[IN_TIME]
-    for i in range(t.n):
-        kept[TIME + 1 + i] = t.phi[i]
-    t.counters[STORED] += 1
-
-
-@shared
-def recover(A: Array, K: int, B: Array, rows: int) -> int:
-    """The parents again, as if the sample had not come."""
-    for row in range(rows):
-        for l in range(K):
-            B[row, l] = A[row, l]
-    normalise(B, K)
-    return K
+def advance(t: Any) -> None:
+    """One sample of a tree that has begun."""
+    counters, sample = t.counters, t.sample
+    sample[EVIDENCE] = 0.0
+    for k in range(len(t.decided)):
+        t.decided[k, 0] = -1.0
+    prepare(t)
+    forecast(t, counters[LEAVES])
+    if sample[IN_OK] > 0.0:
+        if refused(sample, counters):
+            return
+        take_in(t)
+    else:
+        let_pass(t, counters[LEAVES])
+    counters[CLOCK] += 1
+    L = counters[LEAVES]
+    mixture(t.n, t, L)
+    if counters[OPEN] > 0 and counters[PARTED] > 0:
+        add_covariance(t, L)
+    elif counters[OPEN] > 0:
+        variance_factor(t, t.scratch, 0, L)
+        widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
+    sample[WINDOW] = marginals(t, L)
+    if sample[IN_SEEN] > 0.0:
+        sample[LAST] = sample[IN_Y]
 
 
 @shared
@@ -436,21 +429,6 @@ def lone_density(sample: Array) -> float:
 
 
 @shared
-def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
-    """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
-    H = len(P)
-    Hd = H // Hm
-    for j in range(Hm):
-        for to in range(Hm):
-            share = 0.0
-            for i in range(Hd):
-                share += P[j, i * Hm + to]
-            for i in range(Hd):
-                for k in range(Hd):
-                    moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
-
-
-@shared
 def note(t: Any, window: float) -> None:
     """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
     known at last of the event W - 1 floors back.
@@ -459,3 +437,25 @@ def note(t: Any, window: float) -> None:
     ring[row, 0], ring[row, 1], ring[row, 2] = window, t.sample[IN_OK], t.sample[ELAPSED]
     for e in range(lag_prob.shape[1]):
         ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
+
+
+@machine
+def bank(address: int) -> None:
+    """One sample, by the table of a bank. One that is refused as a fault code is done again, as missing."""
+    t = table_at(address)
+    counters, head = t.counters, t.report
+    begun = counters[SETTLED] == 1
+    counters[AGAIN] = 1 if begun else 0
+    while counters[AGAIN] == 1:
+        counters[AGAIN] = 0
+        advance(t)
+        head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
+    if not begun:
+        t.places[CAP, 0] = GROWTH * trace(t.cov)
+        wait(t)
+        for row in range(len(t.root)):
+            t.root[row, 0] = t.leaves[row, 0]
+        head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
+    t.sample[ELAPSED] += t.sample[IN_DT]
+    summary(t.lag_prob, t.newest)
+    note(t, head[1])

@@ -35,6 +35,22 @@ FLOOR = 1e-12
 """S never falls below this share of nu times the mean square of y: the data's own rounding."""
 
 
+@shared
+def develop_own(t: Any, K: int) -> int:
+    """The same where parent l stands for the joint event l."""
+    A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
+    for l in range(K):
+        c = l // Hm
+        for k in range(n * (n + 1) // 2):
+            C[k, l] = maps[c, KEEP] * A[FIRST + n + k, l] + Q[c, k]
+        for i in range(n):
+            m[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else A[FIRST + i, l]
+    for c in range(len(t.walks)):
+        if maps[c, KIND] > 0.0:
+            apply(t, C, m, c * Hm, (c + 1) * Hm, c, t.from_g)
+    return K
+
+
 @part
 def develop(n: int, t: Any, K: int, own: bool) -> int:
     """C- = C / forget + Q_i and m of every parent under every change: columns c K + l. With ``own`` parent l stands for
@@ -53,22 +69,6 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
         if maps[c, KIND] > 0.0:
             apply(t, C, m, c * K, (c + 1) * K, c, t.from_g)
     return K * len(t.walks)
-
-
-@shared
-def develop_own(t: Any, K: int) -> int:
-    """The same where parent l stands for the joint event l."""
-    A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
-    for l in range(K):
-        c = l // Hm
-        for k in range(n * (n + 1) // 2):
-            C[k, l] = maps[c, KEEP] * A[FIRST + n + k, l] + Q[c, k]
-        for i in range(n):
-            m[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else A[FIRST + i, l]
-    for c in range(len(t.walks)):
-        if maps[c, KIND] > 0.0:
-            apply(t, C, m, c * Hm, (c + 1) * Hm, c, t.from_g)
-    return K
 
 
 @part(sizes=(2, 3, 4))
@@ -164,45 +164,6 @@ def frozen(t: Any, at: int, columns: int, y: float, last: float, width: float) -
 
 
 @shared
-def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: float) -> int:
-    """The leaves that K parents grow by a sample, with their weights not normalised; returns how many there are.
-
-    With ``own`` parent l stands for the joint event l alone; ``last`` is what a frozen sensor says again.
-    """
-    sensors = t.sensors
-    columns = int(ahead(t.n, t, K, own, phi))
-    if t.output_lags > 0:
-        widen_by_lags(t, t.parents, K, columns)
-    for j in range(len(sensors)):
-        at = j * columns
-        if t.unknown > 0:
-            inherit(t, K, NU, at, columns)
-            inherit(t, K, S, at, columns)
-        if sensors[j, FROZEN] > 0.0:
-            leave(t, at, columns)
-            frozen(t, at, columns, y, last, sensors[j, STUCK])
-        elif sensors[j, OWN] > 0.0:
-            judge_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
-            correct(t.n, t, at, columns, y, 0.0)
-            weigh_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
-        else:
-            correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.sample[R] * noise)
-            if t.unknown > 0:
-                student(t, at, columns)
-            else:
-                gaussian(t.scores, columns)
-        if t.output_lags > 0:
-            own_lags = sensors[j, CLEANS] > 0.0
-            remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
-            if own_lags and sensors[j, OWN] > 0.0:
-                clean_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
-            shift_covariance(t, t.parents, K, at, columns, own_lags)
-        weigh(t, K, at, columns, j, own)
-        encode(t, K, at, columns, j)
-    return columns * len(sensors)
-
-
-@shared
 def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
     """A row of children as their parents have it."""
     A, B = t.parents, t.leaves
@@ -266,3 +227,42 @@ def encode(t: Any, K: int, at: int, columns: int, j: int) -> None:
                 e = events[at + l]
                 digits, digit = ((Hd * Hm, e), (Hm, j), (Hd, e // Hm))[k]
                 B[row, at + l] = (A[row, l % K] * digits + digit) % base
+
+
+@shared
+def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: float) -> int:
+    """The leaves that K parents grow by a sample, with their weights not normalised; returns how many there are.
+
+    With ``own`` parent l stands for the joint event l alone; ``last`` is what a frozen sensor says again.
+    """
+    sensors = t.sensors
+    columns = int(ahead(t.n, t, K, own, phi))
+    if t.output_lags > 0:
+        widen_by_lags(t, t.parents, K, columns)
+    for j in range(len(sensors)):
+        at = j * columns
+        if t.unknown > 0:
+            inherit(t, K, NU, at, columns)
+            inherit(t, K, S, at, columns)
+        if sensors[j, FROZEN] > 0.0:
+            leave(t, at, columns)
+            frozen(t, at, columns, y, last, sensors[j, STUCK])
+        elif sensors[j, OWN] > 0.0:
+            judge_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+            correct(t.n, t, at, columns, y, 0.0)
+            weigh_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+        else:
+            correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.sample[R] * noise)
+            if t.unknown > 0:
+                student(t, at, columns)
+            else:
+                gaussian(t.scores, columns)
+        if t.output_lags > 0:
+            own_lags = sensors[j, CLEANS] > 0.0
+            remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
+            if own_lags and sensors[j, OWN] > 0.0:
+                clean_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+            shift_covariance(t, t.parents, K, at, columns, own_lags)
+        weigh(t, K, at, columns, j, own)
+        encode(t, K, at, columns, j)
+    return columns * len(sensors)

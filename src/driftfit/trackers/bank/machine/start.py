@@ -31,20 +31,6 @@ GROWTH = 1e8
 
 
 @shared
-def wait(t: Any) -> None:
-    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    counters, sample = t.counters, t.sample
-    t.lag_prob[0, 0] = 1.0
-    y_hat = t.leaves[WEIGHT, :1]
-    y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
-    push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
-    sample[LAST] = sample[IN_Y] if sample[IN_SEEN] > 0.0 else sample[LAST]
-    counters[CLOCK] += 1
-    if counters[SETTLED] == READY:
-        begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
-
-
-@shared
 def begin(t: Any, nu: float, squares: float) -> None:
     """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
     B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
@@ -62,6 +48,20 @@ def begin(t: Any, nu: float, squares: float) -> None:
     for at in range(history.shape[1]):
         history[0, at] = 1.0 if at % (H + 1) == H else 0.0
     counters[LEAVES], counters[GROUPS], counters[EXPANDED], counters[SETTLED] = 1, 1, 1, 1
+
+
+@shared
+def wait(t: Any) -> None:
+    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
+    counters, sample = t.counters, t.sample
+    t.lag_prob[0, 0] = 1.0
+    y_hat = t.leaves[WEIGHT, :1]
+    y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
+    push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
+    sample[LAST] = sample[IN_Y] if sample[IN_SEEN] > 0.0 else sample[LAST]
+    counters[CLOCK] += 1
+    if counters[SETTLED] == READY:
+        begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
 
 
 @shared

@@ -51,6 +51,13 @@ GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift
 
 
 @kernel
+def keep(o: State, s: State, l: int) -> None:
+    """Store what tells of events."""
+    for k in range(s.report.shape[0]):
+        o.report[k, l] = s.report[k, l]
+
+
+@kernel
 def only_drift(s: State, l: int) -> None:
     """The first change, for the one filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
@@ -99,16 +106,9 @@ def point(s: State) -> None:
 
 
 @kernel
-def run(s: State, l: int) -> None:
-    """The compiled routine; addresses are no part of the state."""
-    if s.theta.shape[1] > 1:
-        among(s, l)
-    else:
-        point(s)
-        bank(s.table.ctypes.data)
-        for k in range(MEMORY_AT, SAMPLE_AT + 1):
-            s.table[k, 0, 0] = 0
-        s.table[OWN_AT, 0, 0] = 0
+def report(s: State, l: int) -> None:
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
 
 
 @kernel
@@ -158,6 +158,19 @@ def among(s: State, l: int) -> None:
 
 
 @kernel
+def run(s: State, l: int) -> None:
+    """The compiled routine; addresses are no part of the state."""
+    if s.theta.shape[1] > 1:
+        among(s, l)
+    else:
+        point(s)
+        bank(s.table.ctypes.data)
+        for k in range(MEMORY_AT, SAMPLE_AT + 1):
+            s.table[k, 0, 0] = 0
+        s.table[OWN_AT, 0, 0] = 0
+
+
+@kernel
 def hand_over(s: State, l: int) -> None:
     """The numbers of this sample, for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
@@ -165,6 +178,26 @@ def hand_over(s: State, l: int) -> None:
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
     s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+
+
+@kernel
+def alone(s: State, l: int, counts: bool) -> None:
+    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    learn_scales(s, l)
+    if counts:
+        learn_start(s, l)
+    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
+    hand_over(s, l)
+    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
+    s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
+    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
+        begin_framed(s, l)
+    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
+    s.counters[SETTLED, l] = READY if ready else WAITING
+    run(s, l)
+    if ready:
+        s.scale[l] = 1.0
 
 
 @kernel
@@ -180,29 +213,6 @@ def correct(s: State, l: int) -> None:
         only_drift(s, l)
         measurement(s, l)
         alone(s, l, s.unknown[l] > 0)
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
-
-
-@kernel
-def begin(s: State, l: int) -> None:
-    resolve(s, l)
-    if s.counters[SETTLED, l] > 0:
-        in_coordinates(s, l)
-    else:
-        only_drifted(s, l)
-        enter(s, l)
-        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
-        if s.framed[l] > 0:
-            read_framed(s, l)
-        elif s.many[SETTLED, l] > 0:
-            report(s, l)
-        else:
-            spanned_variance(s, l)
 
 
 @kernel
@@ -227,30 +237,18 @@ def in_coordinates(s: State, l: int) -> None:
 
 
 @kernel
-def alone(s: State, l: int, counts: bool) -> None:
-    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
-    learn_scales(s, l)
-    if counts:
-        learn_start(s, l)
-    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
-    hand_over(s, l)
-    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
-    s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
-    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
-    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
-        begin_framed(s, l)
-    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
-    s.counters[SETTLED, l] = READY if ready else WAITING
-    run(s, l)
-    if ready:
-        s.scale[l] = 1.0
-
-
-@kernel
-def keep(o: State, s: State, l: int) -> None:
-    """Store what tells of events."""
-    for k in range(s.report.shape[0]):
-        o.report[k, l] = s.report[k, l]
+def begin(s: State, l: int) -> None:
+    resolve(s, l)
+    if s.counters[SETTLED, l] > 0:
+        in_coordinates(s, l)
+    else:
+        only_drifted(s, l)
+        enter(s, l)
+        alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
+        if s.framed[l] > 0:
+            read_framed(s, l)
+        else:
+            spanned_variance(s, l)
 
 
 @kernel

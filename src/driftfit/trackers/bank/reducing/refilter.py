@@ -31,6 +31,12 @@ def widen(t: Any, weight: Array, X: Array) -> None:
 
 
 @shared
+def floor(t: Any, K: int, sample: Array) -> int:
+    """One floor of the new tree, with a stored sample."""
+    return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))
+
+
+@shared
 def refilter(t: Any, L: int) -> int:
     """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
     among the parents.
@@ -91,9 +97,3 @@ def histories(t: Any, L: int) -> None:
             code //= H
             quiet *= 1.0 if e < Hm else 0.0
             T[l, k * block + e], T[l, k * block + H] = 1.0, quiet
-
-
-@shared
-def floor(t: Any, K: int, sample: Array) -> int:
-    """One floor of the new tree, with a stored sample."""
-    return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))

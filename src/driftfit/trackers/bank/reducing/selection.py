@@ -152,37 +152,6 @@ def hybrid(t: Any, L: int) -> int:
 
 
 @shared
-def decide(t: Any, L: int, phi: Array) -> None:
-    """Resolve the oldest events while the rule says so, spec section 5.
-
-    A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
-    visible, and its probability. ``phi`` stands for the next regressor.
-    """
-    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
-    p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0
-    for l in range(L):
-        group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
-    while held > 0:
-        top = float(H) ** (held - 1)
-        mass = oldest(t, L, top, p)
-        best = least_risk(t.loss, p, mass, risk)
-        if not settled(t, L, held, risk[best], top, mass, phi):
-            break
-        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.counters[CLOCK]) - stamps[0], p[best]
-        count += 1
-        for k in range(held - 1):
-            stamps[k] = stamps[k + 1]
-        for l in range(L):
-            if group[l] >= 0:
-                if int(B[CODE, l] // top) == best:
-                    B[CODE, l] -= best * top
-                else:
-                    group[l] = -1
-        held -= 1
-    t.counters[HELD] = held
-
-
-@shared
 def oldest(t: Any, L: int, top: float, p: Array) -> float:
     """The weights of the oldest events in p, whose digit in the codes counts ``top``; returns their sum."""
     mass = 0.0
@@ -226,6 +195,37 @@ def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi
         return True
     wait = reduction[WAIT]
     return wait > 0.0 and (risk <= wait or risk <= wait + expected_risk(t, L, top, mass, phi))  # type: ignore[no-any-return]
+
+
+@shared
+def decide(t: Any, L: int, phi: Array) -> None:
+    """Resolve the oldest events while the rule says so, spec section 5.
+
+    A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
+    visible, and its probability. ``phi`` stands for the next regressor.
+    """
+    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
+    p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0
+    for l in range(L):
+        group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
+    while held > 0:
+        top = float(H) ** (held - 1)
+        mass = oldest(t, L, top, p)
+        best = least_risk(t.loss, p, mass, risk)
+        if not settled(t, L, held, risk[best], top, mass, phi):
+            break
+        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.counters[CLOCK]) - stamps[0], p[best]
+        count += 1
+        for k in range(held - 1):
+            stamps[k] = stamps[k + 1]
+        for l in range(L):
+            if group[l] >= 0:
+                if int(B[CODE, l] // top) == best:
+                    B[CODE, l] -= best * top
+                else:
+                    group[l] = -1
+        held -= 1
+    t.counters[HELD] = held
 
 
 @shared

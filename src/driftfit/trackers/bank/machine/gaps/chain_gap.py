@@ -44,25 +44,6 @@ def further(dt: float) -> int:
 
 
 @shared
-def go_on(t: Any, dt: float, used: bool) -> None:
-    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
-
-    A sample that is refused after all comes here twice.
-    """
-    counters, Q = t.counters, t.Q
-    if counters[OPEN] == 0 and counters[TAKEN] == 0:
-        open_gap(t.path, len(t.row))
-    steps = further(dt) + 1 if dt > 0.0 else 0
-    share = 1.0 / max(steps, 1)
-    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
-        lengthen(t, share)
-    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
-    for c in range(len(t.walks)):
-        for k in range(Q.shape[1]):
-            Q[c, k] *= share if used else 0.0
-
-
-@shared
 def open_gap(path: Array, H: int) -> None:
     """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare, whose last entry
     says how many leaves there is room for.
@@ -102,6 +83,25 @@ def lengthen(t: Any, share: float) -> None:
         for k in range(Q.shape[1]):
             path[2 * H + c, k] += share * Q[c, k]
     path[2 * H, path.shape[1] - 1] = 1.0  # the first sample may lead from any event into a mode
+
+
+@shared
+def go_on(t: Any, dt: float, used: bool) -> None:
+    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
+
+    A sample that is refused after all comes here twice.
+    """
+    counters, Q = t.counters, t.Q
+    if counters[OPEN] == 0 and counters[TAKEN] == 0:
+        open_gap(t.path, len(t.row))
+    steps = further(dt) + 1 if dt > 0.0 else 0
+    share = 1.0 / max(steps, 1)
+    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
+        lengthen(t, share)
+    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
+    for c in range(len(t.walks)):
+        for k in range(Q.shape[1]):
+            Q[c, k] *= share if used else 0.0
 
 
 @shared
@@ -155,62 +155,6 @@ def origins(t: Any, L: int, K: int) -> None:
             total += origin[s, k]
         for s in range(len(origin)):
             origin[s, k] /= total
-
-
-@shared
-def split(t: Any, K: int) -> int:
-    """The parents twice; returns how many there are now.
-
-    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
-    """
-    A, T, path, prior = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history, t.path, t.prior
-    H, Hd, Hm, last, wide, count = len(t.row), len(t.walks), len(t.sensors), len(path) - 1, path.shape[1] - 1, K
-    room, floors, standing = int(path[last, wide]), t.counters[OPEN], t.sample[IN_DT] == 0.0
-    reach, stay, q = t.scratch[0], t.scratch[1], path[last]
-    for k in range(K):
-        for e in range(H):
-            reach[e], stay[e] = 0.0, 0.0
-            for s in range(H):
-                reach[e] += prior[s, k] * path[s, e]
-                stay[e] += prior[s, k] * path[H + s, e]
-        best, kappa = 0, -1.0
-        for c in range(Hd):
-            mass = 0.0
-            for e in range(c * Hm, (c + 1) * Hm):
-                mass += stay[e]
-            best, kappa = (c, mass) if mass > kappa else (best, kappa)
-        rest = 1.0 - kappa
-        both = rest > SURE and kappa > SURE and count < room
-        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
-        for i in range(wide):
-            mean = 0.0
-            for s in range(H):
-                mean += prior[s, k] * path[2 * H + Hd + s, i]
-            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
-        for e in range(H):
-            own = stay[e] if e // Hm == best else 0.0
-            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
-            stay[e] = own / kappa if kappa > 0.0 else 0.0
-        if both:
-            for i in range(len(A)):
-                A[i, count] = A[i, k]
-            for i in range(T.shape[1]):
-                T[count, i] = T[k, i]
-            A[LOG, count] += math.log(rest)
-            widen_leaf(t, count, q)
-            remember_other(T, count, floors, H, Hm, best, kappa)
-            remember_one(T, k, floors, H, Hm, best)
-            next_event(t, standing, reach, count)
-            next_event(t, standing, stay, k)
-            A[LOG, k] += math.log(kappa)
-            for i in range(wide):
-                q[i] = path[2 * H + best, i]
-            widen_leaf(t, k, q)
-            count += 1
-        else:
-            next_event(t, standing, reach if rest > 0.0 else stay, k)
-            widen_leaf(t, k, q)
-    return count
 
 
 @shared
@@ -270,3 +214,59 @@ def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, ka
                 T[k, at + e] /= total
         if best == 0 and at >= (floors - 1) * block:
             T[k, at + H] = 0.0  # something changed
+
+
+@shared
+def split(t: Any, K: int) -> int:
+    """The parents twice; returns how many there are now.
+
+    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
+    """
+    A, T, path, prior = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history, t.path, t.prior
+    H, Hd, Hm, last, wide, count = len(t.row), len(t.walks), len(t.sensors), len(path) - 1, path.shape[1] - 1, K
+    room, floors, standing = int(path[last, wide]), t.counters[OPEN], t.sample[IN_DT] == 0.0
+    reach, stay, q = t.scratch[0], t.scratch[1], path[last]
+    for k in range(K):
+        for e in range(H):
+            reach[e], stay[e] = 0.0, 0.0
+            for s in range(H):
+                reach[e] += prior[s, k] * path[s, e]
+                stay[e] += prior[s, k] * path[H + s, e]
+        best, kappa = 0, -1.0
+        for c in range(Hd):
+            mass = 0.0
+            for e in range(c * Hm, (c + 1) * Hm):
+                mass += stay[e]
+            best, kappa = (c, mass) if mass > kappa else (best, kappa)
+        rest = 1.0 - kappa
+        both = rest > SURE and kappa > SURE and count < room
+        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
+        for i in range(wide):
+            mean = 0.0
+            for s in range(H):
+                mean += prior[s, k] * path[2 * H + Hd + s, i]
+            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
+        for e in range(H):
+            own = stay[e] if e // Hm == best else 0.0
+            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
+            stay[e] = own / kappa if kappa > 0.0 else 0.0
+        if both:
+            for i in range(len(A)):
+                A[i, count] = A[i, k]
+            for i in range(T.shape[1]):
+                T[count, i] = T[k, i]
+            A[LOG, count] += math.log(rest)
+            widen_leaf(t, count, q)
+            remember_other(T, count, floors, H, Hm, best, kappa)
+            remember_one(T, k, floors, H, Hm, best)
+            next_event(t, standing, reach, count)
+            next_event(t, standing, stay, k)
+            A[LOG, k] += math.log(kappa)
+            for i in range(wide):
+                q[i] = path[2 * H + best, i]
+            widen_leaf(t, k, q)
+            count += 1
+        else:
+            next_event(t, standing, reach if rest > 0.0 else stay, k)
+            widen_leaf(t, k, q)
+    return count
