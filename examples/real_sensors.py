@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, Track, Tracker, track
+from driftfit import ARX, RLS, AdaptiveKalman, Bank, Kalman, Regression, Track, Tracker, track
 from driftfit.extend import Array
 from driftfit.systems.arc_furnace import switching
 
@@ -28,16 +28,16 @@ def idle() -> None:
     x, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
     y = np.where(np.arange(T) < 1000, 1.0, 2.0) * x + v
     print("An input that stands still: response to x, 2 after a jump, at the end")
-    print(f"  {'second column':18}{'AdaptiveKalman':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
+    print(f"  {'second column':16}{'AdaptiveKalman':>22}{'Bank()':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
     for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
         cells = []
-        for tracker in (AdaptiveKalman(), FORGET, WALK):
+        for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 run = track(Regression(2), tracker, y, np.column_stack([x, second]))
             both = name == "is x again"
             cells.append(f"{run.theta[-1].sum() if both else run.theta[-1, 0]:.3f} (std {run.std[-1, 0]:.3f})")
-        print(f"  {name:18}" + "".join(f"{cell:>22}" for cell in cells))
+        print(f"  {name:16}" + "".join(f"{cell:>22}" for cell in cells))
 
 
 def codes() -> None:

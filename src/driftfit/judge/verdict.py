@@ -25,6 +25,7 @@ many times within the record leaves little trace in a cumulated score. Cost: thr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +56,8 @@ class Moved:
     parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
     moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
     first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
-    its value after the last step, which is ``before`` again after a temporary fault.
+    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
+    and last sample of an interval that contains the date of its clearest step with 95 % confidence.
     """
 
     name: str
@@ -69,6 +71,8 @@ class Moved:
     after: float
     std: float
     last: float
+    earliest: int
+    latest: int
 
 
 @dataclass(frozen=True)
@@ -90,8 +94,8 @@ class Verdict(Printed):
         Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
     alike : tuple of str
-        Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
-        which.
+        If parameters move and none is named: those of which one moves; their regressors are too similar to tell which
+        one.
     since : str
         Time of the step that explains most of it.
     rms : float
@@ -136,7 +140,7 @@ class Verdict(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words."""
+        """The verdict in sentences."""
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
@@ -167,11 +171,11 @@ class Verdict(Printed):
         if not self.drifts:
             return ""
         if not self.moving and len(self.alike) == 1:
-            return f"It probably is {self.alike[0]}, from about {self.since}; its own test alone does not show it."
+            return f"It probably is {self.alike[0]}, from about {self.since}; its own test does not confirm it."
         if not self.moving and len(self.alike) < len(self.parameters):
             return (
                 f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
-                "tell which."
+                "tell which one."
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
@@ -309,12 +313,13 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i
     at, own = int(test.at[i]), float(test.p_own[i])
     before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
+    span: Sequence[int] = (at, at)
     if steps is not None:
         own = float(steps.p[i])
         if named:
-            at = steps.first(i) or 0
+            at, span = steps.first(i) or 0, steps.span(i) or (at, at)
             before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
-    sample = int(rows.at[min(at, len(rows.at) - 1)]) if len(rows.at) else 0
+    sample, *span = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
-    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last)
+    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last, *span)

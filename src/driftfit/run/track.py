@@ -77,11 +77,10 @@ def track_one(
 def records_of(
     y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
 ) -> tuple[Records, dict[Hashable, str]]:
-    """What is to be run, from arrays or a table, and the reasons of what cannot be."""
+    """The records to be run, from arrays or a table, and the reasons of those that cannot be."""
     if data is not None:
-        from driftfit.data.tables import (
-            read_records,
-        )  # importing narwhals and polars takes as long as all other imports
+        # imported here, because narwhals and polars take as long to import as everything else
+        from driftfit.data.tables import read_records
 
         return read_records(data, y, u, by, reading)
     if by not in (None, "row"):

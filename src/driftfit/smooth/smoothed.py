@@ -99,7 +99,7 @@ class Smoothed:
 
     @property
     def time(self) -> Array:
-        """Times given, or sample numbers."""
+        """The given times, or sample numbers."""
         return self.run.time
 
     @cached_property

@@ -25,12 +25,11 @@ from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
 from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.smooth.shared_theta import SmoothedShared
+from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.fls import FLS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from driftfit.smooth.smoothed import Smoothed
 
 
 class Frontier(NamedTuple):

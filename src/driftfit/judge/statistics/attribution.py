@@ -21,13 +21,14 @@ import numpy as np
 from scipy import special
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.statistics.constancy import Constancy, constancy, shortest
 from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
 ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters are told apart by nothing."""
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
@@ -41,6 +42,10 @@ class Step(NamedTuple):
     at: int
 
 
+LEVEL = 0.95
+"""Share of the likelihood in the interval of a date."""
+
+
 class Attribution(NamedTuple):
     """The parameters that move, and their steps."""
 
@@ -48,6 +53,8 @@ class Attribution(NamedTuple):
     """(n,): p-value of each parameter when it was named, or at the end if it was not."""
     steps: tuple[Step, ...]
     """In the order in which they were found."""
+    spans: tuple[tuple[int, int], ...]
+    """First and last sample where each may have been: 95 % of the likelihood of its date between its neighbours."""
     before: Array
     """(n,): value before the first step; the constant value if there is none."""
     after: Array
@@ -62,6 +69,10 @@ class Attribution(NamedTuple):
     def first(self, i: int) -> int | None:
         """The date of the step of parameter i that was found first; None if it has none."""
         return next((step.at for step in self.steps if step.parameter == i), None)
+
+    def span(self, i: int) -> tuple[int, int] | None:
+        """The interval of that date."""
+        return next((span for step, span in zip(self.steps, self.spans, strict=True) if step.parameter == i), None)
 
 
 def holm(p: Array, level: float) -> Array:
@@ -93,7 +104,22 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
     far = np.abs(after - before) > special.ndtri(1.0 - 0.5 * level) * std
-    return Attribution(p, tuple(steps), before, after, std, last, far & [i in named for i in range(n)])
+    spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
+    return Attribution(p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)])
+
+
+def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
+    """The interval of the date of a step, by the likelihood of every date between the steps beside it."""
+    N, n = phi.shape
+    others = [other.at for other in steps if abs(other.at - step.at) > NEAR * N]
+    a, b = max((at for at in others if at < step.at), default=0), min((at for at in others if at > step.at), default=N)
+    edge = max(shortest(n) // 2, len(noise.ar) + 1 if noise is not None else 0)
+    if noise is None or b - a < 4 * edge:
+        return a, b
+    c = noise.level[a:b] * noise.white
+    loglik = date_loglik(phi[a:b] / c[:, None], noise.held[a:b] / c, noise.ar, edge, b - a - edge)
+    first, last = smallest(loglik, LEVEL)
+    return a + edge + first, a + edge + last
 
 
 def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
@@ -110,7 +136,7 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
 
 
 def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
-    """The date of the one step that explains most of y, and the parameters of which a step does so about as well."""
+    """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
     N, n = phi.shape
     if test.noise is None:
         return 0, ()
@@ -127,7 +153,7 @@ def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
 
 
 def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:
-    """The place from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
+    """The position from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
     N = len(x)
     places = np.arange(max(1, first), min(N - 1, last) + 1)
     later = np.cumsum((x * e)[::-1])[::-1][places]

@@ -1,4 +1,4 @@
-"""The size of values without their outliers."""
+"""The mean square of values without their outliers."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def together(mean: float, *suprema: float) -> float:
     """Combine tests of one record into one p-value, however they depend on each other: Liu and Xie (2020).
 
     The mean square has half of the weight, and the suprema share the rest. p-values above one half count as one half:
-    those of suprema are bounds that mean nothing there.
+    those of suprema are bounds without meaning there.
     """
     p = np.array([mean, *suprema])
     weight = np.array([0.5, *[0.5 / len(suprema)] * len(suprema)])

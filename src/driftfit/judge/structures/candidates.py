@@ -43,12 +43,12 @@ class Structure(NamedTuple):
 
 
 def unscored(T: int, n: int) -> int:
-    """Samples at the beginning that score no structure, of at most n parameters: 100, or half of a short record."""
+    """Number of first samples that are not scored: with at most n parameters 100, or half of a short record."""
     return max(burn_in(n), min(100, T // 2))
 
 
 def price(n: int, start: int) -> float:
-    """What n parameters cost in the log-likelihood of the first ``start`` samples, which is not scored."""
+    """The cost of n parameters in the log-likelihood of the first ``start`` samples, which are not scored."""
     return 0.5 * n * float(np.log(start))
 
 

@@ -2,11 +2,11 @@
 
     loglik of a structure = sum over t > m of log p(y_t | past) - (n / 2) log m
 
-Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them without
-a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. log p is the
-tracker's predictive density, a mixture where it has several modes. All structures are scored on the same samples: those
-after the first m that every one could predict, m = max(50, 5 n of the largest, min(100, T / 2)). What learning n
-parameters costs in the first m samples, which are nobody's, is (n / 2) log m (Rissanen, 1986).
+Every term is a prediction made before the output was observed, so a structure with superfluous parameters pays for them
+without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the comparison. log p
+is the tracker's predictive density, a mixture if it has several modes. All structures are scored on the same samples:
+those after the first m that all of them could predict, m = max(50, 5 n of the largest, min(100, T / 2)). The term
+(n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
   columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures with
@@ -21,7 +21,7 @@ the root mean square error. ``best`` has the highest loglik; ``simplest`` has th
 standard error of it. `Selection.average` is dynamic model averaging.
 
 Source: Dawid (1984); Rissanen (1986); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the
-recursion of the weights in closed form. Cost: one run a structure.
+recursion of the weights in closed form. Cost: one run per structure.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def select(
     Parameters
     ----------
     models : sequence of models, or one model
-        Candidates; or the model whose regressors are to be chosen, at most 30.
+        Candidates; or one model whose regressors are to be selected, at most 30.
     y, u, data, time, dt, weights, drift, limits, exclude
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     tracker : Tracker

@@ -55,7 +55,7 @@ def date_axis(axis: Axes, run: Track) -> None:
 def draw_prediction(axis: Axes, run: Track) -> None:
     """The output, and its prediction one step ahead."""
     axis.plot(run.time, run.y, color=GREY, ls="", marker=".", ms=3.0, label="output")
-    # before anything is known the prediction is theta0's, which means nothing
+    # the first predictions come from theta0 alone and mean nothing
     known = np.where(np.isinf(run.innovation_std), np.nan, run.prediction)
     axis.plot(run.time, known, color=BLUE, lw=0.9, label="one-step prediction")
     frame(axis, np.concatenate([run.y, run.prediction[settled(run)]]))

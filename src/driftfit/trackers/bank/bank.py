@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -45,10 +46,23 @@ from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.layout import (
+    COUNT,
+    FADE,
+    FAULTS,
+    HEAD,
+    LAST,
+    LEAVES,
+    LIMIT,
+    ROW,
+    SIZE,
+    TOLD,
+    WHOLE,
+    R,
+)
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
-from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
 from driftfit.trackers.bank.machine.start import GROWTH, begin
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
@@ -257,7 +271,7 @@ class Bank(Tracker):
         state = self._state(model.n, (model.output_lags or 0) if cleans else 0)
         if len(model.outputs) == 1 or model.shared:
             return state
-        sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
+        sizes = [np.size(state[name]) for name in ("memory", "report", "sample", "counters", "table")]
         return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
@@ -266,26 +280,31 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        now, many = np.zeros(SIZE), np.zeros(COUNT, int)
-        now[LAST], now[R], now[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
-        now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
+        sample[LAST], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            arrays["theta0"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
-            begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["places"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
+            begin.py_func(SimpleNamespace(**arrays, theta=theta0, cov=P0, counters=counters), count, squares)
             if self.form == "sqrt":
-                factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
-            arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
-        q0, Q0 = arrays["Q"][0, : n * (n + 1) // 2], np.zeros((n, n))
+                factorise.py_func(arrays["leaves"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
+            arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
+        q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
+        numbers = {
+            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self._alike, "apart": self._apart,
+            "plain": na == 0 and self.form == "covariance",
+        }  # fmt: skip
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
-            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
+            **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
+            "scale": scale, "count": count, "squares": squares, "sample": sample,
+            "counters": counters, **unresolved(),
             **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
             "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
@@ -316,8 +335,9 @@ class Bank(Tracker):
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
         columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
-        for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
-            start = lane["table"][PACKED.index(name), 0] // 8
+        given = np.split(columns, (self._count, len(columns) - Hd))
+        for name, values in zip(("given", "given_chain", "drift"), given, strict=True):
+            start = lane["table"][ROW[name], 0] // 8
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
@@ -348,9 +368,9 @@ class Bank(Tracker):
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
         """The leaves of a lane, as a view; before the tree starts, the single filter."""
-        start, rows, columns = lane["table"][PACKED.index("B")]
+        start, rows, columns = lane["table"][ROW["leaves"]]
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return B[:, : max(int(lane["many"][LEAVES]), 1)]
+        return B[:, : max(int(lane["counters"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
         """evidence, window, kept, leaves, lag_prob (of the levels `floors_told`, H) or decided (held, 3) from reports
@@ -374,16 +394,16 @@ class Bank(Tracker):
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
         table = lane["table"] if "table" in lane else self.state_for(model)["table"]
-        start, rows, columns = table[PACKED.index(name)]
+        start, rows, columns = table[ROW[name]]
         part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return part.view(np.int64) if name in ("links", "group", "slots") else part
+        return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         told = run.hypotheses
         kinds = [event.kind for event in told.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
-        faults = int(run.state["many"][FAULTS])
+        faults = int(run.state["counters"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:

@@ -14,7 +14,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, numbers, one_of, plain, whole
-from driftfit.trackers.bank.machine import selection
+from driftfit.trackers.bank.reducing import selection
 
 REMEMBERED = 24
 """Number of past levels of the tree that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four

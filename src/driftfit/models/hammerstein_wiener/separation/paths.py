@@ -268,13 +268,13 @@ def deviations(model: HammersteinWiener, var: Array) -> Groups:
 
 
 def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array]:
-    """a, b, c, d side by side and quality, to be filled."""
+    """Empty arrays of (a, b, c, d), one after the other, and of quality."""
     na, nb, n_in, n_out, _ = model.structure
     return np.empty((T, na + sum(nb) + sum(n_in) + n_out)), np.empty((T, 2))
 
 
 def apart(model: HammersteinWiener, groups: Array) -> list[Array]:
-    """a, b, c, d from all of them side by side."""
+    """Split (a, b, c, d) into its four arrays."""
     na, nb, n_in, _, _ = model.structure
     return np.split(groups, np.cumsum([na, sum(nb), sum(n_in)]), axis=1)
 

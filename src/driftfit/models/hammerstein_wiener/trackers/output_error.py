@@ -145,8 +145,7 @@ class OutputError(Tracker):
         structure = structure_of("OutputError", model)
         n_w = max(structure.na, 1)
         N = n_w + structure.n_x
-        own = np.ones(V_POWER + model.m)
-        own[:V_POWER] = 0.0
+        own = np.zeros(V_POWER + model.m)
         own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)

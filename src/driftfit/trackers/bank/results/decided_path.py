@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth.problem import replay
@@ -161,7 +161,7 @@ def noise_variance(bank: Bank, run: Track) -> float:
     if r is not None:
         return float(r)
     lane = run.lane(-1)
-    B = bank.array(run.model, lane, "B")
+    B = bank.array(run.model, lane, "leaves")
     mass = B[WEIGHT] > 0.0
     if not mass.any():
         return float(lane["scale"])
@@ -206,7 +206,7 @@ def solve(problem: Problem) -> tuple[Array, Array, Array]:
     return m, C, gains
 
 
-@shared
+@Driver
 def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> float:
     """The filter; m (T, n) and C (T, n, n) after each sample. Returns the log-likelihood, but for its constant."""
     T, n = phi.shape

@@ -185,7 +185,9 @@ def densest(mass: Array) -> tuple[int, int]:
     """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
     wanted = LEVEL * total[-1] * (1.0 - 1e-12)
-    ends = np.searchsorted(total, total[:-1] + wanted)  # of the interval that begins at each sample sample sample
+    ends = np.searchsorted(
+        total, total[:-1] + wanted
+    )  # of the interval that begins at each sample sample sample sample sample sample
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1
 

@@ -10,7 +10,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
+from driftfit.trackers.bank.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
 from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
@@ -33,7 +33,7 @@ class LiveHypotheses:
         told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
         self.lag_prob: Array = told["lag_prob"].copy()
         self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
-        self.impossible = int(self._lane["many"][IMPOSSIBLE])
+        self.impossible = int(self._lane["counters"][IMPOSSIBLE])
 
     def mixture(self) -> Mixture:
         """The present leaves, for use in control."""
@@ -44,7 +44,7 @@ class LiveHypotheses:
 
         A stream remembers the last 256 samples, so call this more often than that.
         """
-        many, bank = self._lane["many"], self.tracker
+        many, bank = self._lane["counters"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
         now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
@@ -62,6 +62,6 @@ class LiveHypotheses:
 
     def _time(self, ring: Array, sample: int) -> Any:
         """The time of a sample of the ring; its number if the stream has no times."""
-        back = float(self._lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        back = float(self._lane["sample"][ELAPSED] - ring[sample % len(ring), 2])
         time = self._live.before(back)
         return sample if time is None else time

@@ -10,8 +10,8 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
 from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
+from driftfit.trackers.bank.layout import LEAVES
 from driftfit.trackers.bank.leaves.leaves import CODE, WEIGHT
-from driftfit.trackers.bank.machine.layout import LEAVES
 from driftfit.trackers.bank.reduction import GPB, Decide
 from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.mixture import mixture_of
@@ -64,7 +64,7 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)
-    B = bank.array(live.model, lane, "B")[:, : lane["many"][LEAVES]]
+    B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     means = mixture_of(bank, live, lane).means
     depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))

@@ -16,7 +16,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
+from driftfit.trackers.bank.layout import IMPOSSIBLE
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.trackers.bank.results import dates
 from driftfit.trackers.bank.results.decided_path import EventSmoothed, measurements, steps_of
@@ -153,7 +153,7 @@ class Hypotheses:
     @property
     def impossible(self) -> int:
         """Number of samples that no leaf allowed; they were not used."""
-        return int(self.run.state["many"][IMPOSSIBLE])
+        return int(self.run.state["counters"][IMPOSSIBLE])
 
     @cached_property
     def decisions(self) -> list[Decision]:

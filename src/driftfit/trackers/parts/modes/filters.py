@@ -110,19 +110,22 @@ def likelihoods(s: State, l: int) -> float:
 
 @kernel
 def predictive_density(s: State, nearest: float, l: int) -> None:
-    """The log density of the sample as it was predicted: without a leap, and with a tail that integrates to 1."""
+    """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
+    repeat, and with a tail that integrates to 1."""
     K, J = s.mu.shape[0], s.nu.shape[0]
-    factor, more = s.noise[l] * s.leverage[l], lasting(s, l)
-    leapt = s.rare[l] < 1.0
+    factor = s.noise[l] * s.leverage[l]
+    leapt, again = s.rare[l] < 1.0, lasting(s, l) > 0.0
     ordinary, outlier = 0.0, 0.0
     for j in range(J - 1):
+        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
         for k in range(K):
-            ordinary += s.joint[j, k, l] if k != TOP or not leapt else 0.0
-        if leapt:
-            v = s.h[TOP, l] - s.gained[l] + factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
-            far = s.e_k[TOP, l] * s.e_k[TOP, l] / v - nearest
-            ordinary += s.prior[TOP, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
-    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l]) + more
+            if again or (leapt and k == TOP):
+                v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+                far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
+                ordinary += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
+            else:
+                ordinary += s.joint[j, k, l]
+    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
     for k in range(K):
         v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
         outlier += s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
