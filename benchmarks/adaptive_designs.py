@@ -1,12 +1,12 @@
-"""Ways to choose the drift by itself, on the tracking benchmark's scenarios; the best one is `AdaptiveKalman`.
+"""Ways of choosing the drift automatically, on the scenarios of the tracking benchmark; `AdaptiveKalman` is the best.
 
 Prints the parameter RMSE after 200 samples of every design as a ratio to the best Kalman filter with one drift ratio,
 chosen per scenario in hindsight from a grid that is printed too. Run: python benchmarks/adaptive_designs.py [--quick]
 
-    mixture    Kalman filters with fixed ratios side by side, weighted by recent predictive likelihood (factor 0.99)
-    IMM        the same filters interacting, every mode led to from every other with the same small probability
+    mixture    Kalman filters with fixed ratios in parallel, weighted by recent predictive likelihood (factor 0.99)
+    IMM        the same filters interacting; all transitions between modes have the same small probability
     slow log-q one filter whose log ratio follows the gradient of the predictive likelihood
-    memories   least squares whose memory is each parameter's own, longer while its corrections alternate in sign
+    memories   least squares with a memory for each parameter, longer while its corrections alternate in sign
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def regressors(kind: str, y: Array, u: Array) -> Array:
 
 @njit(cache=True)
 def mixed(m: Array, P: Array, mu: Array, stay: float) -> tuple[Array, Array, Array]:
-    """Interaction of K filters: every other mode leads to a mode with the same probability."""
+    """Interaction of K filters: all transitions to other modes have the same probability."""
     K = len(mu)
     prior = stay * mu + (1.0 - stay) / (K - 1) * (1.0 - mu)
     means, covariances = np.zeros_like(m), np.zeros_like(P)
@@ -56,7 +56,7 @@ def mixed(m: Array, P: Array, mu: Array, stay: float) -> tuple[Array, Array, Arr
 
 @njit(cache=True)
 def bank(phi: Array, y: Array, ratios: Array, fade: float, stay: float) -> Array:
-    """Filters side by side; stay = 1: weights by faded likelihood; below 1: IMM with that probability to stay."""
+    """Filters in parallel; stay = 1: weights by faded likelihood; below 1: IMM with that probability to stay."""
     T, n = phi.shape
     K = len(ratios)
     m, P = np.zeros((K, n)), np.zeros((K, n, n))

@@ -1,13 +1,13 @@
-"""False alarms that are set, and false alarms that happen.
+"""Set and measured rates of false alarms.
 
 Systems without a fault, records of 20,000 samples; "set" is one false alarm in so many samples, "measured" the samples
-for each alarm that began, with two standard errors. ARX(2, 2) with Gaussian noise, with outliers (5 % are ten times as
-large), and one parameter that walks and stands at the very edge of its band, which is the worst case of a band alarm.
+per alarm, with two standard errors. ARX(2, 2) with Gaussian noise, with outliers (5 % are ten times as large),
+and one parameter, a random walk, at the very edge of its band, which is the worst case of a band alarm.
 
-The second table is of fleets of 50 series, 10 of which have a fault, watched together: false alarms of all series in
-"every" samples, and of the series that are said to have had something the share that had nothing.
+The second table is for fleets of 50 series, 10 of which have a fault, watched together: false alarms of all series in
+"every" samples, and the share of series without a fault among those that are reported.
 
-Run: python benchmarks/alarm_rates.py [records a line, 20 by default] [fleets, 20 by default] [--quick]
+Run: python benchmarks/alarm_rates.py [records per line, 20 by default] [fleets, 20 by default] [--quick]
 """
 
 import sys
@@ -23,12 +23,12 @@ from driftfit import ARX, Bank, Change, Kalman, Regression, Sensor, Track, track
 from driftfit.judge.alarms.onsets import onsets
 
 T, QUICK = 20_000, 6000
-"""Samples a record."""
+"""Samples per record."""
 A, B = [1.0, -1.2, 0.5], [0.0, 1.0, 0.4]
 
 
 def system(seed: int, outliers: bool, T: int) -> Track:
-    """A constant ARX(2, 2), followed by a filter that allows a little drift."""
+    """A constant ARX(2, 2), tracked by a filter that allows a little drift."""
     rng = np.random.default_rng(seed)
     u, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
     v *= np.where(rng.random(T) < 0.05, 10.0, 1.0) if outliers else 1.0
@@ -37,7 +37,7 @@ def system(seed: int, outliers: bool, T: int) -> Track:
 
 
 def at_the_edge(seed: int, every: float, T: int) -> tuple[int, int]:
-    """Onsets of "outside the band" for a band that ends exactly where the walking parameter is."""
+    """Onsets of "outside the band" for a band that ends exactly at the drifting parameter."""
     rng = np.random.default_rng(seed)
     u, theta = rng.normal(size=T), 1.0 + np.cumsum(0.03 * rng.normal(size=T))
     y = theta * u + 0.5 * rng.normal(size=T)
@@ -57,7 +57,7 @@ def watched(kind: str, outliers: bool, **settings: object) -> Callable[[int, flo
 
 
 def jumps(seed: int, every: float, T: int) -> tuple[int, int]:
-    """Onsets of the change probability of a bank that waits for jumps, where there are none."""
+    """Onsets of the change probability of a bank that expects jumps, where there are none."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=T)
     y = 2.0 * u + 0.1 * rng.normal(size=T)

@@ -1,9 +1,9 @@
 """A bank of hypotheses: time per step, against filterpy's interacting multiple models.
 
-Prints microseconds a step in record mode and live, for three changes with a beam of eight leaves at n = 4, for
-twenty-seven leaf updates at n = 3, and for beams of growing width; and the same of filterpy's IMM with three Kalman
-filters where it is installed. Least of several runs, processor time of one core. Run: python benchmarks/bank.py
-[--quick], which takes the first three lines of short records.
+Prints microseconds per step in record mode and live, for three changes with a beam of eight leaves at n = 4, for
+twenty-seven leaf updates at n = 3, and for beams of growing width; and the same for filterpy's IMM with three Kalman
+filters if it is installed. Minimum of several runs, processor time of one core. Run: python benchmarks/bank.py
+[--quick], which runs the first three lines on short records.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ KNOWN = [Sensor.nominal(0.01)]
 
 
 def least(work: Callable[[], object], steps: int, times: int = 5) -> float:
-    """Microseconds a step."""
+    """Microseconds per step."""
     work()
     found = []
     for _ in range(times):
@@ -62,7 +62,7 @@ def live(n: int, bank: Bank) -> float:
 
 
 def filterpy_imm(n: int, steps: int = 200) -> float | None:
-    """filterpy's IMM with three models; None where it is not installed."""
+    """filterpy's IMM with three models; None if it is not installed."""
     try:
         from filterpy.kalman import IMMEstimator, KalmanFilter
     except ImportError:

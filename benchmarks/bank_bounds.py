@@ -1,13 +1,13 @@
-"""Every option of every reduction of a bank, in a machine that is compiled with its bounds checked.
+"""Every option of every reduction of a bank, in compiled routines that check their array bounds.
 
-Compiled code does not look whether an index is within its array. Here it does: a process of its own, with a cache of
-its own, compiles the machines with a check at every index, of single numbers and of eights, that writes down where it
-was out of bounds and goes on. Banks are then drawn at random, with every reduction, kind of change, sensor, prior and
-form, and with records that have outages, gaps in time, fault codes and repeated readings; and the tests of banks are
-run in it. Prints every place that was out of bounds, with its line, and every bank that was not finite.
+Compiled code does not check whether an index is within its array. Here it does: a separate process with its own cache
+compiles the routines with a check at every index, of scalars and of SIMD vectors, which records the line of a violation
+and continues. Banks are then drawn at random, with every reduction, kind of change, sensor, prior and form, and with
+records that have outages, gaps in time, fault codes and repeated readings; and the tests of banks are run as well.
+Prints every violation with its line, and every bank that was not finite.
 
-Run: python benchmarks/bank_bounds.py [--quick] [--banks N]. Compiling both machines with checks takes some minutes;
---quick does one form and size, few banks and no tests. The exit status is 1 where anything was found.
+Run: python benchmarks/bank_bounds.py [--quick] [--banks N]. Compiling both forms with checks takes some minutes;
+--quick uses one form and size, few banks and no tests. The exit status is 1 if anything was found.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 
 
 def watch() -> tuple[Any, list[str]]:
-    """Put checks into whatever is compiled from now on; returns what they write to, and the lines of the sites."""
+    """Insert checks into all code compiled from now on; returns the array of violations, and the lines of checks."""
     from llvmlite import ir
     from numba.core import cgutils
 
@@ -74,7 +74,7 @@ def watch() -> tuple[Any, list[str]]:
 
 
 def found(noted: Any, sites: list[str]) -> list[str]:
-    """What was out of bounds since this was asked last."""
+    """The violations since the last call."""
     wrong = []
     for k in range(min(len(sites), len(noted) // 3)):
         if noted[3 * k]:
@@ -112,7 +112,7 @@ def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, d
 
 
 def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
-    """A bank for n parameters, at random; what does not go together is drawn again."""
+    """A random bank for n parameters; invalid combinations are redrawn."""
     from driftfit import Bank, Change, Sensor
 
     while True:
@@ -146,7 +146,7 @@ def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
 
 
 def reduction(rng: np.random.Generator, H: int) -> Any:
-    """A reduction, at random."""
+    """A random reduction."""
     from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 
     depth, leaves, window = (
@@ -163,7 +163,7 @@ def reduction(rng: np.random.Generator, H: int) -> Any:
 
 
 def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
-    """Run so many banks; returns in how many something was wrong."""
+    """Run this many banks; returns how many had a violation or were not finite."""
     from driftfit import track
 
     bad = 0
@@ -185,7 +185,7 @@ def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
 
 
 def work(banks: int, quick: bool) -> int:
-    """What the process with the checks does."""
+    """The work of the process with the checks."""
     noted, sites = watch()
     bad = fuzz(banks, quick, noted, sites)
     print(f"{banks} banks, {len(sites)} checks, {bad} banks at fault")

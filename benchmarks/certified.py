@@ -1,9 +1,9 @@
-"""Correct digits of NIST's certified estimates: least squares sample by sample, beside statsmodels (a minute).
+"""Correct digits of NIST's certified estimates: least squares sample by sample, and statsmodels (a minute).
 
     python benchmarks/certified.py            all data sets
     python benchmarks/certified.py --quick    the first alone
 
-Printed here is the table of docs/units.md. Needs statsmodels.
+Prints the table of docs/units.md. Needs statsmodels.
 """
 
 import sys

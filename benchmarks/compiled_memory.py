@@ -1,8 +1,8 @@
-"""Memory that a process holds for each configuration that it compiled: MB, as the number of configurations grows.
+"""Memory per compiled configuration in a process: MB, as the number of configurations grows.
 
-ARX(na, nb) of different orders, each a record type of its own, followed by a Kalman filter; first compiled, then found
-on disk, in processes of their own with a cache of their own. "all kept": nothing is forgotten, and llvmlite's pass
-managers are not freed, as it was before there was a bound. Run: python benchmarks/compiled_memory.py [--quick]
+ARX(na, nb) of different orders, each with its own record type, tracked by a Kalman filter; first compiled, then found
+on disk, in separate processes with separate caches. "all kept": nothing is freed, including llvmlite's pass managers,
+as it was before there was a bound. Run: python benchmarks/compiled_memory.py [--quick]
 """
 
 from __future__ import annotations

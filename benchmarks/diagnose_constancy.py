@@ -1,16 +1,16 @@
-"""How often `diagnose` finds fault with constancy where the coefficients are constant.
+"""How often `diagnose` finds a fault with constancy although the coefficients are constant.
 
-Regression on three inputs and ARX(2, 2), Gaussian noise, nothing moves. "loss" is what letting the coefficients move
-costs: the one-step error of the tracker over that of constant least squares, less one, median over the records. Three
-rules for "the drift is set too high", each beside constants that are not rejected (p above 0.05):
+Regression on three inputs and ARX(2, 2), Gaussian noise, constant coefficients. "loss" is the cost of letting the
+coefficients change: the one-step error of the tracker over that of constant least squares, minus one, median over the
+records. Three rules for "the drift is set too high", each in addition to constants not being rejected (p above 0.05):
 
     ratio     the errors of the record are more than 3 % larger than those of constants
     worse     constants are better at all, at 1 % (paired test)
     by 3 %    the errors are more than 3 % larger, at 1 % (paired test): what `diagnose` uses
 
-"constant" is a tracker that holds the coefficients, which has fault found where constancy is rejected at 1 %.
+"constant" is a tracker with constant coefficients; it has a fault if constancy is rejected at 1 %.
 
-Run: python benchmarks/diagnose_constancy.py [records a cell, 60 by default] [--quick]
+Run: python benchmarks/diagnose_constancy.py [records per cell, 60 by default] [--quick]
 """
 
 import sys
@@ -47,7 +47,7 @@ def record(model: str, seed: int, T: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def judged(run: Track) -> tuple[float, bool, bool, bool]:
-    """(loss, ratio, worse, by 3 %); the first rule of a tracker that holds constants is its own."""
+    """(loss, ratio, worse, by 3 %); for a tracker with constant coefficients the first rule is its own."""
     rows, error = regressors(run), errors(run)
     p = constancy(rows.phi, rows.y).p_joint
     own, steady = error.tracked[error.scored], error.constant_ls[error.scored]

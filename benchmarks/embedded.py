@@ -1,10 +1,10 @@
-"""Size and speed of exported trackers: code, state, instructions on a Cortex-M4F, and time beside C written by hand.
+"""Size and speed of exported trackers: code, state, instructions on a Cortex-M4F, and time next to hand-written C.
 
     python benchmarks/embedded.py            about a minute
     python benchmarks/embedded.py --quick    two sizes, few samples
 
-Instructions are counted by the emulator (qemu with -icount: one instruction, one nanosecond of its clock), where it and
-the cross compiler are there. Beside them stands the filter of filter.c, compiled with the same flags on this computer.
+The emulator counts instructions (qemu with -icount: one instruction, one nanosecond of its clock), if it and the cross
+compiler are installed. The filter of filter.c is compiled with the same flags on this computer for comparison.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from driftfit.embedded import export_c
 HERE = Path(__file__).parent
 CORTEX = HERE.parent / "tests" / "cortex"
 FLAGS = ["-std=c99", "-O3", "-fno-tree-vectorize", "-ffp-contract=off", "-shared", "-fPIC"]
-"""Vectors make both slower: numbers stored one by one are read four at once, before the stores have ended."""
+"""Vectorisation makes both slower: numbers stored one by one are read four at once, before the stores have finished."""
 M4F = ["-std=c99", "-O2", "-ffp-contract=off", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16"]
 
 LOOP = """
@@ -97,7 +97,7 @@ NANOSECONDS_A_TICK = 40  # the board's timer runs at 25 MHz
 
 
 def emulated(folder: Path, sources: list[str], flags: list[str]) -> int | None:
-    """Instructions an update on the emulated controller; None where there is none."""
+    """Instructions per update on the emulated controller; None if there is no emulator."""
     if shutil.which("arm-none-eabi-gcc") is None or shutil.which("qemu-system-arm") is None:
         return None
     (folder / "count.c").write_text(COUNT)
@@ -117,7 +117,7 @@ def by_hand(folder: Path, n: int, single: bool) -> int | None:
 
 
 def exported(folder: Path, single: bool) -> tuple[str, str]:
-    """(bytes of code and constants, instructions an update) of the tracker in a folder."""
+    """(bytes of code and constants, instructions per update) of the tracker in a folder."""
     flags = ["-DTRACKER_SINGLE"] if single else []
     count = emulated(folder, [str(folder / "tracker.c")], flags)
     if count is None:
@@ -130,7 +130,7 @@ def exported(folder: Path, single: bool) -> tuple[str, str]:
 
 
 def beside_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[float, float]:
-    """Nanoseconds an update: exported, and the loop of filter.c; both must give the same numbers."""
+    """Nanoseconds per update: exported, and the loop of filter.c; both must give the same numbers."""
     (folder / "loop.c").write_text(LOOP)
     ours, other = str(folder / "ours.so"), str(folder / "other.so")
     subprocess.run(["gcc", *FLAGS, "-o", ours, str(folder / "loop.c"), "-lm"], check=True, cwd=folder)

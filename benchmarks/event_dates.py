@@ -1,9 +1,9 @@
 """Do the intervals of event dates hold their level, and are jumps in outages found?
 
-Records of 300 samples of a regression with two regressors, one jump in the middle, of ``size`` standard deviations of
-the noise, tracked by `Bank()`, which knows neither size nor noise. An event is right if it is within 25 samples of the
-jump. The interval of its date should hold the jump in 95 per cent of those that are found. Then the same with an outage
-around the jump: a jump that happens while nothing is seen. Run: python benchmarks/event_dates.py [records]
+Records of 300 samples of a regression with two regressors have one jump in the middle, of ``size`` standard deviations
+of the noise, and are tracked by `Bank()`, which knows neither size nor noise. An event is correct if it is within 25
+samples of the jump. The interval of its date should contain the jump in 95 per cent of the correct events. Then the
+same with an outage around the jump. Run: python benchmarks/event_dates.py [records]
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def near(events: list[Event], outage: int) -> list[Event]:
 
 
 def coverage(size: float, records: int) -> tuple[int, int, int, float]:
-    """Found, held, false, and the mean length of the interval."""
+    """Share found, share of intervals that contain the date, false events, and the mean length of the interval."""
     found, held, false, length = 0, 0, 0, 0
     for seed in range(records):
         events = track(Regression(2), Bank(), *record(np.random.default_rng(seed), size)).hypotheses.dated()
@@ -46,7 +46,7 @@ def coverage(size: float, records: int) -> tuple[int, int, int, float]:
 
 
 def outages(size: float, outage: int, records: int) -> int:
-    """In how many of the records a jump during an outage is found."""
+    """Share of records in which a jump during an outage is found."""
     runs = (track(Regression(2), Bank(), *record(np.random.default_rng(seed), size, outage)) for seed in range(records))
     return sum(bool(near(run.hypotheses.found(), outage)) for run in runs)
 

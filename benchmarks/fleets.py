@@ -1,10 +1,10 @@
 """Ten thousand series at once: driftfit against dynamax (vmap) and simdkalman (its primitives, step by step).
 
 The task: random-walk Kalman regressions with n = 4, y (units, T), regressors (units, T, 4), double precision, results
-for every sample. All get the same arrays, each runs once to warm up and the best of three runs counts. driftfit writes
-means, variances, predictions, innovations and their variances; the others means and covariances. Peers that are not
-installed are left out. "streaming the bytes" reads the same inputs and writes as many bytes as driftfit's results have,
-on the same number of threads: no program that keeps these results can be faster.
+for every sample. All packages get the same arrays, each runs once to warm up, and the best of three runs counts.
+driftfit writes means, variances, predictions, innovations and their variances; the others write means and covariances.
+Packages that are not installed are left out. "streaming the bytes" reads the same inputs and writes as many bytes as
+driftfit's results have, with the same number of threads: no program that keeps these results can be faster.
 
 Run: python benchmarks/fleets.py [--quick]
 """
@@ -33,7 +33,7 @@ TRACKER = Kalman(q=Q, r=R, p0=P0)
 
 
 def simulate(units: int, T: int) -> tuple[Array, Array]:
-    """y (units, T) and regressors (units, T, 4) with parameters that walk."""
+    """y (units, T) and regressors (units, T, 4) with random-walk parameters."""
     rng = np.random.default_rng(0)
     phi = rng.normal(size=(units, T, 4))
     theta = rng.normal(size=(units, 1, 4)) + np.cumsum(np.sqrt(Q) * rng.normal(size=(units, T, 4)), axis=1)
@@ -59,7 +59,7 @@ def dynamax_run(y: Array, phi: Array) -> Callable[[], Array]:
     jax.config.update("jax_enable_x64", True)
 
     def one(series: Array, rows: Array) -> tuple[Array, Array]:
-        # dynamax's first prior stands after the first drift, ours before it
+        # dynamax's prior refers to the time after the first drift, ours to the time before it
         parameters = make_lgssm_params(
             jnp.zeros(4), (P0 + Q) * jnp.eye(4), jnp.eye(4), Q * jnp.eye(4), rows[:, None, :], R * jnp.eye(1)
         )

@@ -2,8 +2,8 @@
 
     python benchmarks/fresh.py 100000
 
-``seconds`` runs from the first line of this file to the first result. ``extra`` is the peak of the process's memory
-during a second run on T samples, less what it held before and the bytes of what that run returned.
+``seconds`` runs from the first line of this file to the first result. ``extra`` is the peak memory of the process
+during a second run on T samples, minus what it held before and the bytes of the results.
 """
 
 from time import perf_counter
@@ -25,7 +25,7 @@ from driftfit import ARX, Kalman, track
 
 
 def peak() -> int:
-    """Most bytes that this process has ever held."""
+    """The peak memory of this process in bytes."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 

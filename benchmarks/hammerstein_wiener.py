@@ -1,4 +1,4 @@
-"""Speed of Hammerstein-Wiener tracking: stage one beside a regression of its size, separation, a stream with blocks.
+"""Speed of Hammerstein-Wiener tracking: stage one compared with a regression of its size, separation, streams.
 
     python -m benchmarks.hammerstein_wiener [--quick]
 
@@ -30,11 +30,11 @@ MODELS = {
     "linear": HammersteinWiener(2, 2),
 }
 TURNS = 4
-"""Times that a model and its regression are measured in turns; the least counts."""
+"""Number of turns in which a model and its regression are measured; the minimum counts."""
 
 
 def beside_regression(name: str, model: HammersteinWiener, y: Array, u: Array, tracker: Kalman) -> float:
-    """Print what stage one takes beside a regression of its size; returns the nanoseconds a sample."""
+    """Print the time of stage one compared with a regression of its size; returns the nanoseconds per sample."""
     T = len(y)
     phi = np.random.default_rng(0).normal(size=(T, model.n))
     plain, stage = np.inf, np.inf

@@ -1,6 +1,6 @@
-"""What the numbers of the Hammerstein-Wiener reproduction become when what is meant is read otherwise (a minute).
+"""The numbers of the Hammerstein-Wiener reproduction under other interpretations of the paper (a minute).
 
-Printed here is what docs/hammerstein_wiener_paper.md says under "Where numbers depend on what is meant".
+Prints the numbers of docs/hammerstein_wiener_paper.md under "Where numbers depend on the interpretation".
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""How often `select` finds the true orders, beside BIC of constant least squares.
+"""How often `select` finds the true orders, compared with BIC of constant least squares.
 
 The truth is ARX(2, 2), y_t = 1.2 y_(t-1) - 0.5 y_(t-2) + g_t u_(t-1) + 0.4 u_(t-2) + e_t with noise of 0.3; the nine
 candidates have one to three lags of both. g_t is 1, or a random walk with steps of 0.02. "best" and "simplest" are
-those of a selection by the tracker without settings; "slow Kalman" the best by a random walk, q = 1e-5 and r = 0.09.
+those of a selection with the tracker without settings; "slow Kalman" is the best with a random walk, q = 1e-5 and
+r = 0.09.
 
-Run: python benchmarks/select_orders.py [records a row, 60 by default] [--quick]
+Run: python benchmarks/select_orders.py [records per row, 60 by default] [--quick]
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def record(rng: np.random.Generator, T: int, drifts: bool, heavy: bool) -> tuple
 
 
 def bic(y: Array, u: Array) -> str:
-    """The candidate of least BIC."""
+    """The candidate with the smallest BIC."""
     T, scores = len(y), {}
     for model in CANDIDATES:
         columns = [

@@ -1,14 +1,15 @@
-"""How often constants are said to move in noise, and beside inputs, that the verdict was not tuned on.
+"""How often constants are reported to move in kinds of noise and with inputs on which the verdict was not tuned.
 
-The level is 5 %. A regression on two inputs and an intercept, and ARX(2, 2) with an intercept, whose coefficients are
-constant. Noise of variance 1: GARCH(1, 1) with persistence 0.98; Student's t with 3 degrees of freedom; an
-autoregression with a spectral peak (period 8, pole radius 0.9); a moving average (0.8 at the first two lags); a level
-that switches by a factor of 5 (a Markov chain, 50 samples a stay); an autoregression at lag 12 (0.6); a level with a
-season; 3 % outliers, ten times as large; outputs rounded to one deviation of the noise. Inputs: white, autoregressions
-with 0.95, steps that stay for 40 samples on average, and a closed loop (the first input answers the output before).
-Inputs are white where the noise is not, and noise is white Gaussian where the inputs are not, but for the last row.
+The level is 5 %. The models are a regression on two inputs and an intercept, and ARX(2, 2) with an intercept, both with
+constant coefficients. The noise has variance 1: GARCH(1, 1) with persistence 0.98; Student's t with 3 degrees of
+freedom; an autoregression with a spectral peak (period 8, pole radius 0.9); a moving average (0.8 at the first two
+lags); a level that switches by a factor of 5 (a Markov chain that stays 50 samples on average); an autoregression at
+lag 12 (0.6); a seasonal level; 3 % outliers, ten times as large; outputs rounded to one standard deviation of the
+noise. The inputs are white, autoregressions with 0.95, steps that stay for 40 samples on average, and a closed loop
+(the first input reacts to the previous output). Inputs are white if the noise is not, and the noise is white Gaussian
+if the inputs are not, except in the last row.
 
-Run: python benchmarks/verdict_unseen.py [records a cell, 300 by default] [--quick]
+Run: python benchmarks/verdict_unseen.py [records per cell, 300 by default] [--quick]
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""Which alarm sees which fault, and with which tracker: one that finds its own drift and noise follows a fault away.
+"""Which kind of alarm detects which fault, and with which tracker: an adaptive tracker follows a fault.
 
     y_t = gain u_t + offset + N(0, 1),     u_t ~ N(0, 1), gain and offset constant until sample 1500 of 2000
 
 The first 1000 samples are the reference, and one false alarm may begin in 5000. Prints the share of 20 records in which
-an alarm begins within 500 samples of the fault, with the median delay, and the false alarms of the 20 records without a
-fault, 4 being expected. Run: python examples/alarm_kinds.py
+an alarm begins within 500 samples of the fault, with the median delay, and the number of false alarms in the 20 records
+without a fault, where 4 are expected. Run: python examples/alarm_kinds.py
 """
 
 import warnings
@@ -35,7 +35,7 @@ def record(seed: int, fault: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def watched(seed: int, tracker: object, kind: str) -> dict[str, Alarms]:
-    """The rule of the reference, at work in each of the records that begin with it."""
+    """The rule of the reference, applied to each of the records that begin with it."""
     rule = None
     said = {}
     for fault in FAULTS:
@@ -46,7 +46,7 @@ def watched(seed: int, tracker: object, kind: str) -> dict[str, Alarms]:
 
 
 def main() -> None:
-    warnings.simplefilter("ignore")  # that innovations of AdaptiveKalman are a poor alarm, which is to be shown
+    warnings.simplefilter("ignore")  # that innovations of AdaptiveKalman are a poor alarm, as the example shows
     print(f"{'':<28}" + "".join(f"{fault:>20}" for fault in FAULTS))
     for name, tracker, kind in WATCHED:
         found = [watched(seed, tracker, kind) for seed in range(RECORDS)]

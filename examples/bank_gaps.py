@@ -1,8 +1,8 @@
-"""A bank after a gap: the probability of a change in it, and of the sample that ends it, beside the exact values.
+"""A bank after a gap: the probability of a change in it, and the density of the next sample, with the exact values.
 
-One parameter, seen in noise of standard deviation 0.2, drifts a little and jumps by about 1 once in a hundred samples.
-Nothing is seen for a while, and then a sample that is 0.6 off. Exact is the sum over all numbers of jumps in the gap.
-Usage: bank_gaps.py
+One parameter, observed in noise of standard deviation 0.2, drifts a little and jumps by about 1 once in a hundred
+samples. After a gap without observations comes a sample that is 0.6 off. The exact value sums over all numbers of jumps
+in the gap. Usage: bank_gaps.py
 """
 
 from math import comb
@@ -25,7 +25,7 @@ def exact(gap):
     prior = np.array([float(comb(gap, k)) for k in number]) * P**number * (1.0 - P) ** (gap - number)
     total = 0.0
     none = 0.0
-    for q, share in ((DRIFT, 1.0 - P), (JUMP, P)):  # the first sample, of 0, may have come after a jump
+    for q, share in ((DRIFT, 1.0 - P), (JUMP, P)):  # the first sample, of 0, may have been preceded by a jump
         before = share * density(0.0, 1.0 + q + R)
         C = (1.0 + q) * R / (1.0 + q + R)
         parts = before * prior * density(OFF, C + number * JUMP + (gap - number) * DRIFT + R)

@@ -1,7 +1,7 @@
-"""Regressors that are nearly collinear, a prior that knows nothing, and little noise: digits of both forms of a bank.
+"""Nearly collinear regressors, a wide prior, and little noise: accurate digits of both forms of a bank.
 
-Two regressors differ by a ten thousandth (P0 = 1e8, r = 1e-6, one parameter jumps by the known covariance). The largest
-error of the parameters relative to the same filter in fifty digits. Run: python examples/collinear.py
+Two regressors differ by a ten thousandth (P0 = 1e8, r = 1e-6, one parameter jumps by the known covariance). Prints the
+largest error of the parameters relative to the same filter in fifty digits. Run: python examples/collinear.py
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def record(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def exact(y: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """The Kalman filter that is told the jump, in fifty digits."""
+    """The Kalman filter with the known jump, in fifty digits."""
     exactly = np.vectorize(Decimal, otypes=[object])
     path = []
     with localcontext() as context:

@@ -1,13 +1,13 @@
-"""A control loop: y_t is read, then u_t is chosen and applied. What happens where the two are given to `Live` wrongly.
+"""A control loop: y_t is read, then u_t is chosen and applied; and the effect of passing the two to `Live` wrongly.
 
     y_(t+1) = 1.05 y_t + b_t u_t + 0.1 N(0, 1),     b_t = 0.5, and 1 from sample 200 on
 
-The plant is unstable and shall follow a set-point that changes between -1 and 1; u is limited to +-20. The law is
-certainty equivalence, or its cautious relative, which allows for what is not known of the gain:
+The plant is unstable and follows a set-point that changes between -1 and 1; u is limited to +-20. The law is certainty
+equivalence, or its cautious variant, which allows for the uncertainty of the gain:
 
     u = (ref - a y) / b,     u = (b (ref - a y) - P_ab y) / (b^2 + P_bb)
 
-Prints the root mean square of the error after the first 50 samples, and the share of loops that were lost (|y| above
+Prints the root mean square of the error after the first 50 samples, and the share of loops that diverged (|y| above
 1000). Run: python examples/control_loop.py
 """
 
@@ -27,7 +27,7 @@ def cautious(m: np.ndarray, P: np.ndarray, y: float, ref: float) -> float:
 
 
 def followed(order: str, law: object, seed: int) -> float:
-    """Root mean square error of one loop; inf where it was lost."""
+    """Root mean square error of one loop; inf if it diverged."""
     rng = np.random.default_rng(seed)
     live = Live(ARX(1, 1), Kalman(q=[1e-4, 1e-3], r=0.01, p0=1.0, theta0=[0.5, 0.7]))
     y, errors = 0.0, np.zeros(T)
@@ -37,7 +37,7 @@ def followed(order: str, law: object, seed: int) -> float:
             live.update(y)  # y_t, before there is an input
         u = float(np.clip(law(live.theta, live.cov, y, ref), -LIMIT, LIMIT))
         if order == "right":
-            live.apply(u)  # u_t: it will be seen in y_(t+1)
+            live.apply(u)  # u_t: its effect appears in y_(t+1)
         y = 1.05 * y + (0.5 if t < T // 2 else 1.0) * u + 0.1 * rng.standard_normal()
         if order == "wrong":
             live.update(y, u)  # y_(t+1) in one row with u_t

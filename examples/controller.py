@@ -4,7 +4,7 @@
     python examples/controller.py docs/figures/controller.png
 
 The plant is y_t = 0.8 y_(t-1) + gain_t u_(t-1) + noise; its gain falls from 1 to 0.25 between samples 300 and 400. The
-controller chooses u so that the next prediction is the set-point. It knows the first gain, or asks the tracker.
+controller chooses u so that the next prediction is the set-point, with the first gain or with the tracker's estimate.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ import numpy as np
 from driftfit import ARX, Kalman, Live
 from driftfit.embedded import export_c
 
-# In a loop the input that acts on y_t was applied before it: nk=0 with that input beside y_t.
+# In a loop the input that acts on y_t was applied before it: use nk=0 with that input and y_t in one row.
 MODEL, TRACKER = ARX(na=1, nb=1, nk=0), Kalman(q=[0.0, 4e-4], r=0.01, p0=[0.1, 0.1], theta0=[0.8, 1.0])
 
 PROGRAM = r"""

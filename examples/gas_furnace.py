@@ -1,4 +1,4 @@
-"""A control: the gas furnace of Box and Jenkins (series J), often shown as a record without drift.
+"""A control record: the gas furnace of Box and Jenkins (series J), often shown as a record without drift.
 
 Prints the verdict; then, for several orders, its p-value and that of an independent test, the largest
 heteroscedasticity-robust Wald statistic of one break in all coefficients (Andrews, 1993) beside the same of constant

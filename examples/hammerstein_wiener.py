@@ -1,4 +1,4 @@
-"""A valve, a tank and a sensor that all age: the three blocks of a drifting system, told apart on line."""
+"""A valve, a tank and a sensor that all age: on-line separation of the three blocks of a drifting system."""
 
 from pathlib import Path
 

@@ -1,12 +1,12 @@
-"""Control while the gain jumps: certainty equivalence against caution, both with the mixture of a bank.
+"""Control while the gain jumps: certainty equivalence and caution, both with the mixture of a bank.
 
     y_{t+1} = a y_t + b u_t + e,  to follow a reference: minimise E (y_{t+1} - ref)^2 over u
     certain      u = (ref - m_a y) / m_b
     cautious     u = (m_b (ref - m_a y) - P_ab y) / (m_b^2 + P_bb)
 
-m and P are mean and covariance of the mixture of all hypotheses. Prints the mean squared error of following, over all
-and within 15 samples of a jump: for a gain that jumps while the reference stands still, and for one that jumps in the
-very sample in which the reference does. Run: python examples/jump_control.py
+m and P are mean and covariance of the mixture of all hypotheses. Prints the mean squared tracking error, overall and
+within 15 samples of a jump: for a gain that jumps while the reference is constant, and for one that jumps in the same
+sample as the reference. Run: python examples/jump_control.py
 """
 
 import numpy as np
@@ -36,11 +36,11 @@ def squares(tracker: object, law: object, seed: int, late: int) -> np.ndarray:
     """Squared errors of one run; inputs are limited to +-10."""
     rng = np.random.default_rng(seed)
     live, out = Live(ARX(1, 1, nk=0, start="zero"), tracker), np.zeros(T)
-    u = 1.0  # a first move, to learn the sign of the gain
+    u = 1.0  # a first input, to learn the sign of the gain
     y = gain(0, late) * u + NOISE * rng.standard_normal()
     for t in range(T):
         ref = 1.0 if t // 15 % 2 else -1.0
-        live.update(y, u)  # y_t, which the input before it made
+        live.update(y, u)  # y_t, the response to the previous input
         u = float(np.clip(law(live.theta, live.cov, y, ref), -10.0, 10.0))
         y = 0.9 * y + gain(t, late) * u + NOISE * rng.standard_normal()
         out[t] = (y - ref) ** 2

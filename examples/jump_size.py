@@ -1,7 +1,7 @@
-"""How much the size of a jump matters that a bank is told: errors with sizes that are wrong by 3 and by 10.
+"""The effect of the jump size that a bank assumes: errors with sizes that are wrong by factors of 3 and 10.
 
-Prints the error of the parameters after 200 samples for 20 simulated records with rare jumps, over that of the bank
-that was told the true size, and beside it the Kalman filter with the best ratio of drift to noise for these records.
+Prints the error of the parameters after 200 samples for 20 simulated records with rare jumps, divided by that of the
+bank with the true size, and the same for the Kalman filter with the best ratio of drift to noise for these records.
 Usage: jump_size.py
 """
 
@@ -21,7 +21,7 @@ def error(tracker, records):
 
 
 def bank(factor):
-    """A bank that takes jumps for ``factor`` times as large as they are."""
+    """A bank that assumes jumps ``factor`` times as large as they are."""
     return Bank(changes=[Change(0.0), Change((factor * JUMP) ** 2, prob=RATE)])
 
 

@@ -1,7 +1,7 @@
-"""Parameters that jump: what a bank of hypotheses says, and when.
+"""Parameters that jump: the events that a bank of hypotheses detects, and their dates.
 
-Prints the events that were found and the segments between them; saves pictures, of parameters with the probabilities
-of events under them, of the segments, and of the tree while a jump is being decided.
+Prints the detected events and the segments between them; saves plots of the parameters with the probabilities of
+events, of the segments, and of the tree while a jump is being decided.
 Run: python examples/jumps.py [folder]
 """
 
@@ -14,7 +14,7 @@ from driftfit import ARX, Bank, Change, Decide, Live, Sensor, piecewise, plot_tr
 
 
 def simulate(T: int = 400, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """y_t = a y_{t-1} + b u_{t-1} + noise: b doubles at 150, both move at 280; the sensor spikes at 90 and 210."""
+    """y_t = a y_{t-1} + b u_{t-1} + noise: b doubles at 150, both change at 280; the sensor spikes at 90 and 210."""
     rng = np.random.default_rng(seed)
     u, x = rng.standard_normal(T), np.zeros(T)
     for t in range(1, T):

@@ -1,6 +1,6 @@
-"""A tracker of one's own, in full: least mean squares in the sign of the error, and what the contract says of it.
+"""A complete tracker of your own: least mean squares in the sign of the error, and the result of the contract checks.
 
-Run: python examples/own_tracker.py, or from a shell in this folder, over a table of one's own,
+Run: python examples/own_tracker.py, or from a shell in this folder, over your own table,
 driftfit track data.csv --y flow --u pressure --with own_tracker:SignLMS -p gain=0.02
 """
 
@@ -56,7 +56,7 @@ class SignLMS(Tracker):
 
 @kernel
 def careless(s: State, l: int) -> None:
-    """The same with two mistakes: s.ok is forgotten, and the regressor's size is read in lane 0."""
+    """The same with two mistakes: s.ok is forgotten, and the size of the regressor is read from lane 0."""
     s.y_hat[l] = prediction(s, l)
     s.e[l] = s.y[l] - s.y_hat[l]
     s.s[l] = np.nan
@@ -73,7 +73,7 @@ class Careless(SignLMS):
 
 
 def simulate(T: int = 1000, seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """A first-order system with a gain that falls, and one output in fifty far off."""
+    """A first-order system with a decreasing gain, and one output in fifty far off."""
     rng = np.random.default_rng(seed)
     u, gain = rng.normal(size=T), np.linspace(2.0, 1.0, T)
     y = np.zeros(T)

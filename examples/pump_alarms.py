@@ -1,8 +1,8 @@
 """Alarms on a pump loop with labelled faults: an inlet valve that closes, a rotor out of balance.
 
-The flow is followed as a regression on pressure and motor current. The first part of each record, before anything is
-wrong, is the reference; then each kind of alarm is scored against the labels: which faults are found, after how long,
-and how many alarms begin where nothing is wrong.
+The flow is a regression on pressure and motor current. The first part of each record, before the fault, is the
+reference; each kind of alarm is then scored against the labels: which faults are found, after how long, and how many
+alarms begin where nothing is wrong.
 
 The record is not part of the project: SKAB by waico (GPL-3), as one CSV file with the columns experiment, current_A,
 pressure_bar, flow_lpm and anomaly. Run: python examples/pump_alarms.py FILE [FOLDER FOR FIGURES]
@@ -35,7 +35,7 @@ def records(path: str) -> dict[str, pl.DataFrame]:
 def followed(part: pl.DataFrame, reference: int) -> Track:
     """Flow (l/min) on pressure (bar) and current (A), each about its mean in the reference.
 
-    Drift and noise are the most likely ones of the reference; the flow meter counts in steps, whose noise is the least.
+    Drift and noise are maximum-likelihood estimates from the reference; the noise is not below that of the steps.
     """
     y = part["flow_lpm"].to_numpy()
     u = part.select("pressure_bar", "current_A").to_numpy()

@@ -1,4 +1,4 @@
-"""Sixteen pumps in one table: different lengths, a day with rows out of order, readings missing, three that wear.
+"""Sixteen pumps in one table: different lengths, unsorted rows on one day, missing readings, three pumps that wear.
 
 Prints the ranking of the fleet and saves small multiples. Run: python examples/pump_fleet.py [picture.png]
 """

@@ -1,9 +1,9 @@
-"""The pump loop: valves that close, a rotor out of balance, and what a bank of hypotheses makes of it.
+"""The pump loop: valves that close, an unbalanced rotor, and the results of a bank of hypotheses.
 
-flow_t on pressure, current and a constant; settings are fixed beforehand (`Bank()` and nothing else). Prints, for every
-experiment, one-step errors beside persistence, a Kalman filter with numbers tuned on the first 200 samples, and RLS;
-coverage of the 95 % band; and alarms against the labels: by the probability of a jump at one instant, which is a poor
-alarm where valves take a minute to close, and by the window. The record (SKAB, GPL-3) is not part of this project.
+flow_t on pressure, current and a constant; settings are fixed beforehand (`Bank()` without arguments). Prints for every
+experiment the one-step errors, and those of persistence, a Kalman filter tuned on the first 200 samples, and RLS;
+the coverage of the 95 % band; and alarms against the labels: by the probability of a jump at one instant, which is a
+poor alarm for valves that take a minute to close, and by the window. The record (SKAB, GPL-3) is not in this project.
 Run: python examples/pump_loop_jumps.py pump_loop_skab.csv [folder]
 """
 
@@ -17,7 +17,7 @@ from driftfit import RLS, Bank, Beam, Kalman, Regression, Track, track, tune
 
 REGRESSORS = ["pressure_bar", "current_A"]
 TUNING, REACH = 200, 60
-"""Samples for tuning, and how long after a label an alarm still counts as caused by it."""
+"""Samples for tuning, and the time after a label in which an alarm still belongs to it."""
 
 
 def rms(values: np.ndarray) -> float:
@@ -25,7 +25,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def detection(on: np.ndarray, anomaly: np.ndarray) -> tuple[int, int, float]:
-    """(stretches found, stretches, false alarms per 1000 samples outside of them)."""
+    """(intervals found, intervals, false alarms per 1000 samples outside of them)."""
     edges = np.flatnonzero(np.diff(np.r_[0, anomaly, 0]))
     stretches = edges.reshape(-1, 2)
     onset = np.flatnonzero(on & ~np.r_[False, on[:-1]])

@@ -1,9 +1,9 @@
 """Three real records: a river, a heated building, and a gas furnace that hardly drifts.
 
-The first half of each record chooses the drift and the noise, once by likelihood and once by one-step error; the second
-half is scored, one step ahead, beside what one would otherwise do.
+The first half of each record determines the drift and the noise, once by likelihood and once by one-step error. The
+second half is scored, one step ahead, and compared with simpler methods.
 
-The records are not part of the project. The folder must hold river_leguer.csv (INRAE, an example catchment of GR4J),
+The records are not part of the project. The folder must contain river_leguer.csv (INRAE, an example catchment of GR4J),
 building_heating.csv (from darkgreybox) and gas_furnace.csv (Box and Jenkins, series J).
 
 Run: python examples/real_records.py FOLDER [FOLDER FOR FIGURES]
@@ -24,12 +24,12 @@ from driftfit.judge.compare import persistence
 from driftfit.run.result import root_mean_square
 
 RATIOS = (0.0, *(10.0 ** np.arange(-7.0, 2.1, 0.5)).tolist())
-"""What the drift of one sample adds to the variance of y through one parameter, in units of r; the same for all."""
+"""Variance that the drift of one sample adds to y through one parameter, in units of r; the same for all."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A model of y (T,) on u (T, m); ``level`` and ``inputs`` are what persistence and constant ARX predict from."""
+    """A model of y (T,) on u (T, m); persistence and constant ARX predict from ``level`` and ``inputs``."""
 
     name: str
     model: Model
@@ -57,7 +57,7 @@ def building(folder: Path) -> Case:
 
 
 def building_arx(folder: Path) -> Case:
-    """The same temperature by a model that knows no physics: two lags of it, one of every input."""
+    """The same temperature by a model without physics: two lags of it, one of every input."""
     case = building(folder)
     model = ARX(2, 1, inputs=["outdoors", "heating water", "power"], intercept=True)
     return Case("building, ARX", model, case.level, case.inputs, case.level, case.inputs)
@@ -81,7 +81,7 @@ def sizes(case: Case, half: int) -> np.ndarray:
 
 
 def fit(case: Case, ratio: float, half: int) -> Track:
-    """The first half with q_i = ratio r / size_i and the most likely r: at r = 1 the mean of e^2 / s."""
+    """The first half with q_i = ratio r / size_i and the maximum-likelihood r: the mean of e^2 / s at r = 1."""
     y, u, q = case.y[:half], case.u[:half], ratio / sizes(case, half)
     unit = track(case.model, Kalman(q=q, r=1.0), y, u)
     counted = unit.ok & np.isfinite(unit.innovation_std)
@@ -94,7 +94,7 @@ def likelihood(run: Track) -> float:
 
 
 def error(run: Track) -> float:
-    """The one-step error after the start, with its sign turned so that more is better."""
+    """Minus the one-step error after the start, so that more is better."""
     return -root_mean_square(run.innovation[max(50, 5 * run.model.n) :][run.ok[max(50, 5 * run.model.n) :]])
 
 

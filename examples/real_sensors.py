@@ -1,5 +1,5 @@
-"""What sensors of a plant do, simulated: an input that stands still, fault codes, a coarse meter, a switching arc; and
-parameters that walk, smoothed.
+"""Typical sensors of a plant, simulated: a constant input, fault codes, a coarse meter, a switching arc; and the
+smoothing of random walks.
 
 Prints the tables of docs/real_sensors.md. Run: python examples/real_sensors.py
 """
@@ -10,7 +10,7 @@ import warnings
 
 import numpy as np
 
-from driftfit import ARX, RLS, AdaptiveKalman, Kalman, Regression, Track, Tracker, track
+from driftfit import ARX, RLS, AdaptiveKalman, Bank, Kalman, Regression, Track, Tracker, track
 from driftfit.extend import Array
 from driftfit.systems.arc_furnace import switching
 
@@ -28,16 +28,16 @@ def idle() -> None:
     x, v = rng.normal(size=T), 0.1 * rng.normal(size=T)
     y = np.where(np.arange(T) < 1000, 1.0, 2.0) * x + v
     print("An input that stands still: response to x, 2 after a jump, at the end")
-    print(f"  {'second column':18}{'AdaptiveKalman':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
+    print(f"  {'second column':16}{'AdaptiveKalman':>22}{'Bank()':>22}{'RLS(0.98)':>22}{'Kalman':>22}")
     for name, second in (("moves too", rng.normal(size=T)), ("stays at 0", np.zeros(T)), ("is x again", x)):
         cells = []
-        for tracker in (AdaptiveKalman(), FORGET, WALK):
+        for tracker in (AdaptiveKalman(), Bank(), FORGET, WALK):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 run = track(Regression(2), tracker, y, np.column_stack([x, second]))
             both = name == "is x again"
             cells.append(f"{run.theta[-1].sum() if both else run.theta[-1, 0]:.3f} (std {run.std[-1, 0]:.3f})")
-        print(f"  {name:18}" + "".join(f"{cell:>22}" for cell in cells))
+        print(f"  {name:16}" + "".join(f"{cell:>22}" for cell in cells))
 
 
 def codes() -> None:
@@ -60,7 +60,7 @@ def codes() -> None:
 
 
 def coarse() -> None:
-    """A flow of 32 +- 2 read in whole numbers."""
+    """A flow of 32 +- 2 read in integers."""
     rng = np.random.default_rng(2)
     x = np.repeat(rng.normal(size=T // 20), 20)
     u = np.column_stack([x, np.ones(T)])
@@ -78,7 +78,7 @@ def coarse() -> None:
 
 
 def arcs() -> None:
-    """i = g u, g between 0.02 and 4 in turn."""
+    """i = g u, with g alternating between 0.02 and 4."""
     print("\nA conductance that switches between 0.02 and 4: rms error of g u")
     names = ("AdaptiveKalman", "RLS(0.998)", "RLS(0.98)", "Kalman")
     print(f"  {'half period':18}" + "".join(f"{name:>16}" for name in names))
@@ -92,7 +92,7 @@ def arcs() -> None:
 
 
 def smoothing() -> None:
-    """Both parameters walk, in noise of standard deviation 0.3; 20 records of 500 samples."""
+    """Both parameters are random walks, in noise of standard deviation 0.3; 20 records of 500 samples."""
     print("\nParameters that walk, 20 records: rms error, and share of the truth in 95 % bands")
     print(f"  {'step':18}{'followed':>16}{'smoothed':>16}")
     for step in (0.01, 0.03, 0.1):

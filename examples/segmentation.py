@@ -1,8 +1,8 @@
 """Segments of whole records: two jumps of a mean, with outliers, with correlated noise.
 
-Prints how many of the jumps are found within 20 samples, how many breaks are false, and how often the interval holds
-the true date. With a folder the same of
-ruptures, where it is installed, found and false, and a picture.
+Prints how many of the jumps are found within 20 samples, how many breaks are false, and how often the interval contains
+the true date. With a folder it also prints the counts of found and false breaks of ruptures, if it is installed, and
+draws a figure.
 Run: python examples/segmentation.py [records, 20 by default] [folder]
 """
 

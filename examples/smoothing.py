@@ -19,7 +19,7 @@ TWO = Regression(["gain", "offset"])
 
 
 def random_walk(seed: int, T: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two coefficients with steps of 0.05, seen in noise of 0.5: the model is true with mu = 100."""
+    """Two coefficients with steps of 0.05, observed in noise of 0.5: the model is true with mu = 100."""
     rng = np.random.default_rng(seed)
     theta = np.cumsum(0.05 * rng.standard_normal((T, 2)), axis=0)
     phi = np.column_stack([rng.standard_normal(T), np.ones(T)])
@@ -57,7 +57,7 @@ def table(title: str, head: list[str], rows: list[list[str]]) -> None:
 
 
 def lags() -> None:
-    """What waiting buys: errors and coverage of the filter, of every lag and of the smoother."""
+    """The value of waiting: errors and coverage of the filter, of every lag and of the smoother."""
     waits = (0, 1, 2, 5, 10, 20)
     errors: dict[str, list[float]] = {str(k): [] for k in (*waits, "whole record")}
     inside: dict[str, list[float]] = {name: [] for name in errors}
@@ -110,7 +110,7 @@ def robust() -> None:
 
 
 def sweeps() -> None:
-    """How far the sweeps of the augmented smoother are from the exact path, and when they arrive."""
+    """Distance of the sweeps of the augmented smoother from the exact path, and when they converge."""
     k = np.arange(1, 31)
     phi = np.column_stack([np.sin(10 + k) + 0.01, np.cos(10 + k)])
     theta = np.column_stack([np.sin(2 * np.pi * k / 15), np.cos(np.pi * k / 15)])
@@ -151,7 +151,7 @@ def forecasts() -> None:
 
 
 def trending(seed: int, T: int = 300, ahead: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two coefficients that swing slowly, seen in noise of 0.3."""
+    """Two coefficients that oscillate slowly, observed in noise of 0.3."""
     rng = np.random.default_rng(seed)
     t = np.arange(T + ahead)
     theta = np.column_stack([np.sin(2.0 * np.pi * t / 200.0 + rng.uniform(0.0, 6.0)), 0.5 + 0.004 * t])
@@ -160,7 +160,7 @@ def trending(seed: int, T: int = 300, ahead: int = 20) -> tuple[np.ndarray, np.n
 
 
 def differences() -> None:
-    """First and second differences, each with the mu of maximum likelihood, where they suit and where they do not."""
+    """First and second differences, each with the mu of maximum likelihood, where they are suitable and where not."""
     rows = []
     truths = {"swings slowly": trending, "walks at random": lambda seed: random_walk(seed, 320)}
     for name, make in truths.items():
@@ -181,7 +181,7 @@ def differences() -> None:
 
 
 def maintained(seed: int, T: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A gain that only changes at sample 150, on maintenance, beside an offset that drifts; and what is known of it."""
+    """A gain that changes only at sample 150, at maintenance, and an offset that drifts; with the known drift."""
     rng = np.random.default_rng(seed)
     theta = np.column_stack([np.where(np.arange(T) < 150, 1.0, 1.6), np.cumsum(0.05 * rng.standard_normal(T))])
     phi = np.column_stack([rng.standard_normal(T), np.ones(T)])
@@ -191,7 +191,7 @@ def maintained(seed: int, T: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def known_changes() -> None:
-    """A drift for every step and parameter against one that maximum likelihood finds for each parameter."""
+    """A drift for every step and parameter, and one that maximum likelihood estimates for each parameter."""
     found: dict[str, list[list[float]]] = {}
     for seed in range(SEEDS):
         phi, y, theta, drift = maintained(seed)
@@ -243,7 +243,7 @@ def pictures(folder: Path) -> None:
 
 
 def second_differences() -> Figure:
-    """The first coefficient of a slow swing, smoothed and forecast with first and with second differences."""
+    """The first coefficient of a slow oscillation, smoothed and forecast with first and with second differences."""
     phi, y, theta = trending(1, ahead=60)
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True, sharey=True)

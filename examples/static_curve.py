@@ -1,6 +1,6 @@
 """A static curve before a linear system, recovered from the coefficient of its input.
 
-y_t = 0.5 y_{t-1} + f(u_{t-1}) + noise with f(u) = u + 0.5 u^3 and white u. Seen as ARX(1, 1) the coefficient of the
+y_t = 0.5 y_{t-1} + f(u_{t-1}) + noise with f(u) = u + 0.5 u^3 and white u. As an ARX(1, 1) model the coefficient of the
 input is f(u) / u: it jumps in time and is smooth along u. Run: python examples/static_curve.py [picture.png]
 """
 
@@ -17,7 +17,7 @@ from driftfit.systems.time_varying import hammerstein
 def main(picture: str | None = None) -> None:
     rng = np.random.default_rng(5)
     d = hammerstein(rng.uniform(-1.5, 1.5, 300), lambda u: u + 0.5 * u**3, rng=rng)
-    before = np.concatenate([[0.0], d.u[:-1, 0]])  # the input that the output answers to
+    before = np.concatenate([[0.0], d.u[:-1, 0]])  # the input that acts on the output
     curves = {}
     for label, order in (("in time", None), ("along the input", before)):
         with warnings.catch_warnings():

@@ -1,6 +1,6 @@
-"""Settings from a record: two coefficients, one that walks and one that stands still.
+"""Settings from a record: two coefficients, one a random walk and one constant.
 
-Prints what each criterion finds and saves the pictures. Run: python examples/tuning.py [folder for pictures]
+Prints the estimates of each criterion and saves plots. Run: python examples/tuning.py [folder for pictures]
 """
 
 import sys
@@ -12,7 +12,7 @@ from driftfit import FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, tune
 
 
 def simulate(T: int = 500, seed: int = 4) -> tuple[np.ndarray, np.ndarray]:
-    """y = theta1 u1 + theta2 u2 + noise: theta1 walks with q = 0.01, theta2 stays, r = 0.25."""
+    """y = theta1 u1 + theta2 u2 + noise: theta1 is a random walk with q = 0.01, theta2 is constant, r = 0.25."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(T, 2))
     theta = np.stack([np.cumsum(0.1 * rng.normal(size=T)), np.full(T, 1.0)], axis=1)

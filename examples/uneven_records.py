@@ -1,7 +1,7 @@
-"""Two real records as they come: a pump loop with uneven time, and gas sensors with missing readings.
+"""Two real records as recorded: a pump loop with uneven time, and gas sensors with missing readings.
 
-pump_loop_skab.csv (SKAB, three experiments, one row a second with steps of two) and air_quality_sensors.csv (UCI Air
-Quality, one row an hour) are not part of this package. Run: python examples/uneven_records.py FOLDER [FIGURES]
+pump_loop_skab.csv (SKAB, three experiments, one row per second with steps of two) and air_quality_sensors.csv (UCI Air
+Quality, one row per hour) are not part of this package. Run: python examples/uneven_records.py FOLDER [FIGURES]
 """
 
 import sys

@@ -18,7 +18,7 @@ def simulate(T: int = 600, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.nd
     flow = np.zeros(T)
     for t in range(1, T):
         flow[t] = 0.7 * flow[t - 1] + gain[t] * pressure[t - 1] + 0.05 * rng.normal()
-    flow[100:103] = np.nan  # a sensor that was away for three samples
+    flow[100:103] = np.nan  # a sensor that fails for three samples
     return flow, pressure, gain
 
 

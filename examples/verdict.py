@@ -1,6 +1,6 @@
-"""The verdict on three systems: nothing moves, nothing moves in noise that changes, and one gain that doubles.
+"""The verdict on three systems: constant parameters, constant parameters in changing noise, and a gain that doubles.
 
-Prints what the verdict says and saves the one-page diagnosis of the third.
+Prints the verdicts and saves the one-page diagnosis of the third.
 Run: python examples/verdict.py [folder for pictures]
 """
 
@@ -15,7 +15,7 @@ T = 600
 
 
 def simulate(gain: np.ndarray, noise: np.ndarray, seed: int = 1) -> Track:
-    """y_t = 1.2 y_(t-1) - 0.5 y_(t-2) + gain_t u_(t-1) + 0.4 u_(t-2) + noise, followed with a little drift."""
+    """y_t = 1.2 y_(t-1) - 0.5 y_(t-2) + gain_t u_(t-1) + 0.4 u_(t-2) + noise, tracked with a little drift."""
     rng = np.random.default_rng(seed)
     u, v = rng.normal(size=T), noise * rng.normal(size=T)
     y = np.zeros(T)

@@ -1,1 +1,1 @@
-"""The laboratory: what shows that the library is right and fast, and is not part of it. Run as `python -m lab`."""
+"""The laboratory: checks of accuracy and speed that are not part of the library. Run as `python -m lab`."""

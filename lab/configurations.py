@@ -1,8 +1,8 @@
-"""Random configurations of the library's public face, each a function that runs one and returns named arrays.
+"""Random configurations of the library's public interface, each a function that runs one and returns named arrays.
 
 They cover every tracker in every form, the models, the reductions of a bank, several outputs, fleets, grids, uneven
-time, weights, known drift, warm starts, saved and loaded states, streams, and records with holes. Only the public face
-is used, so that they say the same before and after the inside is rebuilt.
+time, weights, known drift, warm starts, saved and loaded states, streams, and records with missing data. Only the
+public interface is used, so they give the same results before and after an internal change.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ EVERY_PART: dict[str, Any] = {
     "FirstFloor, prior": Bank(CHANGES, [Sensor.nominal(r=0.01)], reduce=FirstFloor(3, "prior"), p0=2.0),
     "lags for certain": Bank(CHANGES, FAULTS, MARKOV, reduce=Beam(6), p0=2.0, lag_variance=False),
 }
-"""Banks that between them use every part of the compiled routine, in both forms."""
+"""Banks that together use every part of the compiled routine, in both forms."""
 BLOCKS = HammersteinWiener(na=1, nb=1, input=Polynomial(2), output=Polynomial(2))
 
 
@@ -115,12 +115,12 @@ def signals(seed: int, m: int = 1, ny: int = 1, holes: bool = True) -> tuple[np.
 
 
 def written(run: Any) -> Arrays:
-    """What a run reports, and its likelihood."""
+    """The results of a run, and its likelihood."""
     return {name: np.asarray(getattr(run, name)) for name in WRITTEN} | {"loglik": np.asarray(run.loglik)}
 
 
 def smoothed(run: Any) -> Arrays:
-    """What its smoother reports."""
+    """The results of its smoother."""
     path = run.smooth()
     return {"smoothed theta": np.asarray(path.theta), "smoothed std": np.asarray(path.std)}
 
@@ -153,7 +153,7 @@ def of_stream(model: Any, tracker: Any, seed: int) -> Configuration:
 
 
 def of_warm_start(model: Any, tracker: Any, seed: int) -> Configuration:
-    """The second half of a record, begun where the first ended."""
+    """The second half of a record, continued from the first."""
 
     def run() -> Arrays:
         y, u = signals(seed, m=model.m)

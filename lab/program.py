@@ -30,7 +30,7 @@ out = Console(highlight=False)
 
 @contextmanager
 def helpful() -> Iterator[None]:
-    """Turn what a user can put right into one line and exit code 2."""
+    """Turn errors that a user can correct into one line and exit code 2."""
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
@@ -43,7 +43,7 @@ def helpful() -> Iterator[None]:
     help=f"Reproduce a paper: {', '.join(reproductions())}. Options: python -m lab reproduce NAME --help.",
 )
 def reproduce(context: typer.Context, name: Annotated[str, typer.Argument(help="Which one.")] = "--help") -> None:
-    """Run one of the reproductions with the options that it has itself."""
+    """Run one of the reproductions with its own options."""
     if name == "--help":
         out.print(f"python -m lab reproduce {{{','.join(reproductions())}}} [--help]", markup=False)
         return

@@ -1,6 +1,6 @@
-"""Does the library still say the same, to the last bit? For work on the inside that may change nothing outside.
+"""Does the library still give the same results, to the last bit? A check for internal changes.
 
-    python -m lab same-numbers record FOLDER      run every configuration, keep what it reports
+    python -m lab same-numbers record FOLDER      run every configuration and store its results
     python -m lab same-numbers compare FOLDER     run them again and compare bit for bit
 
 Keep FOLDER outside the checkout. The numbers belong to one processor and one set of packages.
@@ -27,12 +27,12 @@ Only = Annotated[str, typer.Option(help="Only configurations whose name contains
 
 
 def file_of(name: str) -> str:
-    """A name for the file of a configuration that any disk takes."""
+    """A file name for a configuration that is valid on any disk."""
     return hashlib.sha256(name.encode()).hexdigest()[:16] + ".npz"
 
 
 def outcome(run: Configuration) -> Arrays:
-    """What a configuration reports; an error is an outcome too."""
+    """The results of a configuration; an error is a result too."""
     try:
         return run()
     except Exception as error:
@@ -57,7 +57,7 @@ def chosen(only: str) -> list[tuple[str, Configuration]]:
 
 @app.command()
 def record(folder: Folder, only: Only = "") -> None:
-    """Run every configuration and keep what it reports."""
+    """Run every configuration and store its results."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, run in with_progress(chosen(only), "recording", console=err):
         arrays = outcome(run)
@@ -68,7 +68,7 @@ def record(folder: Folder, only: Only = "") -> None:
 
 @app.command()
 def compare(folder: Folder, only: Only = "") -> None:
-    """Run them again; exit with 1 where a bit differs."""
+    """Run them again; exit with 1 if a bit differs."""
     wrong = 0
     ran = chosen(only)
     for name, run in with_progress(ran, "comparing", console=err):

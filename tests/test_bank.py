@@ -95,7 +95,7 @@ def test_without_reduction_it_is_the_joint_gaussian_of_every_sequence(prior):
         logs.append(prior_log + dense)
     evidence = np.logaddexp.reduce(logs)
     assert told(run, "evidence").sum() == pytest.approx(evidence, abs=1e-10)
-    got = state(run, "B")[0, : 6**K]
+    got = state(run, "leaves")[0, : 6**K]
     np.testing.assert_allclose(np.sort(got), np.sort(np.array(logs) - evidence), atol=1e-10)
 
 

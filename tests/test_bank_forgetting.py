@@ -161,7 +161,7 @@ def test_prediction_does_not_depend_on_the_sample_being_there():
         (lambda: Change(forget=0.9, kind="stabilised", anchor=0.0), "positive definite"),
         (lambda: Change(1.0, forget=0.9, reset=True), "not both"),
         (lambda: Change(forget=0.9, kind="linear"), "exponential"),
-        (lambda: bank(Change(1.0, reset=True)), "ordinary course"),
+        (lambda: bank(Change(1.0, reset=True)), "normal course"),
         (lambda: bank(Change(forget=0.9), reduce=FirstFloor(2)), "random walks only"),
     ],
 )

@@ -1,6 +1,6 @@
 """Outages and long intervals are floors of the tree; loglik is the log evidence; fault codes are survived."""
 
-from itertools import pairwise, product
+from itertools import product
 from math import comb
 
 import naive_bank
@@ -83,15 +83,15 @@ def test_what_is_reported_in_a_gap_is_all_that_may_have_happened():
 
 @pytest.mark.parametrize("sensors", [None, "markov"])
 def test_a_stream_in_a_gap_says_what_the_record_says(sensors, tmp_path):
-    y, u = record(60, 5, (35,))
+    y, u = record(90, 5, (35,))  # long enough for a stream to tell of the jump
     y[30:40], u[42] = np.nan, np.nan
     bank = Bank(changes(), KNOWN, reduce=Beam(6), p0=2.0)
     if sensors:
         two = [*KNOWN, Sensor.outlier(10.0)]
         bank = Bank(changes(), two, (None, [[0.95, 0.05], [0.5, 0.5]]), Hybrid(6), p0=2.0)
-    time = np.cumsum(np.where(np.arange(60) % 17 == 0, 6.0, 1.0))
+    time = np.cumsum(np.where(np.arange(90) % 17 == 0, 6.0, 1.0))
     run, live, found = track(Regression(N), bank, y, u, time=time), Live(Regression(N), bank), []
-    for t in range(60):
+    for t in range(90):
         live.update(y[t], u[t], time=time[t])
         found += live.hypotheses.events()
         assert same(live.theta, run.theta[t]), t
@@ -105,9 +105,9 @@ def test_a_stream_in_a_gap_says_what_the_record_says(sensors, tmp_path):
     assert event.span.first <= 35 <= event.span.last
     assert event.first == time[event.span.first] <= time[35] <= event.last
     assert event.level == 0.95
-    early = [event for event in found if event.kind == "change"]
-    if early:  # told as soon as it can be, if the stream is long enough
-        assert early[0].date == pytest.approx(time[early[0].span.date])
+    (streamed,) = (event for event in found if event.kind == "change")
+    assert streamed.date == time[streamed.span.date]
+    assert 30 <= streamed.span.date <= 41
 
 
 def test_jumps_in_an_outage_are_found():
@@ -212,7 +212,6 @@ def test_transitions_may_vary_in_time():
         assert same(live.theta, run.theta[t])
     with pytest.raises(ValueError, match="rows of a chain"):
         track(Regression(N), bank, y, u, prob=Pt * 0.5)
-    assert [(a, b) for a, b in pairwise(Pt.shape)] == [(40, 3), (3, 3)]
 
 
 def test_a_chain_goes_on_over_an_interval():
@@ -246,13 +245,10 @@ def test_one_fault_code_is_survived(code):
 
 def test_the_bound_of_a_beam_is_found_among_large_numbers():
     """The bits of two numbers above 2 overflow when they are added."""
-    from driftfit.trackers.bank.machine import selection
+    from driftfit.trackers.bank.reducing import selection
 
-    values = np.zeros((1, 72))
+    values, M = np.zeros((1, 72)), 45
     values[0, :66] = np.r_[np.full(40, 4.0), np.linspace(2.0, 3.0, 26)]
-    with np.errstate(all="raise"):
-        M, low, high = 45, np.int64(1), np.int64(0x7FF0000000000000)
-        assert 0 < low + (high - low) // 2 < high
     from driftfit.engine.kernel import Driver
 
     bound = selection.bound

@@ -1,6 +1,7 @@
 """Identities of banks: unknown noise, scale, order of hypotheses, merging, and the price of waiting."""
 
 import math
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -11,16 +12,24 @@ from test_bank import P3, PROBS, N, Q, R, changes, record, state, told
 from driftfit import Bank, Regression, track
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
-from driftfit.trackers.bank.machine import lookahead, merge
+from driftfit.trackers.bank.reducing import lookahead, merge
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide
 from driftfit.trackers.bank.sensor import Sensor
 
 Y, U = record(60, 11, (25,))
 
 
+Table = namedtuple("Table", "leaves parents n output_lags unknown")
+"""As much of a bank's table as merging asks for."""
+
+
 @njit
+def match(t, members, share):
+    merge.match(t, members, share, 0, t.parents)
+
+
 def matched(B, members, unknown, share, A):
-    merge.match(B, members, 2, 0, unknown, share, A, 0, A)
+    match(Table(B, A, 2, 0, int(unknown)), members, share)
 
 
 @njit
@@ -141,7 +150,7 @@ def test_weights_sum_to_one_for_a_long_time():
     rng = np.random.default_rng(6)
     u = rng.standard_normal((20_000, N))
     run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=GPB(2), p0=1e10), u @ [1.0, 2.0], u)
-    w = state(run, "B")[WEIGHT, :9]
+    w = state(run, "leaves")[WEIGHT, :9]
     assert w.sum() == pytest.approx(1.0, abs=1e-12)
     assert np.isfinite(run.theta).all()
 

@@ -80,3 +80,27 @@ def test_smoothing_beats_filtering():
     run = track(Regression(N), Bank(), Y, U)
     truth = np.repeat(piecewise(run, [40, 90]).theta, [40, 50, 30], axis=0)
     assert np.abs(run.smooth().theta - truth).mean() < np.abs(run.theta - truth).mean()
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_bands_of_the_smoothed_path_hold_where_parameters_walk(unit):
+    """Random walks of 0.05 in noise 0.5: between events `Bank()` has next to no drift, and covered a quarter."""
+    covered, widened = [], []
+    for seed in range(15):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal((400, N))
+        theta = 1.0 + np.cumsum(0.05 * rng.standard_normal((400, N)), axis=0)
+        y = unit * ((u * theta).sum(axis=1) + 0.5 * rng.standard_normal(400))
+        smoothed = track(Regression(N), Bank(), y, u).smooth()
+        low, high = smoothed.band(0.95)
+        covered.append(((low < unit * theta) & (unit * theta < high))[20:].mean())
+        widened.append(smoothed.widened)
+    assert np.mean(covered) > 0.85
+    assert np.median(widened) > 10.0
+
+
+def test_a_drift_that_was_given_is_kept():
+    run = track(Regression(N), Bank(changes(), KNOWN, p0=2.0), Y, U)
+    assert run.smooth().widened == 1.0
+    steady = track(Regression(N), Bank(), Y, U).smooth()
+    assert steady.widened < 30.0  # two jumps and nothing else

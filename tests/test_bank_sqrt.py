@@ -16,7 +16,8 @@ from driftfit.trackers.bank.leaves import leaves
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.factored import product as multiplied
 from driftfit.trackers.bank.leaves.leaves import FIRST
-from driftfit.trackers.bank.machine import merge, start
+from driftfit.trackers.bank.machine import start
+from driftfit.trackers.bank.reducing import merge
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 from driftfit.trackers.bank.sensor import Sensor
 
@@ -180,7 +181,7 @@ def test_every_leaf_stays_positive_for_long(settings):
     for t in range(length):
         live.update(y[t], u[t])
         if t % 50 == 0 or t < 50:
-            D = live.tracker.array(live.model, live.lane(), "B")[
+            D = live.tracker.array(live.model, live.lane(), "leaves")[
                 [FIRST + 2, FIRST + 4], : int(run.hypotheses.leaves[t])
             ]
             assert (D > 0.0).all(), t

@@ -44,7 +44,7 @@ def fade(s, l):
 
 @kernel
 def always(s, l):
-    """Learns from every sample, also those that are not to be used."""
+    """Learns from every sample, also from those that must not be used."""
     s.ok[l] = 1.0
     follow(s, l)
 
@@ -148,10 +148,10 @@ def test_trackers_that_keep_their_promises(tracker):
 @pytest.mark.parametrize(
     ("tracker", "said"),
     [
-        (Fading(), ["with s.dt[l] = 0 predict changes nothing"]),
-        (Always(), ["must be a factor of the gain", "no time passes and nothing is used"]),
-        (Careless(), ["every field is used at [..., l]", "must be a factor of the gain"]),
-        (Bold(), ["poison theta"]),
+        (Fading(), ["with s.dt[l] = 0 predict must change nothing"]),
+        (Always(), ["must be a factor of the gain", "no time passes and no sample is used"]),
+        (Careless(), ["index every field with [..., l]", "must be a factor of the gain"]),
+        (Bold(), ["make theta not finite"]),
         (Hindsight(), ["depends on that output", "s.e is not"]),
         (Boastful(), ["It does not run"]),
         (Deaf(q=1e-4, r=0.01), ["drift_each = True"]),

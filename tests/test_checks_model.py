@@ -74,10 +74,10 @@ class Twice(ARX):
     ("kind", "said"),
     [
         (Short, "reach is 1, but signals of sample 30 are in the regressors of sample 33"),
-        (Proud, r"A missing u at sample 30 makes samples \[31, 32, 33\] unusable; declared are \[30\]"),
+        (Proud, r"A missing u at sample 30 makes samples \[31, 32, 33\] unusable; declared: \[30\]"),
         (Lagged, "output_lags is 2, but regressor 1 is not the output 2 samples before"),
         (Steep, "log_jacobian is not the logarithm of the slope of the innovation against y, which is 1"),
-        (Drawn, "play says"), (Fickle, "follows denies"), (Twice, "names must be 4 different names"),
+        (Drawn, "play gives"), (Fickle, "follows returns False"), (Twice, "names must be 4 different names"),
     ],
 )  # fmt: skip
 def test_wrong_declarations_are_said(kind, said):

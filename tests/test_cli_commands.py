@@ -101,7 +101,7 @@ def test_the_other_ways_to_write_a_table(table):
     piped = io.BytesIO()
     table.write_csv(piped)
     assert np.array_equal(theta("-", *SIGNALS[1:], stdin=piped.getvalue()), expected().theta[:, 1])
-    assert "one sign" in fails("track", *SIGNALS, "--separator", "::")
+    assert "one character" in fails("track", *SIGNALS, "--separator", "::")
     assert "point or a comma" in fails("track", *SIGNALS, "--decimal", ":")
 
 

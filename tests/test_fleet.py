@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from time import sleep
 
@@ -129,19 +129,19 @@ def test_mapping():
 
 def test_an_interrupt_keeps_what_is_finished(monkeypatch):
     y, u = rows(70, 50, seed=10)
-    drive, begun = fleets._drive, []
+    begun = []
 
-    def slow_after_the_first(job, records, stop):
-        begun.append(stop)
-        if begun.count(50) > 1:
-            sleep(0.2)
-        drive(job, records, stop)
+    class SlowAfterTheFirst(ThreadPoolExecutor):
+        def submit(self, work, *arguments):
+            begun.append(work)
+            wait = 0.2 if len(begun) > 1 else 0.0
+            return super().submit(lambda: (sleep(wait), work(*arguments)))
 
     def interrupted(waiting):
         yield next(iter(as_completed(waiting)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fleets, "_drive", slow_after_the_first)
+    monkeypatch.setattr(fleets, "ThreadPoolExecutor", SlowAfterTheFirst)
     monkeypatch.setattr(fleets, "as_completed", interrupted)
     monkeypatch.setattr(fleets, "cores", lambda: 1)
     with pytest.warns(UserWarning, match=r"interrupted: \d+ of 70 series are finished"):

@@ -154,7 +154,7 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
     said = fleet.detect("band", every=1000.0, reference=140)
     assert set(said.faulty) == set(said.alarmed) == {f"<{k}>" for k in MOVED}
     assert len(said) == 6
-    assert "too little" in said.failed["<6>"]
+    assert "too short" in said.failed["<6>"]
     alone = fleet["<1>"].detect("band", every=7000.0, reference=140)
     assert np.array_equal(said["<1>"].limits, alone.limits)
     assert np.array_equal(said["<1>"].onsets, alone.onsets)
@@ -218,7 +218,7 @@ def test_without_faults_few_series_are_accused():
         ({"every": "ten"}, "every"),
         ({"every": np.inf}, "every"),
         ({}, "normal range of the parameters"),
-        ({"reference": {}}, "names"),
+        ({"reference": {}}, "maps parameters"),
         ({"reference": {"b1[u]": 1.0}}, "low <= high"),
         ({"reference": {7: (0.0, 1.0)}}, "no parameter 7"),
         ({"reference": {"<1>": 140}}, "missing for <0>, <2>"),

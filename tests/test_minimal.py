@@ -202,7 +202,7 @@ def test_hand_off_continues_the_record():
     assert np.median(error[200:]) < 0.03
     first = found.first.blocks("gls")
     assert same(found.then.tracker.theta0, tuple(first.xi[-1]))
-    with pytest.raises(ValueError, match="leaves nothing"):
+    with pytest.raises(ValueError, match="leaves none"):
         hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, s.u, at=299)
     with pytest.raises(ValueError, match="no window"):
         hand_off(SMALL, K, ExtendedKalman(q=1e-6, r=1e-6), s.y, np.zeros(300))

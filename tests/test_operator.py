@@ -165,7 +165,7 @@ def test_resets_that_make_no_sense():
         live.reset(2, p=1.0)
     with pytest.raises(ValueError, match="p must be finite and at least 0"):
         live.reset("b1", p=-1.0)
-    with pytest.raises(ValueError, match="say p= "):
+    with pytest.raises(ValueError, match="give p= "):
         live.reset("b1")
     with pytest.raises(ValueError, match="AugmentedFLS carries no covariance that can be widened"):
         Live(MODEL, KINDS[2]).reset("b1", p=1.0)

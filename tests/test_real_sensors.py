@@ -1,5 +1,7 @@
 """Sensors of a plant: inputs that stand still, fault codes, coarse meters, arcs; and the adaptive smoother."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -306,27 +308,29 @@ def test_a_late_direction_enters_all_hypotheses_as_it_enters_the_kalman_filter(r
     np.testing.assert_allclose(live.hypotheses.mixture().cov[0, 0], leaves.cov[0, 0] + 1.0, rtol=1e-9)
 
 
-def test_the_density_of_a_sample_is_that_of_the_mixture():
+@pytest.mark.parametrize("step", [0.0, 0.5])
+def test_the_density_of_a_sample_is_that_of_the_mixture(step):
     """Against sums over modes and levels in numpy, and it integrates to 1 over what the next reading may be."""
     rng = np.random.default_rng(7)
     x = rng.normal(size=(400, 2))
     y = x @ [1.0, 0.5] + 0.1 * rng.normal(size=400)
     y[200:] += x[200:, 0]
     y[300] += 5.0
+    y, first = (np.round(y / step) * step, 100) if step else (y, 20)  # the quantum is known from the 100th on
     live = Live(Regression(2), AdaptiveKalman())
     run = track(Regression(2), AdaptiveKalman(), y, x)
-    for t in range(400):
+    for t in range(320):
         lane = {name: np.array(value) for name, value in live.lane().items()}
         live.update(y[t], x[t])
-        if t < 20:
+        if t < first:
             continue
         log_density = np.log(naive_density(lane, x[t], y[t]))
         np.testing.assert_allclose(run.log_density[t], log_density, rtol=1e-9, atol=1e-9)
-        if t in (25, 201, 301):
+        if t in (110, 201, 301):
             grid = y[t] + np.sinh(np.linspace(-16.0, 16.0, 200001)) * 1e-3
             density = naive_density(lane, x[t], grid)
             assert abs(np.trapezoid(density, grid) - 1.0) < 1e-3
-    assert run.loglik == pytest.approx(np.nansum(run.log_density) - 0.5 * np.log(live.lane()["F"]).sum())
+    assert run.loglik == pytest.approx(np.nansum(run.log_density) - 0.5 * np.log(lane["F"]).sum())
 
 
 def naive_density(lane, phi, y):
@@ -342,7 +346,7 @@ def naive_density(lane, phi, y):
         C = lower + np.tril(lower, -1).T + (S * (lane["ratio"][:, k] * r / c)) @ S.T
         e, h = y - x @ lane["m"][:, k], x @ C @ x
         for j, p in enumerate(levels):
-            scale = np.sqrt(h + leverage * lane["level"][j] * r)
+            scale = np.sqrt(h + leverage * max(lane["level"][j] * r, lane["coarse"]))
             law = stats.cauchy if j == len(levels) - 1 else stats.norm
             total = total + weight * p * law.pdf(e, scale=scale)
     return total
@@ -361,3 +365,26 @@ def test_where_parameters_stand_can_be_said_in_a_stream():
     live.reset(["theta2"], theta=0.9)
     assert live.theta[1] == 0.9
     assert live.predict([0.0, 1.0, 0.0])[0] == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize("tracker", [AdaptiveKalman(), Bank()], ids=lambda one: type(one).__name__)
+def test_resumed_runs_and_structures_are_judged_by_the_density_of_the_mixture(tracker):
+    y, u = jumping(noise, noise)
+    u[:900, 2] = 0.0
+    whole = track(MODEL, tracker, y, u)
+    for cut in (400, 1000):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what the first part could not learn
+            before = track(MODEL, tracker, y[:cut], u[:cut])
+            rest = track(MODEL, tracker, y[cut:], u[cut:], warm_start=before)
+        np.testing.assert_array_equal(rest.theta, whole.theta[cut:])
+        np.testing.assert_array_equal(rest.log_density, whole.log_density[cut:])
+    models = [Regression(2), Regression(2, intercept=True)]
+    said = select(models, y, u[:, :2], tracker=tracker)
+    runs = [track(model, tracker, y, u[:, :2]) for model in models]
+    sums = [run.log_density[said.judged].sum() for run in runs]
+    np.testing.assert_allclose(sorted(row.loglik for row in said.rows), sorted(sums), rtol=1e-9)
+    for run, total in zip(runs, sums, strict=True):
+        square = (run.innovation / run.innovation_std) ** 2
+        gaussian = -0.5 * (np.log(2.0 * np.pi * run.innovation_std**2) + square)[said.judged].sum()
+        assert abs(gaussian - total) > 1.0

@@ -138,5 +138,5 @@ def test_polynomials_carry_the_other_sign():
     assert A.tolist() == [[1.0, -1.2, 0.5]]
     assert [b.tolist() for b in B] == [[[0.0, 1.0, 0.4]], [[3.0]]]
     run = track(Regression(1), RLS(1.0), ONES, ONES)
-    with pytest.raises(ValueError, match="Regression has none"):
+    with pytest.raises(ValueError, match="Regression has no polynomials"):
         run.polynomials()

@@ -22,7 +22,7 @@ from driftfit.engine.simd import (
     store,
     sum_of,
 )
-from driftfit.trackers.bank.machine.merge import digamma
+from driftfit.trackers.bank.reducing.merge import digamma
 
 RNG = np.random.default_rng(3)
 

@@ -4,7 +4,20 @@ import numpy as np
 import pytest
 from nist import DATA, digits
 
-from driftfit import FLS, RLS, AdaptiveKalman, Bank, Kalman, Regression, track
+from driftfit import (
+    FLS,
+    RLS,
+    AdaptiveKalman,
+    AugmentedFLS,
+    Bank,
+    ExtendedKalman,
+    HammersteinWiener,
+    Kalman,
+    Regression,
+    track,
+)
+from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
+from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 
 MODEL = Regression(2, intercept=True)
 TRACKERS = {
@@ -37,15 +50,48 @@ def test_estimates_do_not_depend_on_units(kind, offset):
     scaled = track(MODEL, TRACKERS[kind](size, 1.0), y, x)
     spanned = np.isfinite(scaled.std)
     assert spanned[10].all()
+    # an offset of m standard deviations leaves m 2^-53 of a reading: 1e-10, times what depends on it
+    most = max(1e-12 * offset, 1e-11)
     for a, b, c in UNITS:
         f = np.array([a, b, 1.0])
         run = track(MODEL, TRACKERS[kind](f * size, c), c * y, x * f[:2])
         np.testing.assert_array_equal(np.isfinite(run.std), spanned)
         error = np.abs(run.theta * f / c - scaled.theta)[spanned] / scaled.std[spanned]
-        # an offset of m standard deviations leaves m 2^-53 of a reading: 1e-10, times what depends on it
-        most = 5e-3 if kind == "Bank" and offset == 1e6 else 1e-6 if kind == "Bank" else max(1e-13 * offset, 1e-10)
         assert error.max() < most
         np.testing.assert_allclose((run.std * f / c)[spanned], scaled.std[spanned], rtol=most)
+
+
+@pytest.mark.parametrize(("c", "d"), [(1e-12, 1e12), (1e12, 1e-12), (3e-5, 7e5)])
+def test_trackers_with_a_prior_or_a_model_of_their_own_know_no_units_either(c, d):
+    """y in units of c, inputs of d, and settings in the same units. Columns of `AugmentedFLS` share one unit, since its
+    mu does. With blocks of powers b scales by c / d, c_2 by 1 / d and d_2 by 1 / c.
+    """
+    y, x = record(0.0)
+    near = track(Regression(2), AugmentedFLS(0.5), y, x)
+    run = track(Regression(2), AugmentedFLS(0.5 * d * d, theta0=1e-6 * c / d), c * y, d * x)
+    np.testing.assert_allclose(run.theta * d / c, near.theta, rtol=1e-10)
+    model = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(2))
+    rng = np.random.default_rng(2)
+    u, w, v = rng.uniform(-1.0, 1.0, 200), np.zeros(200), np.zeros(3)
+    for t in range(2, 200):
+        v = np.array([u[t - 1], u[t - 2]])
+        w[t] = 0.5 * w[t - 1] + [0.5, -0.3] @ (v + 0.3 * v * v)
+    y = w - 0.1 * w * w + 0.01 * rng.standard_normal(200)
+    u[[50, 51]], y[[2, 120, 121]] = np.nan, [0.1, np.nan, np.nan]
+    f = np.array([1.0, c / d, c / d, 1.0 / d, 1.0 / c])
+
+    def settings(f, c):
+        start = np.array([-0.48, 0.52, -0.28, 0.32, 0.12])
+        return {"q": 1e-5 * f**2, "r": 1e-4 * c * c, "p0": 0.01 * f**2, "theta0": start * f}
+
+    for kind in (ExtendedKalman, OutputError):
+        more = (lambda c: {"q_w": 1e-6 * c * c, "p_w": 0.5 * c * c}) if kind is OutputError else (lambda c: {})
+        near = track(model, kind(**settings(1.0 + 0.0 * f, 1.0), **more(1.0)), y, u)
+        with pytest.warns(UserWarning, match="raw powers of data far from unit size"):
+            run = track(model, kind(**settings(f, c), **more(c)), c * y, d * u)
+        assert (np.abs(run.theta / f - near.theta) < 1e-9 * near.std).all()
+        np.testing.assert_allclose(run.std / f, near.std, rtol=1e-9)
+        np.testing.assert_allclose(run.prediction / c, near.prediction, rtol=1e-6, atol=1e-9)
 
 
 def plain_si():

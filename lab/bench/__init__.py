@@ -1,4 +1,4 @@
-"""The scoreboard: accuracy and speed beside peers and beside what cannot be beaten: ``python -m lab bench``.
+"""The scoreboard: accuracy and speed, compared with peers and with lower bounds: ``python -m lab bench``.
 
-Peers are the packages of the extra ``peers``; one that is not installed is left out and named.
+Peers are the packages of the extra ``peers``; those that are not installed are left out and listed.
 """

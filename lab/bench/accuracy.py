@@ -1,9 +1,9 @@
-"""The tracking benchmark: every contestant on every scenario, for a regression and an ARX model, beside the oracle.
+"""The tracking benchmark: every method on every scenario, for a regression and an ARX model, compared with the oracle.
 
-For each scenario and model the scored runs have seeds 0, 1, .., the runs that settings are tuned on 10000, 10001, .. .
-Every contestant sees the same runs, so comparisons are paired: a ratio is that of the parameter errors of one run, to
-the oracle's, and its spread are the quartiles over runs. *Hindsight* is our Kalman filter at the one setting of its
-grid that is best on the scored runs themselves: what no tuning of one fixed setting can beat.
+For each scenario and model the scored runs have seeds 0, 1, .., and the runs for tuning settings 10000, 10001, .. .
+Every method gets the same runs, so comparisons are paired: a ratio is that of the parameter errors of one run to
+the oracle's, and its spread is given by the quartiles over runs. *Hindsight* is our Kalman filter with the setting of
+its grid that is best on the scored runs themselves: no tuning of one fixed setting can be better.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ JUMPS, CALM = "sparse_jumps", "no_drift"
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: scored runs, tuning runs, samples a run."""
+    """Size of the benchmark: scored runs, tuning runs, samples per run."""
 
     runs: int = 20
     tuning: int = 5
@@ -56,7 +56,7 @@ QUICK = Size(2, 1, 400)
 
 
 class Entry(NamedTuple):
-    """A contestant with what it was told: a row of a table."""
+    """A contestant with its setting: a row of a table."""
 
     name: str
     contestant: Contestant
@@ -97,7 +97,7 @@ def mean_squares(records: list[Record]) -> Array:
 def tuned(
     contestant: Contestant, records: list[Record], c: Array, criterion: Callable[[Record, Outcome], float]
 ) -> Entry:
-    """The setting with the least mean square of a criterion over records, and the noise variance that goes with it."""
+    """The setting with the least mean square of a criterion over records, and the corresponding noise variance."""
     totals = [
         root_mean_square([criterion(record, contestant.follow(record, setting, c)) for record in records])
         for setting in contestant.grid

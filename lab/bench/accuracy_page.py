@@ -1,4 +1,4 @@
-"""The page and the pictures of the tracking benchmark, written from its results and from nothing else."""
+"""The page and the pictures of the tracking benchmark, written from its results only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LESS, OFTEN = 0.97, 0.75
 """A row beats the reference where its error is 3 % less in the median run, and less in three of four runs."""
 
 ERA = 1.0e3
-"""Ratios above this are divergence, and printed as such."""
+"""Ratios above this count as divergence."""
 
 
 def figures(value: float, digits: int = 2) -> str:
@@ -101,7 +101,7 @@ def _range(shares: Sequence[float]) -> str:
 
 
 def losses(cells: Iterable[Cell]) -> list[tuple[str, str, str, float, float]]:
-    """(scenario, model, row, median ratio to the reference, share of runs won) where a row beats the reference."""
+    """(scenario, model, row, median ratio to the reference, share of runs won) for rows that beat the reference."""
     lost = []
     for cell in cells:
         for name in cell.scores:
@@ -113,7 +113,7 @@ def losses(cells: Iterable[Cell]) -> list[tuple[str, str, str, float, float]]:
 
 
 def lost_table(cells: Sequence[Cell]) -> str:
-    """Where the tracker without settings is beaten, and why."""
+    """Where and why the tracker without settings is beaten."""
     lost = losses(cells)
     if not lost:
         return f"Nowhere was a row better than `{REFERENCE}` by 3 % in the median and in three of four runs."

@@ -1,8 +1,8 @@
-"""Who takes part: every tracker of ours, every peer that is installed, and what they may be told.
+"""The methods of the benchmark: every tracker of ours, every installed peer, and their settings.
 
-A contestant runs *as it comes*, if it has defaults for everything, and *tuned*, if it has a setting: the one of its
-grid with the least parameter error on other runs of the same scenario. A filter with q in units of r takes r from those
-runs too: the mean of e^2 / s at r = 1.
+A method runs *with its defaults*, if it has defaults for everything, and *tuned*, if it has a setting: the one of its
+grid with the least parameter error on other runs of the same scenario. A filter with q in units of r also takes r from
+those runs: the mean of e^2 / s at r = 1.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LARGE_PRICES = tuple(np.logspace(-1.0, 7.0, 17).tolist())
 class Contestant:
     """A way to follow parameters.
 
-    ``relative``: tuned, its std comes in units of sqrt(r). ``tuned_as`` names a contestant whose setting it takes,
+    ``relative``: if tuned, its std is in units of sqrt(r). ``tuned_as`` names a method whose setting it takes,
     because it is the same algorithm.
     """
 
@@ -105,7 +105,7 @@ SAME_FILTER = (
     Contestant("simdkalman primitives", "simdkalman", peers.simdkalman_kalman),
     Contestant("dynamax lgssm_filter", "dynamax", peers.dynamax_kalman),
 )
-"""Peers that run the same filter as `Kalman` when given the same numbers: their row would be the same row again."""
+"""Peers that run the same filter as `Kalman` with the same settings: their rows would be identical."""
 
 
 def present(contestants: tuple[Contestant, ...]) -> tuple[list[Contestant], list[str]]:

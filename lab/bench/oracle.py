@@ -2,11 +2,11 @@
 
     P <- P + diag(q_t);  s = phi' P phi + r_t;  K = P phi / s;  theta <- theta + K e;  P <- P - K (P phi)'
 
-It knows jumps and outliers when they come, not where theta jumps to. Where theta moves by a rule instead of at random
-(a ramp, a sinusoid) q_t is the square of its step, which is less than all there is to know, and a tracker may win. The
-lags of missing outputs are its own predictions, for at most ``na`` in a row, as in `ARX`. Start: P = 10^6 I at 0.
+It knows jumps and outliers when they occur, but not the new value of theta. Where theta follows a rule instead of a
+random walk (a ramp, a sinusoid) q_t is the square of its step, which is not all the information, and a tracker may win.
+The lags of missing outputs are its own predictions, for at most ``na`` in a row, as in `ARX`. Start: P = 10^6 I at 0.
 
-Written as a plain loop apart from the library, so that it shares no fault with it.
+It is written as a plain loop independent of the library, so that it shares no fault with it.
 """
 
 from __future__ import annotations

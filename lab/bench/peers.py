@@ -1,8 +1,8 @@
 """Other packages on the same regression, one function each: ``follow(record, setting, c) -> Outcome``.
 
-A package is imported when it runs, so that an absent one costs nothing. All are handed the regressors; samples whose
-output or lags are missing are left out, which is what dropping incomplete rows does. Starting weights are zero where a
-package would draw them at random. For random-walk filters ``setting`` is the ratio of `walk` and r = 1.
+A package is imported when it runs, so that a missing one costs nothing. All of them get the regressors; samples with a
+missing output or lag are left out, as when incomplete rows are dropped. Starting weights are zero where a package would
+draw them at random. For random-walk filters ``setting`` is the ratio of `walk`, and r = 1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Real records that come with packages, one step ahead, beside what one would do without tracking.
+"""Real records that are shipped with packages, one step ahead, compared with methods that do not track.
 
-Settings are chosen by one-step error on the first half, the second half is scored, on the samples that every contestant
-could predict. There is no truth, so there are no parameter errors; ``t`` is the paired t statistic of the differences
-of squared errors to those of `AdaptiveKalman` (negative: smaller errors than its).
+Settings are chosen by one-step error on the first half; the second half is scored, on the samples that every method
+could predict. The true parameters are unknown, so there are no parameter errors; ``t`` is the paired t statistic of the
+differences of squared errors to those of `AdaptiveKalman` (negative: smaller errors than its).
 
     US money demand   log real M1 on its lag, log real GDP, bill rate, intercept; quarters  (statsmodels macrodata)
     Danish money      log real M2 on its lag, log income, two rates, intercept; quarters (statsmodels danish_data)

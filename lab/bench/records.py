@@ -1,4 +1,4 @@
-"""What a contestant is handed, and what it hands back.
+"""The input and the output of a method in the benchmark.
 
 Record   y (T,), u (T, m), the model, and the regressors phi (T, n) for packages that know no lags
 Outcome  theta (T, n) and its std after each sample, prediction (T,) and its std before it
@@ -24,7 +24,7 @@ MODELS: dict[str, Model] = {"regression": Regression(3), "arx": ARX(2, 2)}
 
 
 class Outcome(NamedTuple):
-    """What a contestant says of a record; NaN where it says nothing."""
+    """The results of a method on a record; NaN where there are none."""
 
     theta: Array
     std: Array

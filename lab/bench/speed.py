@@ -1,4 +1,4 @@
-"""Contests of speed, one function each: what is timed, and against whom. ``python -m lab bench speed``.
+"""Speed contests, one function each: what is timed, and against which packages. ``python -m lab bench speed``.
 
 Every contest is a regression of four parameters unless it says otherwise, from the same start P0 = 10, with the same
 numbers. Times are medians of runs that take turns.
@@ -38,7 +38,7 @@ FORGETTING = 0.99
 
 
 def signals(T: int, n: int = 4, series: int | None = None) -> Signals:
-    """White regressors, a slowly walking truth, noise."""
+    """White regressors, slowly drifting true parameters, noise."""
     rng = np.random.default_rng(SEED)
     shape = (T, n) if series is None else (series, T, n)
     phi = rng.normal(size=shape)

@@ -1,4 +1,4 @@
-"""The page and the picture of the contests of speed, written from their results and from nothing else."""
+"""The page and the picture of the contests of speed, written from their results only."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What a package costs before it runs: import, first result, disk.
+"""What a package costs before it runs: import, first result, disk space.
 
-Each figure is the time of a process of its own, numpy being imported already; processes take turns and medians are
+Each figure is the time of a separate process in which numpy is already imported; processes take turns and medians are
 reported. The first result is the last estimate from a thousand samples of a regression with four parameters, by the
-package's Kalman filter where it has one. Ours is shown with an empty cache of compiled code, which happens once on a
-machine, and with a warm one.
+package's Kalman filter if it has one. Ours is shown with an empty cache of compiled code, which happens once per
+computer, and with a warm one.
 """
 
 from __future__ import annotations

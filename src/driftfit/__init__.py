@@ -1,4 +1,4 @@
-"""driftfit follows the parameters of a system while they change."""
+"""driftfit tracks the parameters of a system while they change."""
 
 from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning

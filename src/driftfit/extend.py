@@ -1,4 +1,4 @@
-"""What a tracker, a model or a curve of your own is made of; see docs/design.md and `driftfit.check_tracker`."""
+"""The building blocks of your own trackers, models and curves; see docs/design.md and `driftfit.check_tracker`."""
 
 from driftfit.engine.drivers import ModelSteps, TrackerSteps, diagonal, unknown
 from driftfit.engine.kernel import Array, State, Step, exp, kernel, log, nothing

@@ -29,24 +29,24 @@ if TYPE_CHECKING:
 
 
 class Judged(fleet.Many):
-    """Questions to many runs at once, by key; see `driftfit.judge.many`."""
+    """Methods of many runs with keys; see `driftfit.judge.many`."""
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
-        """Which of them move, at a false discovery rate of ``level``, and where does following them pay?"""
+        """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
         return verdicts(self.runs(), level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
-        """What `Track.diagnose` says of each, and how often each number is out of bounds."""
+        """Diagnose every run, and count how often each diagnostic is out of bounds."""
         return diagnoses(self.runs())
 
     def detect(
         self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:  # fmt: skip
-        """Alarms of all of them, one false in ``every`` samples of all together, and which of them had something.
+        """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
 
-        ``level`` is a false discovery rate, ``reference`` one for all or a mapping from every key to its own; kinds and
-        other settings are those of `driftfit.judge.alarms.detect`.
+        ``level`` is a false discovery rate; ``reference`` is one for all runs or a mapping from every key to its own.
+        Kinds and other settings are those of `driftfit.judge.alarms.detect`.
         """
         return alarms(self.runs(), kind, every=every, level=level, reference=reference, **settings)
 
@@ -54,9 +54,9 @@ class Judged(fleet.Many):
         self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
         labels: Mapping[Hashable, Array] | None = None,
     ) -> None:  # fmt: skip
-        """Write one self-contained HTML page: all of them in one table, the clearest with pictures.
+        """Write one self-contained HTML page with all runs in one table, and pictures of the clearest.
 
-        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a section of their own.
+        ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
         text = page_of_many(self.runs(), title, self.failed, alarms, labels)
         check_path(path).write_text(text, encoding="utf-8")
@@ -65,22 +65,22 @@ class Judged(fleet.Many):
         self, what: str, *, below: Any = None, above: Any = None, horizon: int | None = None, u: Any = None,
         level: float = 0.9,
     ) -> polars.DataFrame:  # fmt: skip
-        """When a parameter or the output of every run crosses a limit, as one polars table, the first on top.
+        """When a parameter or the output of every run crosses a limit, as one polars table, earliest first.
 
-        Limits are one for all, or a mapping from every key. Columns: what tells the runs apart, ``probability``
-        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times where the
+        Limits are the same for all, or a mapping from every key. Columns: those that identify the runs, ``probability``
+        within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times if the
         record has them. See `driftfit.use.crossing`.
         """
         return crossings(self.runs(), self.by, what, below, above, horizon, u, level)
 
     def to_table(self, kind: str = "polars") -> Any:
         """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
-        from driftfit.show.export import to_table  # polars takes as long to import as all the rest
+        from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
         return to_table(self, kind)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for whatever reads one."""
+        """The same table as an Arrow stream, for any program that reads one."""
         return self.to_table().__arrow_c_stream__(requested_schema)
 
     def to_parquet(self, path: str | PathLike[str]) -> None:
@@ -105,11 +105,11 @@ class Fleet(fleet.Fleet, Judged, public=True):
         return ((key, _public(run)) for key, run in super().items())
 
     def forecast(self, h: int, u: Any = None) -> polars.DataFrame:
-        """The h nominal samples after the end of every series as one polars table, a row a sample.
+        """The h nominal samples after the end of every series as one polars table, one row per sample.
 
-        Columns: what tells the series apart, ``step`` (1 .. h), the time where the record has one, ``y_hat`` and
+        Columns: those that identify the series, ``step`` (1 .. h), the time if the record has one, ``y_hat`` and
         ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
-        inputs (h,) or (h, m), or one array for all; a key that is not in it has none. See `driftfit.use.forecast`.
+        inputs (h,) or (h, m), or one array for all; a missing key has no inputs. See `driftfit.use.forecast`.
         """
         from driftfit.show.export import forecasts_table
 
@@ -128,7 +128,7 @@ class Outputs(outputs.Outputs, Judged, public=True):
     __doc__ = outputs.Outputs.__doc__
 
     def __getitem__(self, output: str | int) -> Track:
-        """The record of one output, by name or place."""
+        """The record of one output, by name or index."""
         return _public(super().__getitem__(output))
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
@@ -144,7 +144,7 @@ class Outputs(outputs.Outputs, Judged, public=True):
         return summarise_outputs(self)
 
     def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands: a row of pictures for each output."""
+        """Parameters with bands: one row of panels for each output."""
         return plot_outputs(self, level)
 
 
@@ -152,7 +152,7 @@ class Shared(shared_outputs.Shared, public=True):
     __doc__ = shared_outputs.Shared.__doc__
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
-        """The smoothed path: theta (T, n) as here, residuals of every output (T, ny)."""
+        """The smoothed path: theta (T, n), and residuals of every output (T, ny)."""
         return SmoothedShared.of_shared(self, keep, order_by, undetermined)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
@@ -164,15 +164,15 @@ class Shared(shared_outputs.Shared, public=True):
         return verdict(self.rows, level, lags, burn)
 
     def diagnose(self) -> Diagnosis:
-        """What `Track.diagnose` says of the rows."""
+        """Diagnose the rows; see `Track.diagnose`."""
         return diagnose(self.rows)
 
     def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """The page of the rows; see `driftfit.show.report`."""
+        """The report on the rows; see `driftfit.show.report`."""
         report(self.rows, path, title)
 
     def summary(self) -> SharedSummary:
-        """Parameters now, and the one-step error of each output; print it."""
+        """Present parameters, and the one-step error of each output; print it."""
         return summarise_shared(self)
 
     def plot(self, level: float = 0.95) -> Figure:
@@ -180,7 +180,7 @@ class Shared(shared_outputs.Shared, public=True):
         return plot_track(self.rows, level)
 
     def to_table(self, kind: str = "polars") -> Any:
-        """The results as one table, a row a sample; see `driftfit.show.export`."""
+        """The results as one table, one row per sample; see `driftfit.show.export`."""
         from driftfit.show.export import to_table
 
         return to_table(self, kind)
@@ -195,6 +195,6 @@ class OutputsFleet(track_outputs.OutputsFleet, Judged, public=True):
 
 
 def _public(run: result.Track) -> Track:
-    """A run as users know it: once the facade is there every run is made so (`driftfit.run.plain`)."""
+    """A run of the class that users know: once the facade is imported, every run is made so (`driftfit.run.plain`)."""
     assert isinstance(run, Track)
     return run

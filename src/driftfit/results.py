@@ -1,4 +1,4 @@
-"""Track with its verbs: what users get from `driftfit.track`. Verbs are modules of their own, on plain data."""
+"""Track with its verbs: the result of `driftfit.track`. Each verb is a separate module that works on plain data."""
 
 from __future__ import annotations
 
@@ -38,32 +38,32 @@ class Track(result.Track, public=True):
 
     @property
     def hypotheses(self) -> Hypotheses:
-        """What a `Bank` says of events: probabilities, evidence, alarms, events, the mixture."""
+        """The events of a `Bank`: probabilities, evidence, alarms, events, the mixture."""
         return Hypotheses(self)
 
     def smooth(
         self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm"
     ) -> Smoothed | EventSmoothed:
-        """Every theta_t from the whole record, past and future: the exact fixed-interval smoother.
+        """Every theta_t estimated from the whole record, past and future: the exact fixed-interval smoother.
 
         The regressors that the filter used are held fixed. keep="cov" also stores the covariances, n * n numbers for
         each sample and each pair of neighbours. ``order_by`` (T,): theta changes with this variable instead of with
-        time; the samples are sorted by it, smoothed in that order, and put back. ``undetermined``: what to give for
-        parameters that the record does not determine, whose std is inf: "min_norm", the answer nearest to theta0;
-        "nan"; or "raise". A `Bank` is smoothed given the events that it found
-        (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for another tracker that is no random
-        walk in Gaussian noise.
+        time; the samples are sorted by it, smoothed in that order, and returned in time order. ``undetermined``: the
+        value of parameters that the record does not determine, whose std is inf: "min_norm", the solution nearest to
+        theta0; "nan"; or "raise". A `Bank` is smoothed given its events
+        (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for other trackers that do not
+        describe a random walk in Gaussian noise.
         """
         if self.tracker.weighs and self.start is None:
             return Hypotheses(self).smooth()
         return Smoothed.of(self, keep, order_by, undetermined)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
-        """theta and y at the h nominal samples after the record, u (h,) or (h, m) being the inputs then."""
+        """theta and y at the h nominal samples after the record, with future inputs u (h,) or (h, m)."""
         return forecast(self, h, u)
 
     def summary(self) -> Summary:
-        """Parameters now, and one-step errors beside what one would otherwise do; print it."""
+        """Present parameters, and one-step errors compared with those of simpler methods; print it."""
         return summarise(self)
 
     def plot(self, level: float = 0.95) -> Figure:
@@ -71,13 +71,13 @@ class Track(result.Track, public=True):
         return plot_track(self, level)
 
     def to_table(self, kind: str = "polars") -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row a sample; see `driftfit.show.export`."""
-        from driftfit.show.export import to_table  # polars takes as long to import as all the rest
+        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`."""
+        from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
         return to_table(self, kind)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for whatever reads one."""
+        """The same table as an Arrow stream, for any program that reads one."""
         return self.to_table().__arrow_c_stream__(requested_schema)
 
     def to_parquet(self, path: str | PathLike[str]) -> None:
@@ -94,7 +94,7 @@ class Track(result.Track, public=True):
         ``method`` is "average", "svd", "svd-joint" or "gls" (with standard deviations), see
         `driftfit.models.hammerstein_wiener.separation.separate`; ``input``, ``output`` and ``at`` choose the gauge,
         see `driftfit.models.hammerstein_wiener.separation.paths.Blocks.gauge`; None is "unit", or "c1" for a tracker
-        that follows the minimal parameters.
+        of the minimal parameters.
         """
         return blocks_of(self, method, input, output, at)
 
@@ -103,13 +103,13 @@ class Track(result.Track, public=True):
         return plot_blocks(self, method, times)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
-        """Is the time variation real, which parameters move, and does following them pay? See
+        """Is the time variation real, which parameters move, and does tracking them pay? See
         `driftfit.judge.verdict`.
         """
         return verdict(self, level, lags, burn)
 
     def segment(self, **settings: Any) -> Segmentation:
-        """Segments of the whole record with constant parameters, with dates and their intervals; `driftfit.segment`."""
+        """Segments of the record with constant parameters, with dates and their intervals; `driftfit.segment`."""
         return segmented(self, **settings)
 
     def diagnose(self) -> Diagnosis:
@@ -117,11 +117,11 @@ class Track(result.Track, public=True):
         return diagnose(self)
 
     def ahead(self, k: int) -> Prediction:
-        """Every output predicted from k samples before it, the inputs given; see `driftfit.use.simulate`."""
+        """Every output predicted from k samples before it, given the inputs; see `driftfit.use.simulate`."""
         return simulate.ahead(self, k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
-        """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
+        """Outputs that inputs u would cause in the system at a sample, with bands; see `driftfit.use.simulate`."""
         return simulate.simulate(self, u, at, y)
 
     def crossing(
@@ -146,7 +146,7 @@ class Track(result.Track, public=True):
         return system.largest_pole(self, at)
 
     def dc_gain(self, at: Any = None) -> Response:
-        """Gain (T, m) of every input for signals that stand, with its standard deviation."""
+        """Static gain (T, m) of every input, with its standard deviation."""
         return system.dc_gain(self, at)
 
     def step_response(self, h: int, input: int | str = 0, at: Any = -1) -> Response:
@@ -162,7 +162,7 @@ class Track(result.Track, public=True):
         return system.frequency_response(self, w, input, at)
 
     def to_scipy(self, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
-        """The system of a sample as `scipy.signal.dlti`, from one input to y."""
+        """The system at a sample as `scipy.signal.dlti`, from one input to y."""
         return system.to_scipy(self, at, dt, input)
 
     def long_run(self, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
@@ -170,9 +170,9 @@ class Track(result.Track, public=True):
         return system.long_run(self, at, level)
 
     def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
-        """Alarms at a rate of false alarms that is set, ``every`` samples one; see `driftfit.judge.alarms.detect`.
+        """Alarms at a set rate of false alarms, one in ``every`` samples; see `driftfit.judge.alarms.detect`.
 
-        ``kind`` may also be the rule of another run, ``said.rule``.
+        ``kind`` may also be the rule of another run, ``alarms.rule``.
         """
         return detect(self, kind, **settings)
 
@@ -183,7 +183,7 @@ class Track(result.Track, public=True):
         return plot_system(self, input, at, **settings)
 
     def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
-        """Simulated beside measured outputs of a record that was not used, with bands and the fit in per cent."""
+        """Simulated and measured outputs of a record that was not used, with bands and the fit in per cent."""
         return plot_validation(self, y, u, at, level)
 
     def report(
@@ -196,6 +196,6 @@ class Track(result.Track, public=True):
     ) -> None:
         """Write one self-contained HTML page: verdict, tables, pictures, settings; see `driftfit.show.report`.
 
-        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a section of their own.
+        ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a separate section.
         """
         report(self, path, title, alarms, labels)

@@ -18,7 +18,7 @@ class Live(live.Live, public=True):
 
     @property
     def hypotheses(self) -> LiveHypotheses:
-        """What a `Bank` says of events now: probabilities, events as they are decided, the mixture for control."""
+        """The events of a `Bank` now: probabilities, events as they are decided, the mixture for control."""
         return LiveHypotheses(self)
 
     @cached_property
@@ -26,14 +26,14 @@ class Live(live.Live, public=True):
         return Separator(self.model)
 
     def blocks(self, method: str = "svd-joint") -> Groups:
-        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, but for "gls"."""
+        """a, b, c, d of a `HammersteinWiener` model now; ``method`` as in `Track.blocks`, except "gls"."""
         groups: Groups = self._separator(self.theta, method)
         return groups
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
-        """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the inputs then.
+        """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the future inputs.
 
-        While `apply` is outstanding the first row of u is what it would bring.
+        While `apply` is outstanding the first row of u is the input that it would receive.
         """
         return forecast_stream(self, h, u)
 

@@ -1,1 +1,1 @@
-"""Bridges to other packages' habits, one module each; nothing of theirs is imported before its module is."""
+"""Bridges to the interfaces of other packages, one module each; a package is imported only by its module."""

@@ -3,11 +3,11 @@
     y_t = x_t' coef_t + intercept_t (+ a_1 y_(t-1) + .. + a_lags y_(t-lags)) + noise
 
 Rows are samples in order of time, and coefficients drift from row to row. `fit` tracks the rows from first to last.
-Coefficients after the last row (`coef_`) are those that `predict` uses for rows after it; `coef_path_` has those after
-every row. `partial_fit` goes on where the rows before ended.
+`predict` uses the coefficients after the last row (`coef_`) for later rows; `coef_path_` has the coefficients after
+every row. `partial_fit` continues after the last row.
 
-Order is all here: a shuffled split (``KFold(shuffle=True)``, ``train_test_split`` with its default) lets the estimator
-look ahead and scores what could not have been predicted. Use ``TimeSeriesSplit``.
+The order of rows matters: a shuffled split (``KFold(shuffle=True)``, ``train_test_split`` with its default) lets the
+estimator look ahead and scores predictions that could not have been made. Use ``TimeSeriesSplit``.
 
 Settings of the tracker are parameters of the estimator:
 
@@ -36,17 +36,17 @@ from driftfit.tracking import track
 
 
 class TrackedRegressor(RegressorMixin, BaseEstimator):
-    """Linear regression whose coefficients are followed while they change.
+    """Linear regression whose coefficients are tracked while they change.
 
     Parameters
     ----------
     tracker : Tracker or None
-        How coefficients are followed; None is ``AdaptiveKalman()``, which needs no numbers.
+        How coefficients are tracked; None is ``AdaptiveKalman()``, which needs no settings.
     lags : int
-        Lags of the output among the regressors. With lags `predict` treats its rows as those right after the rows that
-        were fitted, and uses its own predictions as outputs.
+        Number of output lags among the regressors. With lags, `predict` assumes that its rows directly follow the
+        fitted rows, and uses its own predictions as outputs.
     fit_intercept : bool
-        Whether there is an intercept, which drifts too.
+        Whether the model has an intercept, which drifts too.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         Coefficients after every row.
     lag_coef_ : (lags,)
     run_ : Track
-        The run behind them: `run_.summary()`, `run_.verdict()`, `run_.plot()`. After `partial_fit`, of its rows only.
+        The underlying run: `run_.summary()`, `run_.verdict()`, `run_.plot()`. After `partial_fit`, of its rows only.
     n_features_in_, feature_names_in_
         As in every estimator.
     """
@@ -72,14 +72,14 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         return self._follow(X, y, first=True)
 
     def partial_fit(self, X: Any, y: Any) -> Self:
-        """Go on with rows that come after those fitted so far; the first call is a `fit`."""
+        """Continue with rows that follow those fitted so far; the first call is a `fit`."""
         return self._follow(X, y, first=not hasattr(self, "run_"))
 
     def predict(self, X: Any, return_std: bool = False) -> Any:
         """Outputs (n_rows,) of rows after the last fitted one; with ``return_std`` also their standard deviations.
 
-        A standard deviation is that of an output: the noise, what is not known of the coefficients, and their drift
-        up to that row. It is NaN for a tracker that carries no covariance.
+        A standard deviation is that of an output. It includes the noise, the uncertainty of the coefficients, and their
+        drift up to that row. It is NaN for a tracker without a covariance.
         """
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, dtype=float, ensure_all_finite="allow-nan")
@@ -125,14 +125,14 @@ class TrackedRegressor(RegressorMixin, BaseEstimator):
         return ARX(self.lags, 1, nk=0, inputs=inputs, intercept=self.fit_intercept)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Parameters, with ``deep`` also the settings of the tracker as ``tracker__NAME``."""
+        """Parameters of the estimator; with ``deep`` also the settings of the tracker as ``tracker__NAME``."""
         found: dict[str, Any] = super().get_params(deep=False)
         if deep and isinstance(self.tracker, Tracker):
             found |= {f"tracker__{name}": value for name, value in self.tracker.settings().items()}
         return found
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters; ``tracker__NAME`` makes a tracker with that setting in the place of the one there is."""
+        """Set parameters; ``tracker__NAME`` replaces the tracker by one with that setting."""
         settings = {name[9:]: params.pop(name) for name in list(params) if name.startswith("tracker__")}
         super().set_params(**params)
         if settings:

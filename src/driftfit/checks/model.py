@@ -1,7 +1,7 @@
 """The promises of a model: `check_model`.
 
-The model is run over a small record of white inputs and outputs, with theta held still, so that every number can be
-compared with what its declarations say it is. It takes about as long as compiling the model five times.
+The model is run over a small record of white inputs and outputs with theta held constant, so that every number can be
+compared with what the model declares. This takes about as long as compiling the model five times.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ AT = 30
 
 
 def check_model(model: Model, theta: Any = None) -> list[str]:
-    """The promises that a model breaks, a sentence each; an empty list when it keeps them all.
+    """The promises that a model breaks, one sentence each; an empty list if it keeps them all.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def check_model(model: Model, theta: Any = None) -> list[str]:
     y, u = signals(bound.m)
     try:
         run = track(bound, still, y, u)
-    except Exception as error:  # whatever it is: its author wants to read it
+    except Exception as error:  # whatever the error is, the author of the tracker wants to read it
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return [f"It does not run: {type(error).__name__}: {first.strip()}"]
     for check in (_live, _lanes, _reach, _touched, _regressors, _density, _forward, _late_input, _follows):
@@ -94,7 +94,7 @@ def _live(model: Model, still: Kalman, run: Track) -> Iterator[str]:
     for t in range(T):
         said = live.update(y[t], u[t])
         if not _same(said[:2], (record.prediction[t], record.innovation[t])):
-            yield f"Live does not say what the record says from sample {t} on: keep memory in fields of the record."
+            yield f"Live and track differ from sample {t} on: keep all memory in fields of the state."
             return
 
 
@@ -107,7 +107,7 @@ def _lanes(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         if not all(
             _same(getattr(fleet[key], name), getattr(alone, name)) for name in ("prediction", "innovation", "ok")
         ):
-            yield "A series in a fleet is not what it is alone: every field is used at [..., l]."
+            yield "A series gives other results in a fleet than alone: index every field with [..., l]."
             return
 
 
@@ -130,7 +130,7 @@ def _touched(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         said = model.touched(AT, name)
         expected = [AT] if said is None and name == "y" else None if said is None else list(said)
         if expected is not None and lost.tolist() != expected:
-            yield f"A missing {name} at sample {AT} makes samples {lost.tolist()} unusable; declared are {expected}."
+            yield f"A missing {name} at sample {AT} makes samples {lost.tolist()} unusable; declared: {expected}."
 
 
 def _regressors(model: Model, still: Kalman, run: Track) -> Iterator[str]:
@@ -147,7 +147,7 @@ def _density(model: Model, still: Kalman, run: Track) -> Iterator[str]:
     error = (run.y - run.prediction)[ok]
     if not model.implicit:
         if not np.allclose(run.innovation[ok], error, atol=1e-9):
-            yield "The innovation is not y less its prediction; a model fitted to something else declares `implicit`."
+            yield "The innovation is not y minus its prediction; a model with another residual declares `implicit`."
         return
     step = 1e-6
     y[AT] += step
@@ -164,14 +164,14 @@ def _forward(model: Model, still: Kalman, run: Track) -> Iterator[str]:
             run.theta[:1], run.y[None, past], run.u[None, past.start : AT + h], np.zeros((1, h)), (-1.0, 1.0)
         )
     except ValueError:
-        return  # it does not say how it runs forward
+        return  # the model does not define how it runs forward
     live = Live(model, still)
     for t in range(AT):
         live.update(run.y[t], run.u[t])
     for k in range(h):
         expected = live.predict(run.u[AT + k])[0]
         if not abs(played[0, k] - expected) < 1e-6 * max(1.0, abs(expected)):
-            yield f"play says {played[0, k]:.9g} of the sample {k + 1} ahead, where the steps predict {expected:.9g}."
+            yield f"play gives {played[0, k]:.9g} for {k + 1} samples ahead, but the steps predict {expected:.9g}."
             return
         live.update(played[0, k], run.u[AT + k])
 
@@ -184,14 +184,14 @@ def _late_input(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         said = live.update(run.y[t])
         live.apply(run.u[t])
         if not _same(said[:2], (run.prediction[t], run.innovation[t])):
-            yield f"apply does not leave the record as if the input had come with its output, from sample {t} on."
+            yield f"An input given by apply has another effect than one given with its output, from sample {t} on."
             return
 
 
 def _follows(model: Model, still: Kalman, run: Track) -> Iterator[str]:
     if not model.follows(model):
-        yield "follows denies that a run of the model can go on with the same model."
+        yield "follows returns False for the model itself, so no run could be continued."
         return
     first = track(model, still, run.y[:AT], run.u[:AT])
     if not _same(track(model, still, run.y[AT:], run.u[AT:], warm_start=first).prediction, run.prediction[AT:]):
-        yield "A run that goes on where another ended is not the run of both: memory must be all that it needs."
+        yield "A run continued with warm_start differs from an uninterrupted one: memory must hold the whole state."

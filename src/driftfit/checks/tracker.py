@@ -1,8 +1,8 @@
 """The promises of a tracker: `check_tracker`.
 
-Every check drives the tracker over a small simulated record and says in a sentence what is broken and where to look.
-It takes about as long as compiling the tracker three times. Keeping all promises does not make a tracker good: compare
-its one-step errors with those of others (`Track.summary`).
+Every check runs the tracker on a small simulated record. If a promise is broken, it returns a sentence that says which
+and where to look. This takes about as long as compiling the tracker three times. A tracker that keeps all promises is
+not necessarily good: compare its one-step errors with those of others (`Track.summary`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LONG = 20_000
 
 
 def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
-    """The promises that a tracker breaks, a sentence each; an empty list when it keeps them all.
+    """The promises that a tracker breaks, one sentence each; an empty list if it keeps them all.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def check_tracker(tracker: Tracker, model: Model | None = None) -> list[str]:
     broken = list(_settings(tracker))
     try:
         run = track(bound, tracker, *record())
-    except Exception as error:  # whatever it is: its author wants to read it
+    except Exception as error:  # whatever the error is, the author of the tracker wants to read it
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return [*broken, f"It does not run: {type(error).__name__}: {first.strip()}"]
     broken += _missing(tracker, bound)
-    if broken and "poison" in broken[-1]:  # nothing else can be told apart
+    if broken and "Missing data make" in broken[-1]:  # nothing else can be distinguished
         return broken
     for check in (_live, _lanes, _causal, _unused, _no_time, _each, _variances, _rest, _saving, _learning):
         broken += check(tracker, bound, run)
@@ -74,7 +74,7 @@ def damaged(seed: int = 0, bad: float = np.nan) -> tuple[Array, Array]:
 
 
 def _differ(one: Track, other: Track, upto: int | None = None) -> str | None:
-    """The first result in which two runs differ, and from which sample on."""
+    """The first result in which two runs differ, and the first sample at which they do."""
     for name in one.stores():
         a, b = one.written(name)[:upto], other.written(name)[:upto]
         wrong = ~((a == b) | (np.isnan(a) & np.isnan(b)))
@@ -107,7 +107,7 @@ def _live(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
         said, expected = (y_hat, e, ok, *live.theta), (run.prediction[t], run.innovation[t], run.ok[t], *run.theta[t])
         if not np.array_equal(said, expected, equal_nan=True):
             yield (
-                f"Live does not say what the record says from sample {t} on: a step may use nothing but its record, "
+                f"Live and track differ from sample {t} on: a step may use only its own sample and the state, "
                 "so keep whatever must be remembered in fields of the state."
             )
             return
@@ -121,8 +121,8 @@ def _lanes(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
         difference = _differ(fleet[key], track(model, tracker, y[key], u[key]))
         if difference:
             yield (
-                f"A series in a fleet is not what it is alone ({difference}): every field is used at [..., l], and "
-                "exp and log come from driftfit.engine.kernel, because others differ with the number of lanes."
+                f"A series gives other results in a fleet than alone ({difference}): index every field with [..., l], "
+                "and take exp and log from driftfit.engine.kernel, because others differ with the number of lanes."
             )
             return
 
@@ -133,10 +133,10 @@ def _causal(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
     other = track(model, tracker, y, u)
     difference = _differ(run, other, 120)
     if difference:
-        yield f"It looks ahead: a change of sample 120 shows before ({difference})."
+        yield f"It looks ahead: a change of sample 120 changes earlier results ({difference})."
     elif run.prediction[120] != other.prediction[120]:
-        yield "The prediction of an output depends on that output: write s.y_hat from theta as it was before."
-    own = tracker.own_model(1, 1, 1) is not None  # whose equation may have another sign or scale
+        yield "The prediction of an output depends on that output: compute s.y_hat from theta before its update."
+    own = tracker.own_model(1, 1, 1) is not None  # its equation may have another sign or scale
     if not own and not np.allclose(run.innovation[run.ok], (run.y - run.prediction)[run.ok]):
         yield "s.e is not s.y[l] - s.y_hat[l] at samples that are used."
 
@@ -146,7 +146,7 @@ def _missing(tracker: Tracker, model: Model) -> Iterator[str]:
     for bad, run in runs.items():
         if not np.isfinite(run.theta).all():
             t = int(np.argmax(~np.isfinite(run.theta).all(axis=1)))
-            yield f"Missing data poison theta (signals that are {bad}, at sample {t}): divide by nothing that can be 0."
+            yield f"Missing data make theta not finite ({bad}, at sample {t}): never divide by what may be 0."
             return
     if any(_differ(run, runs[np.nan]) for run in runs.values()):
         yield "Values that are infinite or absurdly large are not treated like missing ones."
@@ -160,7 +160,7 @@ def _unused(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     memoryless = tracker.own_model(0, 1, 0) or Regression(1)
     runs = [track(memoryless, tracker, signal, u, weights=weights) for signal in (y, loud)]
     if not np.array_equal(runs[0].theta, runs[1].theta):
-        yield "It learns from samples that are not to be used: s.ok[l], 0 or 1, must be a factor of the gain."
+        yield "It learns from samples that must not be used: s.ok[l], 0 or 1, must be a factor of the gain."
 
 
 def _no_time(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
@@ -173,7 +173,10 @@ def _no_time(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     for t in range(100, 110):
         live.update(y[t], u[t])
     if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, (live.theta, live.cov), strict=True)):
-        yield "Something happens although no time passes and nothing is used: with s.dt[l] = 0 predict changes nothing."
+        yield (
+            "The state changes although no time passes and no sample is used: "
+            "with s.dt[l] = 0 predict must change nothing."
+        )
 
 
 def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
@@ -185,8 +188,9 @@ def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     one, each = (track(model, tracker, y, u, drift=given) for given in (drift, columns))
     if not np.allclose(one.theta, each.theta, rtol=1e-6, atol=1e-9):
         yield (
-            "It declares drift_each = True, but a drift for each parameter is not what the same drift for all is: give "
-            "its steps told=driftfit.trackers.parts.varying_drift.told and multiply q by s.each[i, l] ** 2."
+            "It declares drift_each = True, but the same drift given for each parameter has another effect than one "
+            "drift for all: give its steps told=driftfit.trackers.parts.varying_drift.told "
+            "and multiply q by s.each[i, l] ** 2."
         )
 
 
@@ -233,7 +237,7 @@ def _saving(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:
             yield f"It cannot be saved and loaded: {error}"
             return
     if not np.array_equal(live.theta, run.theta[-1]):
-        yield "Saved, loaded and continued it says something else than never stopped."
+        yield "A run that is saved, loaded and continued differs from one that never stopped."
 
 
 def _learning(tracker: Tracker, model: Model, run: Track) -> Iterator[str]:

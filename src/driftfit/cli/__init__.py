@@ -1,4 +1,4 @@
-"""Command line: one file a command; `driftfit --help` lists them, docs/command_line.md shows each at work."""
+"""The command line, one file per command; `driftfit --help` lists them, docs/command_line.md shows each in use."""
 
 from driftfit.cli import cache, demo, detect, export, forecast, select, smooth, track, trackers, tune, verdict, warm
 from driftfit.cli.parts.program import app, main

@@ -1,4 +1,4 @@
-"""``driftfit cache``: the compiled code that is kept on disk."""
+"""``driftfit cache``: the compiled code that is stored on disk."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def cache(
     ] = False,
     days: Annotated[float, typer.Option(help="With --prune: days without use; 0 removes everything.")] = 30.0,
 ) -> None:
-    """Say where compiled code is kept and how much of it there is, or prune it."""
+    """Show where compiled code is stored and how much of it there is, or prune it."""
     with helpful():
         if days < 0.0:
             raise ValueError(f"--days {days:g}: at least 0.")

@@ -12,9 +12,9 @@ from driftfit.cli.parts.program import app, helpful, out, progress
 
 @app.command()
 def demo(
-    plot: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("driftfit-demo.png"),
+    plot: Annotated[Path, typer.Option(help="File of the picture.")] = Path("driftfit-demo.png"),
 ) -> None:
-    """Follow the US demand for money from 1959 to 2009."""
+    """Track the US demand for money from 1959 to 2009."""
     from driftfit.demo.demo import show
 
     with helpful():

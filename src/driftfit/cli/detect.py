@@ -1,4 +1,4 @@
-"""``driftfit detect``: alarms at a set rate of false alarms, scored against labels where there are some."""
+"""``driftfit detect``: alarms at a set rate of false alarms, scored against labels if there are any."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def detect(
     reference: Annotated[
         list[str] | None,
         typer.Option(
-            help="What is normal: so many first samples, FROM..TO in times, or name=low:high; repeat the last."
+            help="What is normal: a number of first samples, FROM..TO in times, or name=low:high; repeat the last."
         ),
     ] = None,
     window: Annotated[int, typer.Option(help="Samples in the sums of the innovation alarm.")] = 50,
-    hold: Annotated[int, typer.Option(help="An alarm stays on for so many samples after its cause.")] = 0,
+    hold: Annotated[int, typer.Option(help="Samples for which an alarm stays on after its cause.")] = 0,
     calibrate: Annotated[bool, typer.Option("--calibrate", help="Find the limits by simulation.")] = False,
     labels: Annotated[
-        str | None, typer.Option(help="Column of labels, 0 or 1: where something was wrong; the alarms are scored.")
+        str | None, typer.Option(help="Column of labels, 0 or 1, that mark faults; the alarms are scored.")
     ] = None,
     write_to: Annotated[Path | None, typer.Option("--out", help="Write the alarms to .csv or .parquet.")] = None,
     plot: Plot = None,
     report: Report = None,
 ) -> None:
-    """Find alarms, with one false alarm in so many samples; with labels, score them."""
+    """Find alarms at a set rate of false alarms; with labels, score them."""
     if labels is not None and (given.by or len(given.outputs) > 1):
         raise ValueError("--labels: labels are for one series of one output; leave out --by and further --y.")
     if write_to is not None and write_to.suffix.lower() not in (".csv", ".parquet"):
@@ -71,7 +71,7 @@ def detect(
 
 
 def parse_reference(given: list[str] | None, run: Any) -> Any:
-    """``300``, ``2024-03-01..2024-03-04`` or ``gain=0.9:1.1`` as `Track.detect` takes it."""
+    """``300``, ``2024-03-01..2024-03-04`` or ``gain=0.9:1.1`` in the form that `Track.detect` takes."""
     if not given:
         return None
     if all("=" in entry for entry in given):
@@ -100,7 +100,7 @@ def _write(said: Any, path: Path) -> None:
 
 
 def _table(said: Alarms) -> pl.DataFrame:
-    """One row an alarm."""
+    """One row per alarm."""
     places = [int(t) for t in said.onsets]
     names = [said.names.index(said.cause(t)) for t in places]
     spans = [said.span(t) for t in places]

@@ -22,11 +22,11 @@ def _languages() -> None:
 
 @export.command(name="c")
 def to_c(
-    model: Annotated[str, typer.Option(help="As of `driftfit track`, such as arx:2,2.")],
+    model: Annotated[str, typer.Option(help="As in `driftfit track`, such as arx:2,2.")],
     out: Annotated[Path, typer.Option(help="The folder to write into.")],
     tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
     p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
-    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own.")] = None,
+    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
 ) -> None:
     """Write a tracker as C99 for a controller: tracker.h, tracker.c, a self-test and a README."""
     from driftfit.embedded import export_c

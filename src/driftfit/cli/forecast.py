@@ -19,7 +19,7 @@ from driftfit.results import Track
 from driftfit.show.parts.text import table_of
 
 SHOWN = 40
-"""Rows that are printed."""
+"""Most rows that are printed."""
 
 
 @app.command()
@@ -29,8 +29,8 @@ def forecast(
     ahead: Annotated[
         int | None, typer.Option("--ahead", help="Samples to forecast; as many as --future has rows.")
     ] = None,
-    future: Annotated[str | None, typer.Option(help="File of the inputs to come, with the columns of --u.")] = None,
-    level: Annotated[float, typer.Option(help="Of the bands.")] = 0.95,
+    future: Annotated[str | None, typer.Option(help="File of future inputs, with the columns of --u.")] = None,
+    level: Annotated[float, typer.Option(help="Level of the bands.")] = 0.95,
     write_to: Annotated[Path | None, typer.Option("--out", help="Write the forecast to .csv or .parquet.")] = None,
 ) -> None:
     """Forecast the outputs, and the parameters, after the end of the record."""

@@ -1,4 +1,4 @@
-"""``driftfit select``: which structure predicts best."""
+"""``driftfit select``: find the structure that predicts best."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from driftfit.cli.track import Plot
 @reads
 def select(
     given: Given,
-    keep: Annotated[list[str] | None, typer.Option(help="Regressor that every subset has; repeat it.")] = None,
-    most: Annotated[int | None, typer.Option(help="Most regressors in a subset.")] = None,
+    keep: Annotated[list[str] | None, typer.Option(help="Regressor that every subset contains; repeat it.")] = None,
+    most: Annotated[int | None, typer.Option(help="Largest number of regressors in a subset.")] = None,
     plot: Plot = None,
 ) -> None:
     """Compare models (repeat --model), or the regressors of one, by how well they predict."""

@@ -1,4 +1,4 @@
-"""``driftfit smooth``: every parameter from the whole record, past and future."""
+"""``driftfit smooth``: estimate every parameter from the whole record, past and future."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from driftfit.show.parts.text import facts, table_of
 from driftfit.tune.tune import tune
 
 PLACES = 5
-"""Samples that are printed."""
+"""Number of samples that are printed."""
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""``driftfit track``: follow the parameters of a model through a record, or through a fleet of them."""
+"""``driftfit track``: track the parameters of a model in a record, or in a fleet of records."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def track(
     ] = None,
     report: Report = None,
 ) -> None:
-    """Follow the parameters of a model through a record, or through a fleet of them."""
+    """Track the parameters of a model in a record, or in a fleet of records."""
     if write_to is not None and check_ending(write_to) == ".npz" and given.by:
         raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
     if report is not None:
@@ -53,7 +53,7 @@ def track(
 
 
 def plot_system(run: Any) -> Figure:
-    """The picture of the system, of runs that have one."""
+    """The picture of the system, for runs that have one."""
     if not isinstance(run, Track):
         raise ValueError("--system: this draws one series with one output; leave out --by and further --y.")
     return run.plot_system()

@@ -1,4 +1,4 @@
-"""``driftfit tune``: settings of a tracker from a record."""
+"""``driftfit tune``: estimate settings of a tracker from a record."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def tune(
     method: Annotated[str, typer.Option(help="ml, h-step, loo or gcv.")] = "ml",
     ahead: Annotated[int, typer.Option("--ahead", help="Samples ahead, for h-step.")] = 1,
     groups: Annotated[
-        str | None, typer.Option(help="each: a drift for each parameter; or a label for each, a,a,b.")
+        str | None, typer.Option(help="each: a separate drift for each parameter; or one label per parameter, a,a,b.")
     ] = None,
-    level: Annotated[float, typer.Option(help="Of the intervals.")] = 0.95,
+    level: Annotated[float, typer.Option(help="Level of the intervals.")] = 0.95,
     plot: Plot = None,
 ) -> None:
-    """Find the settings that a tracker was left without: --tracker kalman finds q and r."""
+    """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""
     from driftfit.tune.tune import tune as find
 
     models, shared = given.models(), groups.split(",") if groups and groups != "each" else groups
@@ -54,7 +54,7 @@ def tune(
 
 
 def _flags(given: Given, tracker: Any) -> str:
-    """The tracker as options of the command line."""
+    """The tracker as command line options."""
     values = {f.name: (getattr(tracker, f.name), f.default) for f in given_fields(type(tracker))}
     parts = [f"-p {name}={_typed(value)}" for name, (value, default) in values.items() if not _same(value, default)]
     return " ".join([f"--tracker {given.tracker}", *parts])

@@ -1,4 +1,4 @@
-"""``driftfit verdict``: is the time variation real, which parameters move, and does following them pay?"""
+"""``driftfit verdict``: is the time variation real, which parameters move, and does tracking them pay?"""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ from driftfit.cli.track import Report
 @reads
 def verdict(
     given: Given,
-    level: Annotated[
-        float, typer.Option(help="Error rate of what is said to move; of a fleet, false discoveries.")
-    ] = 0.05,
+    level: Annotated[float, typer.Option(help="Error rate of the test; for a fleet, the false discovery rate.")] = 0.05,
     lags: Annotated[int | None, typer.Option(help="Lags of correlation of the noise to allow for.")] = None,
     report: Report = None,
 ) -> None:
-    """Say whether the parameters move, which, when, and whether following them pays."""
+    """Report whether the parameters move, which ones and when, and whether tracking them pays."""
     run = given.run()
     say(run.verdict(level=level, lags=lags))
     if report is not None:

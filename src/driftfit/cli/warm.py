@@ -1,4 +1,4 @@
-"""``driftfit warm``: compile before the first user waits, as when a container image is built."""
+"""``driftfit warm``: compile before the first user has to wait, for example when a container image is built."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from driftfit.run.fleet import FEWEST
 from driftfit.show.parts.text import facts
 
 SAMPLES = 300
-"""Of the made-up record."""
+"""Length of the simulated record."""
 
 
 @app.command()
 def warm(
     model: Annotated[
-        list[str] | None, typer.Option(help="As of `driftfit track`; repeat it. Default: arx:2,2,intercept.")
+        list[str] | None, typer.Option(help="As in `driftfit track`; repeat it. Default: arx:2,2,intercept.")
     ] = None,
     tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
     p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
-    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own.")] = None,
-    inputs: Annotated[int, typer.Option(help="How many inputs the record has.")] = 1,
-    fleet: Annotated[bool, typer.Option("--fleet", help="For many series at once as well.")] = False,
+    own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
+    inputs: Annotated[int, typer.Option(help="Number of inputs of the record.")] = 1,
+    fleet: Annotated[bool, typer.Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
-    """Compile what models and a tracker need (record, stream, summary, verdict), so that it is found on disk later."""
+    """Compile what models and a tracker need (record, stream, summary, verdict), and store it on disk for later."""
     from driftfit.streams import Live
     from driftfit.tracking import track
 

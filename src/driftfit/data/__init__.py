@@ -1,4 +1,4 @@
-"""Signals, records, tables and files: what users hand over, checked once."""
+"""Reading data: arrays, tables and files, times, limits and labels; and writing results as tables and files."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +9,7 @@ __all__ = ["read_columns"]
 
 
 def __getattr__(name: str) -> Any:
-    """`read_columns`, once it is asked for: narwhals and polars take as long to import as all the rest."""
+    """Import `read_columns` when it is first used: narwhals and polars take as long to import as everything else."""
     if name == "read_columns":
         from driftfit.data.files import read_columns
 

@@ -1,4 +1,4 @@
-"""Which argument is the model and which the tracker: said plainly where they are classes, or have changed places."""
+"""Check the types of the arguments model and tracker; the message names a class that was passed, or a wrong order."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _is(value: Any, kind: type) -> bool:
 
 
 def _called(value: Any) -> str:
-    """An instance as it was made; a class with the settings that it asks for."""
+    """An instance as it was constructed; a class with its required settings."""
     if not isinstance(value, type):
         return repr(value)
     needed = [p.name for p in signature(value).parameters.values() if p.default is p.empty]
@@ -55,7 +55,7 @@ def _called(value: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """What was passed, in a few words."""
+    """A short description of what was passed."""
     if value is None:
         return "None"
     if isinstance(value, np.ndarray) or hasattr(value, "shape"):

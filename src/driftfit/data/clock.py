@@ -1,17 +1,17 @@
-"""Time: how many nominal intervals, dt, lie between two samples.
+"""Time: the number of nominal intervals, dt, between two samples.
 
     dt = 10                                         numbers: in the unit of ``time``, 1 by default
     dt = "10ms" "1s" "15min" "1h" "30d" "2w"        durations; also timedelta, numpy.timedelta64, pandas offsets
-    dt = "month" "quarter" "year" "3 months"        steps of the calendar, however many days they have
+    dt = "month" "quarter" "year" "3 months"        calendar steps, whatever their number of days
     dt = "business day"                             Monday to Friday; "business day except 2024-12-25, 2024-12-26" with
-                                                    holidays, which pandas' CustomBusinessDay(holidays=..) brings too
-    dt = "label"                                    times are labels: samples are one step apart, whatever they say
+                                                    holidays, also from pandas' CustomBusinessDay(holidays=..)
+    dt = "label"                                    times are labels: samples are one step apart
 
-A month is counted from its first day, with the part of it that has passed: 31 January to 28 February is 0.997 months. A
-number of steps within a tenth of a whole one counts as whole, so that the last day, or the last trading day, of every
-month are one step apart; days and months are those of the zone of the times. A weekend has no business time: from
-Saturday to Monday 0 steps pass. Everything depends on a sample and the one before it alone, so a stream counts as its
-record does.
+A month is counted from its first day, including the fraction of it that has passed: 31 January to 28 February is 0.997
+months. A number of steps within a tenth of an integer is rounded to it, so that the last day, or the last trading day,
+of every month are one step apart. Days and months are those of the time zone. A weekend has no business time: from
+Saturday to Monday 0 steps pass. Every interval depends only on a sample and the one before it, so a stream counts
+intervals as its record does.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MONTHS = {
     **dict.fromkeys(("quarter", "quarters", "Q", "QS", "QE", "BQS", "BQE"), 3),
     **dict.fromkeys(("year", "years", "Y", "YS", "YE", "BYS", "BYE"), 12),
 }
-"""Calendar steps in months, with the codes of pandas."""
+"""Calendar steps in months, including the codes of pandas."""
 
 BUSINESS = ("business day", "business days", "B", "C")
 DURATIONS = {
@@ -47,20 +47,20 @@ DURATIONS = {
     **dict.fromkeys(("d", "day", "days"), 86400),
     **dict.fromkeys(("w", "week", "weeks"), 604800),
 }
-"""Seconds of a unit, or 1 where NumPy has a unit of that name."""
+"""Seconds of a unit, or 1 if NumPy has a unit of that name."""
 
 NEAR = 0.1
-"""So close to a whole number of calendar steps counts as that number."""
+"""A number of calendar steps this close to an integer is rounded to it."""
 
 LOOK = 20
-"""After so many samples a stream says that most of them cannot be used."""
+"""Number of samples after which a stream warns if most of them cannot be used."""
 
 
 @dataclass(frozen=True)
 class Clock:
     """One nominal interval: ``count`` of a ``kind``, "number", "month" or "business", or a ``duration``, or a "label".
 
-    "unset" is what holds while nobody has said: 1 for numbers, refused for dates.
+    "unset" is the default if no dt was given: 1 for numbers, and an error for dates.
     """
 
     kind: str
@@ -68,11 +68,11 @@ class Clock:
     duration: np.timedelta64 | None = None
     holidays: tuple[str, ...] = ()
     zone: str | None = None
-    """Where days and months begin, for times in UTC."""
+    """Time zone of days and months, for times in UTC."""
 
     @classmethod
     def of(cls, dt: Any, zone: str | None = None) -> Clock:
-        """What ``dt`` stands for, for times that are shown in a zone; ValueError where it is nothing of the kind."""
+        """The clock of ``dt``, for times shown in a zone; ValueError if ``dt`` is not valid."""
         clock = cls._of(dt)
         return replace(clock, zone=zone) if clock.kind in CALENDARS and zone is not None else clock
 
@@ -96,7 +96,7 @@ class Clock:
 
     @property
     def plain(self) -> float | str | None:
-        """What `of` makes this clock of again, as plain data."""
+        """Plain data from which `of` makes the same clock."""
         if self.kind in ("unset", LABEL):
             return None if self.kind == "unset" else LABEL
         if self.kind == "number":
@@ -122,7 +122,7 @@ class Clock:
         return np.where((nearest >= 1.0) & (np.abs(steps - nearest) < NEAR), nearest, steps)
 
     def _fits(self, time: Array) -> None:
-        """ValueError where times of this kind cannot be counted so."""
+        """ValueError if this clock cannot count times of this kind."""
         dates = np.asarray(time).dtype.kind == "M"
         if self.kind == "unset" and dates:
             raise ValueError(
@@ -137,12 +137,12 @@ class Clock:
             raise ValueError(f"dt={self.plain!r} is for dates, but time is numeric: give dt in the unit of time.")
 
     def at(self, time: Any) -> Clock:
-        """This clock, its days and months those of the zone of a time that has one."""
+        """This clock with days and months in the zone of a time that has one."""
         known = self.zone is not None or self.kind not in CALENDARS or getattr(time, "tzinfo", None) is None
         return self if known else replace(self, zone=zone_name(time.tzinfo))
 
     def _local(self, time: Array) -> Array:
-        """Times in UTC as the wall clock of the zone shows them."""
+        """Times in UTC converted to the wall clock of the zone."""
         if self.zone is None:
             return time
         import polars as pl
@@ -152,7 +152,7 @@ class Clock:
         return np.asarray(shown.reshape(np.shape(time)))
 
     def _in_utc(self, time: Array) -> Array:
-        """The inverse; NaT where the wall clock skips a time."""
+        """The inverse; NaT for times that the wall clock skips."""
         if self.zone is None:
             return time
         import polars as pl
@@ -162,13 +162,13 @@ class Clock:
         return np.asarray(zoned.dt.convert_time_zone("UTC").dt.replace_time_zone(None).to_numpy())
 
     def _months(self, time: Array) -> Array:
-        """Months since 1970, with the part of the month that has passed."""
+        """Months since 1970, including the fraction of the month that has passed."""
         month = time.astype("datetime64[M]")
         start, end = (m.astype("datetime64[us]") for m in (month, month + 1))
         return np.asarray(month.astype(np.int64) + (time - start) / (end - start))
 
     def _business_days(self, time: Array) -> Array:
-        """Business days since 1970, with the part of the day that has passed."""
+        """Business days since 1970, including the fraction of the day that has passed."""
         day = time.astype("datetime64[D]")
         part = (time - day) / np.timedelta64(1, "D")
         whole = np.busday_count(np.datetime64("1970-01-01"), day, busdaycal=self._calendar)
@@ -179,7 +179,7 @@ class Clock:
         return np.busdaycalendar(holidays=np.array(self.holidays, dtype="datetime64[D]"))
 
     def steps(self, time: Array) -> Array:
-        """Nominal intervals (T,) since the sample before; 1 at the first."""
+        """Nominal intervals (T,) since the previous sample; 1 at the first."""
         gaps = np.ones(len(time))
         if len(time):
             self._fits(time)
@@ -187,18 +187,18 @@ class Clock:
         return gaps
 
     def since(self, last: Any, time: Any) -> float:
-        """Nominal intervals from one instant to another; 1 where there is none before, NaN where time stands still."""
+        """Nominal intervals from one instant to another; 1 if there is none before, NaN if time does not advance."""
         self._fits(time)
         if last is None:
             return 1.0
         return float(self.between(np.asarray(last), np.asarray(time))) if time > last else float("nan")
 
     def ahead(self, last: Any, h: int) -> Array | None:
-        """The times (h,) of the nominal samples after ``last``; None where times are only labels."""
+        """The times (h,) of the nominal samples after ``last``; None if times are only labels."""
         return self.moved(last, np.arange(1, h + 1))
 
     def moved(self, last: Any, k: Array) -> Array | None:
-        """The times k nominal intervals after ``last``, negative ones before it; None where times are only labels."""
+        """The times k nominal intervals after ``last``, or before it for negative k; None if times are only labels."""
         if self.kind == LABEL or last is None:
             return None
         if self.kind in ("number", "unset"):
@@ -214,16 +214,16 @@ class Clock:
             return self._in_utc(np.asarray(days + part))
         month = local.astype("datetime64[M]")
         first, after = (m.astype("datetime64[D]") for m in (month + jump, month + jump + 1))
-        ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays that
+        ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays the last day
         there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
         return self._in_utc(np.asarray(there + part))
 
 
 def instant(time: Any) -> Any:
-    """One time as a float, or as datetime64 in UTC where it is a date."""
+    """One time as a float, or as datetime64 in UTC if it is a date."""
     if isinstance(time, int | float | np.number) and not isinstance(time, np.timedelta64):
         return float(time)
-    if hasattr(time, "to_datetime64"):  # of pandas, in UTC where it has a zone
+    if hasattr(time, "to_datetime64"):  # a pandas time, in UTC if it has a zone
         return time.to_datetime64()
     if isinstance(time, datetime) and time.tzinfo is not None:
         time = time.astimezone(UTC).replace(tzinfo=None)
@@ -231,7 +231,7 @@ def instant(time: Any) -> Any:
 
 
 def instants(time: Any) -> tuple[Array, str | None]:
-    """(times (T,) as floats or as datetime64 in UTC, their zone) from an array or a sequence."""
+    """(times (T,) as floats or as datetime64 in UTC, their zone) of an array or a sequence."""
     axis = np.asarray(time)
     if axis.dtype.kind in "iuf":
         return axis.astype(float), None
@@ -245,19 +245,19 @@ def instants(time: Any) -> tuple[Array, str | None]:
 
 
 def zone_name(zone: Any) -> str:
-    """The name of a time zone, of a tzinfo or as text; a fixed offset of whole hours has one too, others are UTC."""
+    """The name of a time zone, from a tzinfo or text; a fixed offset of whole hours has a name, others become UTC."""
     name = next((str(getattr(zone, key)) for key in ("key", "zone") if getattr(zone, key, None)), str(zone))
     try:
         ZoneInfo(name)
         return name
-    except (ValueError, OSError, KeyError):  # nothing of that name
+    except (ValueError, OSError, KeyError):  # no zone has this name
         pass
     offset = re.fullmatch(r"(?:UTC)?([+-]\d\d):00", name)
     return f"Etc/GMT{-int(offset[1]):+d}" if offset and int(offset[1]) else "UTC"
 
 
 def _by_days(axis: Array) -> Array:
-    """Dates in days at least: nothing can be divided by a month."""
+    """Dates in units of at most a day, because nothing can be divided by a month."""
     coarse = np.datetime_data(axis.dtype)[0] in ("Y", "M", "W", "generic")
     return axis.astype("datetime64[D]") if coarse else axis
 
@@ -271,7 +271,7 @@ def _of_duration(length: np.timedelta64, given: Any) -> Clock:
 
 
 def _of_text(text: str) -> Clock:
-    """A count and a unit; codes of pandas may carry the month or weekday that they are anchored to."""
+    """A count and a unit; codes of pandas may contain the month or weekday to which they are anchored."""
     if text.strip() == LABEL:
         return Clock(LABEL)
     words, _, holidays = text.partition(" except ")
@@ -297,7 +297,7 @@ def _of_text(text: str) -> Clock:
 
 
 def _delta(count: int, unit: str) -> np.timedelta64:
-    """A duration of so many units that NumPy knows."""
+    """A duration of a number of NumPy units."""
     return np.timedelta64(count, unit)  # type: ignore[arg-type, call-overload, no-any-return, unused-ignore]
 
 
@@ -308,7 +308,7 @@ def _whole(text: str, count: float) -> float:
 
 
 def _of_offset(offset: Any) -> Clock:
-    """An offset of pandas, known by its attributes."""
+    """An offset of pandas, recognised by its attributes."""
     kwds = {name: value for name, value in getattr(offset, "kwds", {}).items() if name.endswith("s")}
     months = 12 * kwds.pop("years", 0) + kwds.pop("months", 0)
     kwds.pop("holidays", None)
@@ -333,7 +333,7 @@ def _refuse(given: Any) -> NoReturn:
 
 
 def _written(length: np.timedelta64) -> str:
-    """A duration in the largest unit of which it is a whole number."""
+    """A duration as an integer multiple of the largest possible unit."""
     for name, one in (("d", 86400), ("h", 3600), ("min", 60), ("s", 1)):
         if length % np.timedelta64(one, "s") == np.timedelta64(0, "s"):
             return f"{length // np.timedelta64(one, 's')}{name}"
@@ -361,9 +361,9 @@ def broken(gaps: Array, first: Array, reach: int) -> Array:
 
 
 def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: int, zone: str | None = None) -> None:
-    """Say it where most samples cannot be used because of dt, or where weekends cost a record of working days.
+    """Warn if most samples cannot be used because of dt, or if weekends cost a record of working days.
 
-    ``time`` and ``gaps`` (N,) hold one series after the other, each from its ``first`` sample on.
+    ``time`` and ``gaps`` (N,) contain one series after the other, each beginning at its ``first`` sample.
     """
     N = len(gaps)
     if reach * int(np.count_nonzero(gaps > GAP)) <= 0.1 * N:
@@ -382,14 +382,14 @@ def warn_of_gaps(clock: Clock, time: Array, gaps: Array, first: Array, reach: in
 
 
 class Pace:
-    """Counts the gaps of a stream, and says once that most of its samples cannot be used because of dt."""
+    """Counts the gaps of a stream, and warns once if most of its samples cannot be used because of dt."""
 
     def __init__(self, clock: Clock, reach: int) -> None:
         self._clock, self._reach = clock, reach
         self._count = self._gaps = 0
 
     def see(self, interval: float) -> None:
-        """Take the nominal interval before a sample in."""
+        """Count the nominal interval before a sample."""
         if not self._reach or self._count > LOOK:
             return
         self._count += 1

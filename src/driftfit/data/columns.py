@@ -1,7 +1,7 @@
-"""Columns of tables as arrays: what is a number, what is a time, what is missing, whatever the table is made of.
+"""Columns of tables as arrays: numbers, times and missing values, for every kind of table.
 
-Missing is what is null, NaN, infinite, empty, or says NA, N/A, NaN, null or None. Anything else that is not a number is
-the user's to put right: it is named with its row and its text.
+Null, NaN, infinite and empty cells are missing, and so are the texts NA, N/A, NaN, null and None. Anything else that is
+not a number raises an error that names its row and its text.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
 MISSING = ("", "na", "n/a", "nan", "null", "none")
-"""What people write in a cell that has no value, in lower case."""
+"""Cell contents that mean "no value", in lower case."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """The columns to read: numbers, perhaps a time, and what tells series apart."""
+    """The columns to read: numbers, perhaps a time, and the columns that identify the series."""
 
     numbers: tuple[str, ...]
     time: str | None = None
@@ -38,7 +38,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Columns:
-    """The chosen columns of one table: numbers (N,), times (N,) or None with their zone, and one list per ``by``."""
+    """The selected columns of one table: numbers (N,), times (N,) or None with their zone, and one list per ``by``."""
 
     numbers: Mapping[str, Array]
     time: Array | None
@@ -62,17 +62,17 @@ def _is_text(series: nw.Series[Any]) -> bool:
 
 
 def _as_text(series: nw.Series[Any]) -> pl.Series:
-    """Cells without surrounding blanks; null where they say that there is no value."""
+    """Cells without surrounding blanks; null if they mean "no value"."""
     cells = [cell if isinstance(cell, str) else None for cell in series.cast(nw.String).to_list()]
     text = pl.Series(series.name, cells, dtype=pl.String).str.strip_chars()
     return text.zip_with(~text.str.to_lowercase().is_in(MISSING), pl.Series([None], dtype=pl.String))
 
 
 def numbers_of(series: nw.Series[Any], where: str, base: int) -> Array:
-    """A column as floats, NaN where it has no value."""
+    """A column as floats, with NaN for missing values."""
     if _is_text(series):
         return _numbers_of_text(_as_text(series), where, base)
-    if series.dtype == nw.Object:  # decimals, None and whatever else Python holds, in one column
+    if series.dtype == nw.Object:  # decimals, None and other Python objects in one column
         return as_numbers(f"{where}, column {series.name!r}", series.to_list())
     if not (series.dtype.is_numeric() or series.dtype == nw.Boolean):
         raise ValueError(f"{where}: column {series.name!r} is of type {series.dtype}, which is not a number.")
@@ -91,14 +91,16 @@ def _numbers_of_text(text: pl.Series, where: str, base: int) -> Array:
 
 
 def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Array, str | None]:
-    """(numbers or datetime64 in UTC, zone); NaN or NaT where a row has no time."""
+    """(numbers or datetime64 in UTC, zone); NaN or NaT for rows without a time."""
     if _is_text(series):
         text = _as_text(series)
         if text.cast(pl.Float64, strict=False).is_null().eq(text.is_null()).all():
             return _numbers_of_text(text, where, base), None
         series = nw.from_native(_dates_of_text(text, where, base), series_only=True)
     native: Any = series.to_native()
-    if hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None:  # narwhals lacks zones that pandas has
+    if (
+        hasattr(native, "dt") and getattr(native.dtype, "tz", None) is not None
+    ):  # narwhals does not support all zones of pandas
         return np.asarray(native.dt.tz_convert(None).to_numpy()), zone_name(native.dtype.tz)
     if series.dtype == nw.Date:
         series = series.cast(nw.Datetime("us"))
@@ -113,7 +115,7 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
 def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
     try:
         dates = text.str.to_datetime(time_unit="us", strict=False)
-    except pl.exceptions.ComputeError:  # no date among the first cells to learn the format from
+    except pl.exceptions.ComputeError:  # the first cells contain no date from which to infer the format
         dates = pl.Series(text.name, [None] * len(text), dtype=pl.Datetime("us"))
     wrong = (dates.is_null() & text.is_not_null()).arg_true()
     if len(wrong):
@@ -125,7 +127,7 @@ def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
 
 
 def _units(series: nw.Series[Any]) -> list[Any]:
-    """The unit of every row; None where there is none. Text that reads as whole numbers becomes whole numbers."""
+    """The unit of every row, or None. Text that reads as integers becomes integers."""
     if not _is_text(series):
         return [None if value is None or value != value else value for value in series.to_list()]
     text = _as_text(series)

@@ -1,8 +1,8 @@
 """Files: CSV and Parquet, one or many, read with polars.
 
-CSV is read as text, so that a cell that is no number can be named; lines that begin with # are comments, and the header
-says whether cells are separated by comma, semicolon or tab. Of several files those that cannot be read are left out,
-with a warning, and kept with their reasons: one damaged file does not cost the others.
+CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments, and
+the header determines whether cells are separated by comma, semicolon or tab. If some of several files cannot be read,
+they are left out with a warning and kept with their reasons.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 
 FILE = "file"
-"""The name under which ``by`` may ask for the file that a row comes from."""
+"""The name with which ``by`` refers to the file that a row comes from."""
 
 
 def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str | None = None) -> dict[str, Array]:
@@ -35,7 +35,7 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
         For a column that the file does not have (with the nearest names), and for a cell that is not a number (with
         its row, counted from 1 after the header, and its text).
     OSError
-        Where the file cannot be read.
+        If the file cannot be read.
     """
     wanted = Wanted(tuple(names), time)
     columns = convert(_file(os.fspath(path), wanted), wanted, os.fspath(path), 1)
@@ -43,7 +43,7 @@ def read_columns(path: str | os.PathLike[str], names: Sequence[str], time: str |
 
 
 def read(data: Any, wanted: Wanted) -> tuple[Columns, dict[Hashable, str]]:
-    """The wanted columns of a table, a file, or several files one after the other."""
+    """The wanted columns of a table, a file, or the concatenation of several files."""
     if not isinstance(data, str | os.PathLike | list | tuple):
         return convert(_frame(data), wanted, "the table", 0), {}
     paths = _paths(data)
@@ -78,7 +78,7 @@ def _frame(data: Any) -> nw.DataFrame[Any]:
 
 
 def _paths(data: Any) -> list[str]:
-    """The files that a path, a pattern, or a list of both stands for, in order of their names."""
+    """The files given by a path, a pattern, or a list of both, sorted by name."""
     paths: list[str] = []
     for entry in data if isinstance(data, list | tuple) else [data]:
         text = os.fspath(entry)
@@ -111,7 +111,7 @@ def _file(path: str, wanted: Wanted) -> nw.DataFrame[Any]:
 
 
 def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
-    """(all column names, the wanted columns as text); separated by comma, semicolon or tab, as the header says."""
+    """(all column names, the wanted columns as text); the header determines whether the separator is , ; or tab."""
     with open(path, encoding="utf-8", errors="replace") as file:
         header = next((line for line in file if not line.startswith("#")), "")
     separator = max(",;\t", key=header.count)
@@ -121,7 +121,7 @@ def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
 
 
 def _together(parts: Mapping[str, Columns]) -> Columns:
-    """Files one after the other; their times must be of one kind."""
+    """Concatenate files; their times must be of one kind."""
     times = {path: part.time for path, part in parts.items() if part.time is not None}
     kinds = {time.dtype.kind: path for path, time in times.items()}
     if len(kinds) > 1:

@@ -1,8 +1,8 @@
-"""Series and data frames that are handed over as arrays: their numbers, their names, their index.
+"""Series and data frames that are passed as arrays: their numbers, their names, their index.
 
-Whatever narwhals reads (pandas, polars, pyarrow), and mappings from name to column. Columns go to the inputs of a model
-by name where both have names. Rows go together by place: where two indices of pandas differ the rows do not belong
-together, which is refused. An index of dates becomes the labels of the samples.
+They may be anything that narwhals reads (pandas, polars, pyarrow), or mappings from name to column. Columns are matched
+with the inputs of a model by name if both have names. Rows are matched by position; if two indices of pandas differ,
+the rows do not match and an error is raised. An index of dates becomes the labels of the samples.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from driftfit.engine.kernel import Array
 
 
 class Held(NamedTuple):
-    """What a user handed over: values for an array, names of its columns (empty: none), its index (None: none)."""
+    """What a user passed: values as an array, names of its columns (may be empty), and its index or None."""
 
     values: Any
     names: tuple[str, ...] = ()
@@ -26,7 +26,7 @@ class Held(NamedTuple):
 
 
 def held(what: str, given: Any) -> Held:
-    """Values (T,) or (T, m) with what they are called, from anything that a user hands over."""
+    """Values (T,) or (T, m) with their names, from anything that a user may pass."""
     if given is None or isinstance(given, np.ndarray | list | tuple | float | int):
         return Held(given)
     if isinstance(given, Mapping):
@@ -34,7 +34,7 @@ def held(what: str, given: Any) -> Held:
         together(**parts)
         index = next((part.index for part in parts.values() if part.index is not None), None)
         return Held(np.column_stack([part.values for part in parts.values()]), tuple(parts), index)
-    import narwhals as nw  # takes as long to import as all the rest
+    import narwhals as nw  # this import takes as long as all others together
 
     try:
         frame = nw.from_native(given, pass_through=True, allow_series=True)
@@ -54,12 +54,12 @@ def held(what: str, given: Any) -> Held:
 
 
 def _names(given: Sequence[Any]) -> tuple[str, ...]:
-    """Names of columns; none where one is not text, as the numbers that pandas gives to columns without names."""
+    """Names of columns; none if one is not text, such as the numbers that pandas gives to columns without names."""
     return tuple(given) if all(isinstance(name, str) and name for name in given) else ()
 
 
 def together(**parts: Held) -> None:
-    """ValueError where the indices of signals of one length differ: their rows do not belong together."""
+    """ValueError if the indices of signals of one length differ, because their rows then do not match."""
     with_index = [(name, part) for name, part in parts.items() if part.index is not None]
     for name, part in with_index[1:]:
         first, other = with_index[0]
@@ -76,7 +76,7 @@ def together(**parts: Held) -> None:
 
 
 class Times(NamedTuple):
-    """When the samples of a record were taken: times (T,) or None, their zone and name, and whether they only label."""
+    """When the samples were taken: times (T,) or None, their zone and name, and whether they are only labels."""
 
     axis: Array | None = None
     zone: str | None = None
@@ -85,7 +85,7 @@ class Times(NamedTuple):
 
 
 def times_of(time: Any, parts: Sequence[Held]) -> Times:
-    """The times that a user gave, or the first index of dates among the signals."""
+    """The times that a user passed, or the first index of dates among the signals."""
     if time is None:
         index = next((part.index for part in parts if _dated(part.index)), None)
         return Times() if index is None else _dates(index)._replace(labels=True)
@@ -105,7 +105,7 @@ def times_of(time: Any, parts: Sequence[Held]) -> Times:
 
 
 def _dated(index: Any) -> bool:
-    """Whether it is an index of dates or of periods."""
+    """Whether the index consists of dates or of periods."""
     return hasattr(index, "to_series") and (hasattr(index, "to_timestamp") or getattr(index.dtype, "kind", "") == "M")
 
 
@@ -120,7 +120,7 @@ def _dates(index: Any) -> Times:
 
 
 def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str = "inputs") -> list[int]:
-    """Where each wanted name stands among the given ones; ValueError where the two are not the same names."""
+    """The position of each wanted name among the given ones; ValueError if the two sets of names differ."""
     letter = "u" if what == "inputs" else "y"
     absent = [name for name in wanted if name not in given]
     more = [name for name in given if name not in wanted]
@@ -136,7 +136,7 @@ def order_of(owner: str, wanted: Sequence[str], given: Sequence[str], what: str 
 
 
 def ordered(model: Any, u: Array, names: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
-    """The columns of u (T, m), and their names, in the order of the inputs of a model, where both have names."""
+    """The columns of u (T, m) and their names, in the order of the inputs of a model, if both have names."""
     wanted = model.input_names
     if not wanted or not names or tuple(names) == wanted:
         return u, tuple(names)
@@ -150,7 +150,7 @@ def inputs_for(model: Any, u: Any, T: int) -> Array:
 
 
 def by_name(model: Any, u: Any) -> Any:
-    """One sample of inputs in the order of the model: a mapping or a labelled row by its names, others as they are."""
+    """One sample of inputs in the order of the model: a mapping or a labelled row by name, anything else unchanged."""
     if not hasattr(u, "keys"):
         return u
     given = tuple(u.keys())

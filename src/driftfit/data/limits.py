@@ -1,16 +1,16 @@
-"""Valid ranges of signals, and stretches to leave out: what is outside becomes missing, and is counted.
+"""Valid ranges of signals, and intervals to leave out: excluded values become missing and are counted.
 
-    limits = {"flow": (0, 80), "pressure": (None, 16)}     a number outside its range was never measured
-    exclude = [("2024-03-01", "2024-03-04"), (500, 620)]   from, to: both belong to the stretch, None has no end
+    limits = {"flow": (0, 80), "pressure": (None, 16)}     a number outside its range counts as missing
+    exclude = [("2024-03-01", "2024-03-04"), (500, 620)]   from, to: both are included, None leaves an end open
 
-Names are those of columns; for arrays "y", the names of the outputs or inputs of the model, "u" for every input, and
-"u1", "u2", .. or 0, 1, .. for one of them. Stretches are given in times, or in sample numbers where there is no time; a
-day, a month or a year as the end of one ("2024-03-04", a date) is that whole day, month or year, and dates without a
-zone are in the zone of the table.
+Names are those of columns; for arrays they are "y", the names of the outputs or inputs of the model, "u" for every
+input, and "u1", "u2", .. or 0, 1, .. for one of them. Intervals are given in times, or in sample numbers if there is no
+time. A day, a month or a year as the end ("2024-03-04", a date) includes that whole day, month or year, and dates
+without a zone are in the zone of the table.
 
-A sample of a stretch is neither used nor looked at: its output and its inputs are missing, so that nothing of it
-reaches a lag, and the samples after it whose lags reach into it are skipped as well. (Where the signals of a stretch
-are true and only nothing is to be learned from it, give ``weights`` of 0: then lags go on.)
+A sample of an excluded interval is not used at all: its output and its inputs are missing, so none of them enters a
+lag, and later samples whose lags reach into the interval are skipped as well. (If the signals of an interval are
+correct but should not be learned from, give ``weights`` of 0: they then still enter the lags.)
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from driftfit.engine.settings import near
 
 
 class Limits:
-    """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite where there is none."""
+    """Valid ranges of ny outputs and m inputs: ``low`` and ``high`` (ny + m,), infinite if there is no limit."""
 
     def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
         self.ny = len(outputs)
@@ -41,7 +41,7 @@ class Limits:
                 self.low[place], self.high[place] = low, high
 
     def _places(self, key: Any, m: int) -> list[int]:
-        """Which signals a key of the mapping means."""
+        """The signals to which a key of the mapping refers."""
         if isinstance(key, int | np.integer) and 0 <= key < m:
             return [self.ny + int(key)]
         if key in self.names:
@@ -60,7 +60,7 @@ class Limits:
 
 
 class Gate:
-    """Valid ranges of a stream: passes samples on, NaN for what is outside, and counts."""
+    """Valid ranges of a stream: replaces values outside their range by NaN, and counts them."""
 
     def __init__(self, limits: Mapping[Any, Any], outputs: Sequence[str], inputs: Sequence[str], m: int) -> None:
         self.given = dict(limits)
@@ -69,18 +69,18 @@ class Gate:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many numbers were outside, by signal."""
+        """How many numbers were outside their range, by signal."""
         found = zip(self._limits.names, self._counts.tolist(), strict=True)
         return {name: count for name, count in found if count}
 
     def sample(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Outputs (ny,) and inputs (.., m) of one sample, counted."""
+        """Outputs (ny,) and inputs (.., m) of one sample; values outside are counted."""
         out_y, out_u = self._limits.outside(y, u)
         self._counts += np.concatenate([out_y, out_u.reshape(-1, u.shape[-1]).sum(axis=0)])
         return np.where(out_y, np.nan, y), np.where(out_u, np.nan, u)
 
     def inputs(self, u: Array) -> Array:
-        """Inputs (.., m) that are asked about, not counted."""
+        """Inputs (.., m) of a query; values outside are not counted."""
         low, high = self._limits.low[self._limits.ny :], self._limits.high[self._limits.ny :]
         return np.where((u < low) | (u > high), np.nan, u)
 
@@ -105,7 +105,7 @@ def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
 
 
 def within(stretches: Any, time: Array | None, number: Array, zone: str | None = None) -> Array:
-    """Which samples lie in one of the stretches; ``number`` (N,) counts the samples of each series."""
+    """Which samples are in one of the intervals; ``number`` (N,) counts the samples of each series."""
     inside = np.zeros(len(number), dtype=bool)
     axis = number if time is None else time
     for stretch in stretches:
@@ -121,7 +121,7 @@ def within(stretches: Any, time: Array | None, number: Array, zone: str | None =
 def within_each(
     exclude: Any, keys: Sequence[Any], owner: Array, time: Array | None, number: Array, zone: str | None
 ) -> Array:
-    """Which samples of series one after the other are excluded: a list of stretches for all, or one for each key."""
+    """Which samples of concatenated series are excluded: one list of intervals for all, or one for each key."""
     if not isinstance(exclude, Mapping):
         return within(exclude or (), time, number, zone)
     absent = [key for key in exclude if key not in keys]
@@ -136,7 +136,7 @@ def within_each(
 
 
 def _end(given: Any, axis: Array, zone: str | None, upper: int) -> Any:
-    """One end of a stretch in the kind of the axis; a day or longer, as the upper end, is taken to its last moment."""
+    """One end of an interval in the kind of the axis; a day or longer, as the upper end, includes its last moment."""
     if given is None:
         return None
     try:
@@ -164,7 +164,7 @@ def _stamp(given: Any) -> Any:
 
 
 def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
-    """A moment that was given without a zone is in that of the table."""
+    """A moment given without a zone is in that of the table."""
     if zone is None or getattr(given, "tzinfo", None) is not None:
         return moment
     local = moment.astype("datetime64[us]").item().replace(tzinfo=ZoneInfo(zone))

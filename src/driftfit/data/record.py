@@ -1,7 +1,7 @@
-"""Records: many series one after the other in flat arrays, and what their signals are called.
+"""Records: several series in flat arrays, one after the other, with the names and units of their signals.
 
-This is what every fleet runs on, whether it came from a table, from rows of an array, or from one series under many
-settings: a lane reads from ``first`` on, for ``length`` samples.
+Every run reads its samples from here, whether they came from a table, from rows of an array, or from one series with
+several settings: a lane reads ``length`` samples, beginning at ``first``.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from driftfit.trackers.base import Tracker
 
 @dataclass(frozen=True)
 class Labels:
-    """What the signals of a series are called, in which units they are, and what was left out of it.
+    """The names and units of the signals of a series, and what was left out of it.
 
     ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
-    counts rows that never became samples, ``missing`` what was taken as missing though a number stood there, by
-    reason. ``by`` names what tells the series of a fleet apart. ``dt`` is the nominal interval as
-    `driftfit.data.clock.Clock.of` takes it.
+    counts rows that never became samples, and ``missing`` counts, by reason, numbers that were treated as missing.
+    ``by`` names the columns that identify the series of a fleet. ``dt`` is the nominal interval in the form that
+    `driftfit.data.clock.Clock.of` takes.
     """
 
     y: str = "y"
@@ -46,11 +46,11 @@ class Labels:
     dt: float | str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("u", "by"):  # lists, after a passage through JSON
+        for name in ("u", "by"):  # lists, if they come from JSON
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
     def unit(self, power: int, j: int | None) -> str:
-        """The unit of y to the power 0 or 1, over that of input j; empty where it is not known, or 1."""
+        """The unit of y to the power 0 or 1, divided by that of input j; empty if it is unknown or 1."""
         top = self.units.get(self.y, "") if power else ""
         bottom = "" if j is None or j >= len(self.u) else self.units.get(self.u[j], "")
         if (power and not top) or (j is not None and not bottom) or top == bottom:
@@ -74,7 +74,7 @@ def time_text(time: Any, zone: str | None) -> str:
 
 @dataclass(frozen=True)
 class Reading:
-    """How signals are to be read: what `driftfit.track.track` is given beside them, see there."""
+    """How signals are to be read: the further arguments of `driftfit.run.track.track`, described there."""
 
     time: Any = None
     dt: Any = None
@@ -160,9 +160,9 @@ class Records:
         return replace(self.labels, **{name: counts for name, counts in counted.items() if counts})  # type: ignore[arg-type]
 
     def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
-        """Inputs in the order of a model with named inputs, valid ranges and stretches taken into account.
+        """Sort the inputs for a model with named inputs, and apply valid ranges and excluded intervals.
 
-        Warns where most samples cannot be used because of dt, lags going back ``reach`` samples, or the model's.
+        Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
         found = replace(self, u=u, labels=replace(self.labels, u=names))
@@ -173,7 +173,7 @@ class Records:
         return found
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
-        """With NaN for what is outside valid ranges or in a stretch to leave out, counted."""
+        """Replace values outside valid ranges or in excluded intervals by NaN, and count them."""
         if not reading.limits and not reading.exclude:
             return self
         y, u, keys = self.y.copy(), self.u.copy(), self.keys

@@ -1,4 +1,4 @@
-"""Signals as users hand them over: arrays of numbers, times, and settings that must be complete."""
+"""Signals as users pass them: arrays of numbers, times, and settings that must be complete."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ S = TypeVar("S", bound=Settings)
 
 
 def check_ready(tracker: S) -> S:
-    """Refuse a tracker whose settings are not all numbers yet."""
+    """Raise an error for a tracker with missing settings."""
     missing = missing_settings(tracker)
     if missing:
         name = type(tracker).__name__
@@ -60,7 +60,7 @@ def noise_of(weights: Any, T: int | None = None) -> Array:
 
 
 def intervals(time: Any, dt: Any, T: int) -> tuple[Array, Array]:
-    """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise."""
+    """(time, nominal intervals (T,)) of a record; the first interval is 1. Unsorted or repeated times raise errors."""
     axis, _ = instants(time)
     if axis.shape != (T,):
         raise ValueError(f"time has shape {axis.shape}, but y has {T} samples.")

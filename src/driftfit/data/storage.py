@@ -1,7 +1,7 @@
-"""Files of states and results: one .npz each, arrays and a header of plain JSON, no pickle.
+"""Files of states and results: one .npz each, with arrays and a header of plain JSON, without pickle.
 
-A file is written beside its place and moved there in one step, so it is complete or absent. Classes are named by module
-and class; loading imports that module, so load only files from people whose code you would run.
+A file is written under a temporary name and then moved into place, so it is complete or absent. Classes are stored by
+module and class name; loading imports that module, so load only files from people whose code you would run.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ def rebuild(description: Mapping[str, Any], kind: type) -> Any:
     assert issubclass(found, Settings)
     try:
         return found.from_settings(dict(description["settings"]))
-    except TypeError as error:  # a setting that this version does not know
+    except TypeError as error:  # a setting that this version does not have
         raise ValueError(f"the file was written by another version: {error}.") from None
 
 
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Write a header and arrays, all or nothing."""
+    """Write a header and arrays completely or not at all."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
     file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
@@ -80,7 +80,7 @@ def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], d
         with np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
-    except Exception as error:  # damage has many faces: zipfile, NumPy and JSON raise a dozen kinds
+    except Exception as error:  # zipfile, NumPy and JSON raise a dozen kinds of errors for damaged files
         raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
     if header.get("format", 0) > FORMAT:
         raise ValueError(
@@ -92,7 +92,7 @@ def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], d
 
 
 class Kept(ABC):
-    """A stream that is saved, or sent as bytes, and goes on as if it had never stopped."""
+    """A stream that can be saved, or sent as bytes, and continues as if it had never stopped."""
 
     _kind: ClassVar[str]
 
@@ -103,10 +103,10 @@ class Kept(ABC):
     @classmethod
     @abstractmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        """The inverse of `_written`; ``source`` is for the message of an error."""
+        """The inverse of `_written`; ``source`` is named in error messages."""
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write model, settings and state to one file, without pickle; complete or not at all."""
+        """Write model, settings and state to one file without pickle, completely or not at all."""
         write(path, *self._written())
 
     @classmethod
@@ -121,7 +121,7 @@ class Kept(ABC):
         return cls._kinds()[header["kind"]]._read(os.fspath(path), header, arrays)
 
     def to_bytes(self) -> bytes:
-        """What `save` writes, for a queue or a database."""
+        """The content of a saved file as bytes, for a queue or a database."""
         file = BytesIO()
         _put(file, *self._written())
         return file.getvalue()
@@ -134,7 +134,7 @@ class Kept(ABC):
 
 
 def _encode(value: Any) -> Any:
-    """What JSON does not know: times and intervals."""
+    """Encode what JSON does not support: times and intervals."""
     if isinstance(value, datetime):
         return {"datetime": value.isoformat()}
     if isinstance(value, timedelta):
@@ -171,5 +171,5 @@ def restore(
 
 
 def fields(tile: Array) -> list[str]:
-    """Names of the fields that hold state."""
+    """Names of the fields that contain state."""
     return [name for name in tile.dtype.names or () if name != "pad"]

@@ -1,9 +1,9 @@
-"""Tables: columns of data frames and files as records for the lanes.
+"""Tables: columns of data frames and files become records.
 
-Anything that narwhals reads is a table: pandas, polars, pyarrow, and lazy frames; so are files (`driftfit.data.files`).
+Anything that narwhals reads is a table (pandas, polars, pyarrow, lazy frames); so is a file (`driftfit.data.files`).
 
-Rows belong to units (``by``), are put in order of time within each unit, and of rows at the same time the first
-stands. Rows without a unit or without a time never become samples; they are counted.
+Rows belong to units (``by``) and are sorted by time within each unit; of several rows at the same time the first is
+used. Rows without a unit or without a time never become samples; they are counted.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from driftfit.engine.kernel import Array
 def read_records(
     data: Any, y: str, u: str | Sequence[str] | None, by: str | Sequence[str] | None, reading: Reading
 ) -> tuple[Records, dict[Hashable, str]]:
-    """Columns of a table as records, and the reasons of units and files that gave none.
+    """Columns of a table as records, and the reasons why units and files have none.
 
     Raises
     ------
     ValueError
-        A column that is not there (with near matches), a cell that is not a number (with row and value), a file that
-        cannot be read, a table without a usable row.
+        For a column that does not exist (with near matches), a cell that is not a number (with row and value), a file
+        that cannot be read, or a table without a usable row.
     """
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
     axis = None if time is None else _name("time", time)
@@ -74,7 +74,7 @@ def _names(argument: str, value: Any) -> tuple[str, ...]:
 
 
 def _codes(columns: Columns) -> tuple[list[Hashable], Array]:
-    """(keys in order of appearance, the number of each row's key, -1 without one)."""
+    """(keys in order of appearance, the index of each row's key, -1 for rows without a key)."""
     if not columns.by:
         return [0], np.zeros(columns.rows, dtype=np.int64)
     index: dict[Hashable, int] = {}
@@ -91,7 +91,7 @@ def _tuples(by: Sequence[Sequence[Any]]) -> Iterator[Hashable]:
 def _order(
     time: Array | None, code: Array, keys: Sequence[Hashable], dropped: dict[Hashable, dict[str, int]]
 ) -> tuple[Array, Array | None]:
-    """(the rows that become samples, unit by unit in order of time; their times); counts the others."""
+    """(the rows that become samples, unit by unit and sorted by time; their times); the other rows are counted."""
     _count(dropped, [None], np.zeros(int((code < 0).sum()), dtype=np.int64), "without a unit")
     if time is None:
         order = np.argsort(code, kind="stable")
@@ -113,14 +113,14 @@ def _count(dropped: dict[Hashable, dict[str, int]], keys: Sequence[Hashable], co
 
 
 def _gaps(time: Array, first: Array, clock: Clock) -> Array:
-    """Nominal intervals since the last sample of the same unit; 1 at its first."""
+    """Nominal intervals since the previous sample of the same unit; 1 at the first."""
     gaps = clock.steps(time)
     gaps[first] = 1.0
     return gaps
 
 
 def _factor(given: Any, values: Mapping[str, Array], convert: Any) -> Array:
-    """A known factor that is one number or the name of a column; a cell without a value is 1."""
+    """A known factor, given as one number or the name of a column; a cell without a value is 1."""
     if not isinstance(given, str):
         return np.asarray(convert(given))
     column = np.where(np.isfinite(values[given]), values[given], 1.0)

@@ -3,14 +3,14 @@
     m_t = a m_{t-1} + b_income income_t + b_rate rate_t + c + v_t
 
 with m and income the logarithms of real M1 (deflated by consumer prices) and real GDP, both relative to 1959 Q1, and
-rate the three-month treasury bill rate in percent a year. This is the equation whose forecasts went wrong after 1973.
-Each coefficient may follow a random walk; which one does, how fast, and r are those of the highest likelihood. Where
-the logarithms are zero changes nothing while the coefficients stay, but it does when they drift: relative to 1959 Q1 a
-moving coefficient of income turns the line about its start.
+rate the three-month treasury bill rate in percent per year. The forecasts of this equation failed after 1973.
+Each coefficient may follow a random walk; which one does, how fast, and r are chosen by maximum likelihood. The origin
+of the logarithms does not matter while the coefficients are constant, but it does when they drift: relative to 1959 Q1
+a change of the coefficient of income rotates the line about its start.
 
 Source of the equation: Goldfeld, The Demand for Money Revisited (1973); of its failure: Goldfeld, The Case of the
-Missing Money (1976). Departures: M1 and prices are those of the end of the quarter, one interest rate instead of two,
-and the rate is not in logarithms.
+Missing Money (1976). Departures: M1 and prices are those of the end of the quarter, there is one interest rate instead
+of two, and the rate is not in logarithms.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ CHOICES = {
 """Which coefficients may drift."""
 
 RATIOS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
-"""What the drift of one quarter adds to the variance of y through one coefficient, in units of r."""
+"""Variance that the drift of one quarter adds to y through one coefficient, in units of r."""
 
 SETTLED = 50
-"""Quarters before the estimates are looked at: the bands are wide until then."""
+"""Quarters before estimates are evaluated: the bands are wide until then."""
 
 CRISIS = 2008.0
-"""The record is also searched without what comes after, where money jumped."""
+"""The search is repeated without the quarters from here on, in which money jumped."""
 
 HORIZON = 8
-"""Quarters within which the largest move is looked for."""
+"""Quarters within which the largest change is searched for."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Record:
 
 
 def read_record() -> Record:
-    """The record that comes with the package."""
+    """The record that is shipped with the package."""
     with resources.as_file(resources.files("driftfit") / "demo" / "us_money_demand.csv") as path:
         data = read_columns(path, ["year", "quarter", "m1", "cpi", "realgdp", "tbilrate"])
     money, income = np.log(data["m1"] / data["cpi"]), np.log(data["realgdp"])
@@ -89,9 +89,9 @@ def read_record() -> Record:
 
 
 def fit(record: Record, drifting: tuple[int, ...], ratio: float) -> Track:
-    """The run with q_i = ratio r / mean(phi_i^2) for the drifting coefficients and the most likely r.
+    """The run with q_i = ratio r / mean(phi_i^2) for the drifting coefficients and the maximum likelihood r.
 
-    With q in units of r the likelihood has its maximum over r in closed form: at r = 1 the mean of e^2 / s.
+    With q in units of r the likelihood is maximised over r in closed form: r is the mean of e^2 / s at r = 1.
     """
     regressors = np.column_stack([record.y, record.u, np.ones(len(record.y))])
     q = np.zeros(MODEL.n)
@@ -115,18 +115,18 @@ class Search:
 
     @property
     def best(self) -> tuple[str, float]:
-        """The choice and the ratio of the highest likelihood."""
+        """The choice and the ratio with the highest likelihood."""
         cells = [(which, ratio) for which, row in self.runs.items() for ratio in row]
         return max(cells, key=lambda cell: self.runs[cell[0]][cell[1]].loglik)
 
     @property
     def run(self) -> Track:
-        """The run of the highest likelihood."""
+        """The run with the highest likelihood."""
         which, ratio = self.best
         return self.runs[which][ratio]
 
     def gain(self, which: str) -> float:
-        """Log-likelihood over no drift at the best ratio of a choice."""
+        """Increase of the log-likelihood over no drift, at the best ratio of a choice."""
         return max(run.loglik for run in self.runs[which].values()) - self.still.loglik
 
 
@@ -137,7 +137,7 @@ def search(record: Record) -> Search:
 
 
 def grid(found: Search) -> Table:
-    """Log-likelihood gained over no drift, for every choice and ratio."""
+    """Table of the increase of the log-likelihood over no drift, for every choice and ratio."""
     table = Table(title=" Log-likelihood gained by drift", title_justify="left", title_style="bold", box=SIMPLE_HEAD)
     table.show_edge = False
     table.add_column("ratio:")
@@ -176,7 +176,7 @@ def dated(run: Track, i: int, t: int) -> str:
 
 
 def sentence(found: Search) -> str:
-    """What the numbers bear out."""
+    """The conclusion from the numbers."""
     which, run = found.best[0], found.run
     i = CHOICES[which][0]
     move = largest_move(run.theta[:, i])
@@ -188,7 +188,7 @@ def sentence(found: Search) -> str:
 
 
 def caveat(found: Search, early: Search) -> str:
-    """What the numbers do not say; ``early`` is the search before the crisis of 2008."""
+    """What the numbers do not show; ``early`` is the search before the crisis of 2008."""
     i = CHOICES[found.best[0]][0]
     move = largest_move(found.run.theta[:, i])
     low, high = (bound[:, i] for bound in found.run.band(0.95))
@@ -204,12 +204,12 @@ def caveat(found: Search, early: Search) -> str:
 
 
 def free(record: Record) -> Track:
-    """The run of the tracker that needs no numbers: every coefficient may drift, nothing is searched."""
+    """The run of the tracker that needs no settings: every coefficient may drift, and nothing is searched."""
     return track(MODEL, AdaptiveKalman(), record.y, record.u, time=record.time, dt=0.25)
 
 
 def beside(found: Search, adaptive: Track) -> str:
-    """What the tracker without settings finds of the same coefficient."""
+    """What the tracker without settings estimates for the same coefficient."""
     i = CHOICES[found.best[0]][0]
     move = largest_move(adaptive.theta[:, i])
     before, after = (dated(adaptive, i, t) for t in move)
@@ -222,10 +222,10 @@ def beside(found: Search, adaptive: Track) -> str:
 
 
 def show(out: Console, progress: Console, picture: Path) -> None:
-    """Print the grid, the summary and what they say, and save the picture."""
+    """Print the grid, the summary and the conclusions, and save the picture."""
     record = read_record()
     with progress.status("tracking (the first run compiles)"):
-        # what it compiles is on disk when this process needs it: a cold demo takes two thirds of the time on two cores
+        # the code it compiles is on disk when this process needs it: a cold demo takes a third less time on two cores
         ahead = get_context("spawn").Process(target=free, args=(record,))
         ahead.start()
         found, early = search(record), search(record.until(CRISIS))
@@ -259,11 +259,11 @@ EVENTS = (
     (1994.0, 1997.0, "banks sweep deposits\nout of M1, from 1994"),
     (2008.0, 2009.5, "crisis,\n2008"),
 )
-"""What histories of the period speak of; the fit knows nothing of it."""
+"""Events that histories of the period describe; the fit does not use them."""
 
 
 def draw(found: Search, adaptive: Track) -> Figure:
-    """The drifting coefficient with its band, and what the tracker without settings finds; prediction, innovations."""
+    """The drifting coefficient with its band, the estimate of the tracker without settings; prediction, innovations."""
     figure = new_figure(10.0, 8.5)
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=[2.6, 1.0, 1.0])
     _draw_path(top, found, adaptive)
@@ -273,7 +273,7 @@ def draw(found: Search, adaptive: Track) -> Figure:
     years = range(1965, 2010, 5)
     bottom.set_xticks(years, [quarter(year) for year in years])
     bottom.set_xticks(range(1963, 2011), minor=True)
-    bottom.set_xlim(1963.0, 2010.0)  # before, the band of the coefficient fills the picture
+    bottom.set_xlim(1963.0, 2010.0)  # before that, the band of the coefficient fills the picture
     figure.align_ylabels()
     return figure
 

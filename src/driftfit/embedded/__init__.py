@@ -1,7 +1,8 @@
-"""A tracker as standalone C99, for controllers that run no Python.
+"""Export a tracker as standalone C99, for controllers without Python.
 
-The source is translated from the steps that run live, on records and in fleets (`driftfit.embedded.statements`), so a
-new tracker can be exported by being there, and the double build gives the same bits. States travel both ways as bytes.
+The source is translated from the steps that run live, on records and in fleets (`driftfit.embedded.statements`). A new
+tracker can therefore be exported without further work, and the double-precision build gives the same bits. States can
+be transferred in both directions as bytes.
 """
 
 from __future__ import annotations
@@ -25,15 +26,15 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
     Parameters
     ----------
     model, tracker : Model, Tracker
-        As for `Live`: a model with several inputs must say so. All trackers but `Bank`.
+        As for `Live`: the model must declare its inputs if there are several. All trackers except `Bank`.
     path : path
-        The folder; it is made where it is not there, and files of these names are replaced.
+        The folder; it is created if it does not exist, and files of these names are replaced.
 
     Raises
     ------
     ValueError
-        For a `Bank`, whose machine works in vectors of eight numbers that have no place on a controller; for several
-        outputs; for incomplete settings; for a step of one's own that uses what has no translation.
+        For a `Bank`, whose compiled routine works with vectors of eight numbers and on many leaves; for several
+        outputs; for incomplete settings; for a user's step that uses something without a translation.
     """
     if tracker.weighs:
         raise ValueError(
@@ -48,17 +49,17 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
 
 
 def to_struct(live: Live) -> bytes:
-    """The state of a stream as the bytes of ``tracker_state`` (double build, the byte order of this computer)."""
+    """The state of a stream as the bytes of ``tracker_state`` (double precision, the byte order of this computer)."""
     return record_bytes(live.program.tile(live.lane()))
 
 
 def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
-    """A stream that goes on from the bytes of a ``tracker_state`` of the double build.
+    """A stream that continues from the bytes of a ``tracker_state`` of the double-precision build.
 
     Raises
     ------
     ValueError
-        If there are not as many bytes as this model and tracker need.
+        If the number of bytes is not the one that this model and tracker need.
     """
     live = Live(model, tracker)
     lane = live.lane()

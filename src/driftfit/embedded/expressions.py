@@ -1,4 +1,4 @@
-"""Expressions of steps in C: names, numbers, places of arrays, arithmetic, and the few functions that steps call."""
+"""Expressions of steps in C: names, numbers, array elements, arithmetic, and the few functions that steps call."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_p
 
 
 class Expressions:
-    """The part of a translator that turns expressions into values; `driftfit.embedded.statements` has the rest."""
+    """The part of the translator that turns expressions into values; `driftfit.embedded.statements` has the rest."""
 
     stored: Counter[str]
     ops: list[Counter[str]]
@@ -37,7 +37,7 @@ class Expressions:
 
     @contextmanager
     def lazily(self) -> Iterator[None]:
-        """Within this an expression may not be computed before its statement, since it may not be computed at all."""
+        """In this context an expression may not be moved before its statement, since it may not be evaluated at all."""
         self.lazy += 1
         yield
         self.lazy -= 1
@@ -104,7 +104,7 @@ class Expressions:
         return view(owner, index)
 
     def _part(self, node: ast.Slice, size: int) -> range:
-        """The part of an axis that a slice keeps."""
+        """The part of an axis that a slice selects."""
         bounds = (node.lower, node.upper)
         ends = [None if one is None else self.value(one).constant for one in bounds]
         unknown = any(one is not None and end is None for one, end in zip(bounds, ends, strict=True))
@@ -113,7 +113,7 @@ class Expressions:
         return range(size)[slice(*ends)]
 
     def _entry(self, table: Value, index: list[Value]) -> Value:
-        """An entry of a table: a constant where its place is known."""
+        """An entry of a table; a constant if its index is known."""
         if all(one.known for one in index):
             inner = table.constant
             for one in index:
@@ -140,7 +140,7 @@ class Expressions:
         return self.binary(node.op, one, self.value(node.right))
 
     def binary(self, operator: ast.operator, one: Value, other: Value) -> Value:
-        """One operation of two numbers."""
+        """One operation on two numbers."""
         kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
         if one.known and other.known and kind in RANK:
             return number(_folded(operator, one.constant, other.constant))
@@ -222,7 +222,7 @@ class Expressions:
         return self._builtin(node, function, arguments)
 
     def _at_address(self, arguments: list[Value]) -> Value:
-        """An array of these extents; only the first of them may be unknown."""
+        """An array with these extents; only the first of them may be unknown."""
         extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
         strides = [int(np.prod(extents[axis + 1 :])) for axis in range(len(extents))]
         return Value("array", arguments[0].text, shape=tuple(extents), strides=tuple(strides))
@@ -255,7 +255,7 @@ class Expressions:
         return self.refuse(node)  # type: ignore[no-any-return]
 
     def _extreme(self, function: Any, one: Value, other: Value) -> Value:
-        """Python's rule: the second only where it is beyond the first, so that NaN and signed zeros fall alike."""
+        """Python's rule: return the second only if it is beyond the first, which decides NaN and signed zeros."""
         if one.known and other.known:
             return number(function(one.constant, other.constant))
         kind = joined(one.kind, other.kind)
@@ -267,7 +267,7 @@ class Expressions:
         return Value(kind, f"{prefix}{function.__name__}imum({one.text}, {other.text})", most=most)
 
     def _reinterpreted(self, node: ast.Call) -> Value:
-        """The bits of a number as another kind."""
+        """Reinterpret the bits of a number as another type."""
         assert isinstance(node.func, ast.Attribute)
         inner, to = self.value(node.func.value), self.value(node.args[0]).constant
         return (
@@ -291,7 +291,7 @@ def _real(value: Value) -> str:
 
 
 def _most(sign: str, one: Value, other: Value) -> int | None:
-    """A bound of a sum or product of whole numbers that are not negative."""
+    """An upper bound of a sum or product of nonnegative integers."""
     if one.most is None:
         return None
     if sign == "-":

@@ -128,7 +128,7 @@ static int64_t bits_of(double number) {
     return count;
 }""",
 }
-"""What the translated steps may call."""
+"""The functions that translated steps may call."""
 
 README = """\
 # {what}
@@ -190,7 +190,7 @@ def _fields(tile: Array) -> str:
 
 
 def _source(unit: Unit, entry: Function, tile: Array, memory: set[str]) -> str:
-    """Tables, functions and the public face."""
+    """Tables, functions and the public interface."""
     steps = "\n\n".join(function.text for function in unit.functions.values())
     support = [text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)]
     start = f"static const tracker_state START = {{\n{_initial(tile)}\n}};"
@@ -228,7 +228,7 @@ def _face(entry: Function, tile: Array, memory: set[str]) -> str:
 
 
 def _ordinary(unit: Unit) -> Counter[str]:
-    """Operations of a sample after the start: without what only the start calls."""
+    """Operations of a sample after the start: those that only the start calls are left out."""
     operations = {function.name: function.operations for function in unit.functions.values()}
     if "advance" not in operations:
         return operations["sample"]
@@ -237,19 +237,19 @@ def _ordinary(unit: Unit) -> Counter[str]:
 
 
 def _said(ops: Counter[str]) -> str:
-    """Operations as words."""
+    """Operations in words."""
     kinds = {"multiply": "multiplication", "add": "addition", "divide": "division", "square root": "square root"}
     said = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
     return ", ".join(said[:-1]) + f" and {said[-1]}" if len(said) > 1 else "".join(said)
 
 
 def write(path: Path, texts: dict[str, Any]) -> None:
-    """Write the files into a folder, which is made where it is not there."""
+    """Write the files into a folder, which is created if it does not exist."""
     path.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (path / name).write_text(text, encoding="utf-8")
 
 
 def record_bytes(tile: Array) -> bytes:
-    """The state as the double build's structure holds it."""
+    """The state as it is stored in the structure of the double-precision build."""
     return b"".join(np.ascontiguousarray(tile[name][0]).tobytes() for name in fields(tile))

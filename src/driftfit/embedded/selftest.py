@@ -59,11 +59,11 @@ int main(void) {{
 """
 
 BOUND = 0.05
-"""How far single precision may be off, as a share of the largest result."""
+"""Largest error of single precision, as a share of the largest result."""
 
 
 def record(model: Model, T: int = SAMPLES, seed: int = 0) -> tuple[Array, Array]:
-    """y (T,), u (T, m): a stable system whose gain doubles, with holes, an outage and a spell of silent inputs."""
+    """y (T,), u (T, m): a stable system whose gain doubles, with missing data, an outage and constant inputs."""
     rng = np.random.default_rng(seed)
     m = max(model.m, 1)
     u = rng.standard_normal((T, m))
@@ -79,7 +79,7 @@ def record(model: Model, T: int = SAMPLES, seed: int = 0) -> tuple[Array, Array]
 
 
 def selftest(model: Model, tracker: Tracker) -> str:
-    """The program's text."""
+    """The text of the test program."""
     y, u = record(model)
     live = Live(model, tracker)
     steps = np.array([live.update(float(y[t]), u[t, : model.m]) for t in range(SAMPLES)], dtype=float)

@@ -1,13 +1,12 @@
-"""Steps as C: the Python source of a compiled function, and of all that it calls, for the shapes of one record.
+"""Translate steps to C: the Python source of a compiled function, and of all that it calls, for the shapes of a record.
 
 The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
-Whole numbers, tables and functions that are known become constants of the text; branches that a constant closes are
-left out; a function is written once for each set of shapes that it is called with. What a step may use is what
-`driftfit.engine.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so
-that the double build gives the same bits as the compiled steps where the C compiler neither contracts nor reorders
-them.
+Known integers, tables and functions become constants of the text, branches that a constant excludes are left out, and a
+function is written once for each set of shapes with which it is called. A step may use what `driftfit.engine.kernel`
+allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so the double-precision build
+gives the same bits as the compiled steps if the C compiler neither contracts nor reorders them.
 
-The number of operations is counted along the way: loops at their longest, the dearer of two branches.
+The number of operations is counted along the way: loops at their longest, and the more expensive of two branches.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ RESERVED = frozenset(
     short signed sizeof static struct switch typedef union unsigned void volatile while real inline restrict
     """.split()  # noqa: SIM905
 )
-"""Words that may not name a variable or function."""
+"""Words that cannot be names of variables or functions in C."""
 
 
 def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
-    """The C function of a Python function for these arguments, translated where it has not been yet."""
+    """The C function of a Python function for these arguments; it is translated on the first call."""
     captured = tuple(id(cell.cell_contents) for cell in source.__closure__ or ())
     key = (source.__code__, captured, tuple(one.key() for one in arguments))
     if key not in unit.functions:
@@ -47,7 +46,7 @@ def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
 
 
 class Body(Expressions):
-    """One function on its way into C."""
+    """One function during its translation."""
 
     def __init__(self, unit: Unit, source: Any, arguments: list[Value]) -> None:
         tree = ast.parse(textwrap.dedent(inspect.getsource(source))).body[0]
@@ -63,7 +62,7 @@ class Body(Expressions):
         self.given = self._parameters(arguments)
 
     def _parameters(self, arguments: list[Value]) -> dict[str, Value]:
-        """The arguments under their names; those that are known take no place in the signature."""
+        """The arguments by name; those with known values do not appear in the signature."""
         named = {}
         for argument, one in zip(self.tree.args.args, arguments, strict=True):
             name = self.safe(argument.arg)
@@ -82,18 +81,18 @@ class Body(Expressions):
             elif one.kind in RANK:
                 self.parameters.append(f"{TYPES[one.kind]} {name}")
                 named[argument.arg] = Value(one.kind, name, most=one.most)
-                if argument.arg in self.stored:  # a parameter that is used up
+                if argument.arg in self.stored:  # a parameter that is modified
                     self.kinds[argument.arg] = one.kind
             else:
                 raise TranslationError(f"{self.source.__name__}: an argument of kind {one.kind}.")
         return named
 
     def safe(self, name: str) -> str:
-        """A name that C allows for a variable."""
+        """A name that is valid for a variable in C."""
         return f"{name}_" if name in RESERVED else name
 
     def function(self, name: str) -> Function:
-        """Translate until the kinds of variables and of what is returned hold."""
+        """Translate repeatedly until the kinds of variables and of the returned value are stable."""
         while True:
             before = dict(self.kinds), self.returns
             self.locals, self.ops, self.temporaries = dict(self.given), [Counter()], 0
@@ -118,7 +117,7 @@ class Body(Expressions):
         return Function(name, self.returns, text, self.ops[0])
 
     def _of_doubles(self, name: str, text: str) -> str:
-        """A function that works on the bits of doubles; in single precision that of the library, which is quicker."""
+        """A function that works on the bits of doubles; single precision uses that of the C library, for speed."""
         if self.source.__name__ not in ("exp", "log"):
             raise TranslationError(f"{self.source.__qualname__}: only exp and log may work on the bits of numbers.")
         text = re.sub(r"\breal\b", "double", re.sub(r"\bR\(", "(", text))
@@ -126,7 +125,7 @@ class Body(Expressions):
         return f"#ifdef TRACKER_SINGLE\n{short}\n#else\n{text}\n#endif"
 
     def _reads(self, name: str) -> bool:
-        """Whether a variable stands anywhere but on the left of an assignment."""
+        """Whether a variable is used anywhere except on the left of an assignment."""
         return any(re.search(rf"\b{name}\b", re.sub(rf"^\s*{name} = ", "", line)) for line in self.lines)
 
     # statements
@@ -135,7 +134,7 @@ class Body(Expressions):
         self.lines.append(f"{'    ' * len(self.ops)}{text}")
 
     def block(self, body: list[ast.stmt]) -> bool:
-        """Translate statements; returns whether nothing after them is reached."""
+        """Translate statements; returns whether statements after them are unreachable."""
         for statement in body:
             handler = getattr(self, f"on_{type(statement).__name__.lower()}", None)
             if handler is None:
@@ -145,7 +144,7 @@ class Body(Expressions):
         return False
 
     def nested(self, body: list[ast.stmt]) -> tuple[Counter[str], bool]:
-        """A block of its own; returns its operations, and whether it always returns."""
+        """A nested block; returns its operations, and whether it always returns."""
         self.ops.append(Counter())
         ended = self.block(body)
         return self.ops.pop(), ended
@@ -190,7 +189,7 @@ class Body(Expressions):
             self.ops[-1]["store"] += 1
 
     def held(self, value: Value) -> Value:
-        """A value in a variable of its own, so that a later assignment does not change it."""
+        """Store a value in a separate variable, so that a later assignment does not change it."""
         if value.known or value.kind not in RANK:
             return value
         name = self.temporary(value.kind)
@@ -257,7 +256,7 @@ class Body(Expressions):
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
 
     def largest(self, value: Value) -> int:
-        """A bound of a loop, or the largest extent of the record where it is not known."""
+        """Upper bound of a loop, or the largest extent of the record if it is not known."""
         return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
@@ -288,7 +287,7 @@ class Body(Expressions):
     # calls of other steps
 
     def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
-        """A call; its result is taken into a variable before the statement that uses it."""
+        """A call; its result is stored in a variable before the statement that uses it."""
         function = translate(self.unit, source, arguments)
         self.ops[-1] += function.operations
         passed = [text for one in arguments if (text := _passed(one))]
@@ -312,7 +311,7 @@ class Body(Expressions):
 
 
 def _passed(value: Value) -> str:
-    """What stands for an argument in the call; nothing where it is known."""
+    """The expression passed for an argument; nothing if its value is known."""
     if value.kind in ("record", "tile"):
         return "s"
     if value.kind in ("array", "address"):

@@ -1,4 +1,4 @@
-"""One C source file in the making: the functions translated so far, callees first, and tables of constants."""
+"""One C source file under construction: the functions translated so far, callees first, and tables of constants."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from driftfit.embedded.values import joined, lifted
 from driftfit.engine.kernel import Array
 
 TYPES = {"real": "real", "int": "int", "long": "int64_t", "bool": "int", "four": "four"}
-"""Kinds of numbers as C writes them."""
+"""C types of the kinds of numbers."""
 
 
 class TranslationError(ValueError):
-    """A step uses what has no translation."""
+    """A step uses something that has no translation."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """One function in C: its text, the kinds of what it returns, and how many operations it takes at most."""
+    """One function in C: its text, the kinds of its results, and an upper bound of its operations."""
 
     name: str
     returns: tuple[str, ...]
@@ -38,7 +38,7 @@ class Unit:
         self.tables: dict[str, str] = {}
         self.names: Counter[str] = Counter()
         self.largest = max((size for name in record.dtype.names or () for size in record[name].shape), default=1)
-        """The largest extent in the record: how often a loop runs at most of which nothing is known."""
+        """The largest extent in the record: the upper bound of loops about which nothing else is known."""
 
     def table(self, values: Any) -> tuple[str, str]:
         """(name, kind) of a table of constants."""

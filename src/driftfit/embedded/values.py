@@ -1,10 +1,10 @@
-"""What an expression of a step is to the translator: its text in C, its kind, and its value where it is a constant.
+"""The translator's view of an expression: its text in C, its kind, and its value if it is a constant.
 
-real    a floating-point number: double, or float where the source is compiled for it
-int     a whole number that a loop or a constant gives; long, one of 64 bits from the record; bool, a truth value
+real    a floating-point number: double, or float if the source is compiled for it
+int     an integer from a loop or a constant; long, a 64-bit integer from the record; bool, a truth value
 record  the state; tile, an array of one state
-array   numbers in memory: where they begin, their shape, and the distance between neighbours on every axis
-address where the numbers of an array begin, as a machine takes it
+array   numbers in memory: their start, their shape, and the stride of every axis
+address the address of the first number of an array
 four    four numbers that are computed together
 table   a tuple or an array of constants; python, a function or module; nothing, no value
 """
@@ -20,10 +20,10 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 RANK = {"bool": 0, "int": 1, "long": 2, "real": 3, "four": 4}
-"""Kinds of numbers, the wider the higher."""
+"""Kinds of numbers, from narrow to wide."""
 
 BIGGEST_SINGLE, SMALLEST_SINGLE = 1e18, 1e-30
-"""Constants beyond these become these in single precision, where their squares would overflow or vanish."""
+"""Constants beyond these are replaced by them in single precision, where their squares would overflow or vanish."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Value:
     element: str = "real"
     scalar: bool = False
     most: int | None = None
-    """The largest value of a whole number, where it is known: how often a loop runs at most."""
+    """The largest value of an integer if it is known: an upper bound of a loop."""
 
     @property
     def known(self) -> bool:
@@ -46,7 +46,7 @@ class Value:
         return self.constant is not None
 
     def key(self) -> tuple[Any, ...]:
-        """What a translated function is specialised on; constants of whole numbers are, those of floats are not."""
+        """The key of specialisation: constant integers are part of it, constant floats are not."""
         fixed = self.constant if self.kind in ("bool", "int", "table", "python") else None
         fixed = id(fixed) if self.kind in ("table", "python") else fixed
         return self.kind, fixed, self.shape, self.strides, self.element, self.scalar
@@ -63,7 +63,7 @@ def number(value: Any) -> Value:
 
 
 def literal(x: float) -> str:
-    """A floating-point constant with all its bits, and what takes its place in single precision."""
+    """A floating-point constant with all its bits, and its replacement in single precision."""
     if np.isnan(x):
         return "NAN"
     if np.isinf(x):
@@ -76,7 +76,7 @@ def literal(x: float) -> str:
 
 
 def joined(*kinds: str) -> str:
-    """The kind of number that holds all of these."""
+    """The kind of number that can represent all of these."""
     return max(kinds, key=lambda kind: RANK[kind])
 
 
@@ -101,7 +101,7 @@ def _strides(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def view(array: Value, index: Sequence[Value | range]) -> Value:
-    """Part of an array, or one number of it; a range keeps that part of an axis."""
+    """Part of an array, or one number of it; a range selects part of an axis."""
     offset: list[str] = []
     shape, strides = [], []
     for axis, one in enumerate(index):
@@ -127,12 +127,12 @@ def begin_of(array: Value) -> str:
 
 
 def renamed(value: Value, text: str) -> Value:
-    """The same value under the name that a parameter has; a scalar of the record is one number behind an address."""
+    """The same value under the name of a parameter; a scalar of the record is one number behind an address."""
     return replace(value, text=text, scalar=False)
 
 
 def bare(text: str) -> str:
-    """An expression without the brackets around all of it."""
+    """An expression without outer brackets."""
     depth = 0
     if not (text.startswith("(") and text.endswith(")")):
         return text

@@ -10,7 +10,7 @@ from driftfit.engine.kernel import Array
 
 
 def as_numbers(name: str, values: Any) -> Array:
-    """Values as floats; None and masked entries become NaN, text is named with its place."""
+    """Values as floats; None and masked entries become NaN; for text the error names its position."""
     if isinstance(values, np.ma.MaskedArray):
         values = np.ma.filled(values.astype(float), np.nan)
     try:

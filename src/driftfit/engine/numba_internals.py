@@ -16,6 +16,7 @@ in a sentence what broke. Tried with the versions in `TRIED`.
     symbols        add_symbol, llvm_cfunc_wrapper   machines are called by name
     arrays         context.make_array,              an array at an address without reference counts
                    populate_array
+    fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
 What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,
@@ -49,10 +50,11 @@ from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
 
-__all__ = ["dumps", "ir"]
+__all__ = ["AttributeTemplate", "dumps", "ir"]
 
 TRIED = {
     "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
@@ -390,16 +392,21 @@ def _array(dtype: Any, *shape: Any) -> Any:
     array = types.Array(dtype, len(shape), "C")
 
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        made = context.make_array(array)(context, builder)
-        kind = context.get_data_type(dtype)
-        strides = [context.get_constant(types.intp, context.get_abi_sizeof(kind))]
-        for length in reversed(given[2:]):
-            strides.insert(0, builder.mul(strides[0], length))
-        data = builder.inttoptr(given[0], kind.as_pointer())
-        populate_array(made, data=data, shape=list(given[1:]), strides=strides, itemsize=strides[-1], meminfo=None)
-        return made._getvalue()
+        return array_at(context, builder, array, given[0], given[1:])
 
     return array(types.intp, *(types.intp for _ in shape)), build
+
+
+def array_at(context: Any, builder: Any, array: Any, address: Any, shape: Any) -> Any:
+    """The C array of a type and shape that begins at an address, while code is built."""
+    made = context.make_array(array)(context, builder)
+    kind = context.get_data_type(array.dtype)
+    strides = [context.get_constant(types.intp, context.get_abi_sizeof(kind))]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    data = builder.inttoptr(address, kind.as_pointer())
+    populate_array(made, data=data, shape=list(shape), strides=strides, itemsize=strides[-1], meminfo=None)
+    return made._getvalue()
 
 
 def matrix_at(name: str, dtype: Any) -> Any:

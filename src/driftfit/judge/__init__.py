@@ -1,1 +1,1 @@
-"""Judging a run: verdict, diagnosis, segments, comparison with what a user would otherwise do."""
+"""Judging a run: verdict, diagnosis, segments, alarms, comparison with simpler methods."""

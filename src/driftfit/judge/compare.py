@@ -1,11 +1,11 @@
-"""The comparison that every result carries: what a user would otherwise have done, on the same samples.
+"""The comparison in every summary: what simpler predictors would have achieved on the same samples.
 
-*persistence*   the last output that was seen
-*constant LS*   recursive least squares without forgetting on the same regressors (fitted on the past only)
-*with lags*     the same with the last two outputs and regressors beside them: constants in correlated noise
+*persistence*   the last known output
+*constant LS*   recursive least squares without forgetting on the same regressors (fitted only to the past)
+*with lags*     the same with the last two outputs and regressors added: constants with correlated noise
 *constant ARX*  the same on ARX(2, 1 per input) with intercept
 
-All are one-step predictions, scored on the samples after max(50, 5 n) that every one of them could predict.
+All are one-step predictions. They are scored on the samples after max(50, 5 n) that all of them could predict.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from driftfit.models.arx import ARX
 from driftfit.run.result import Track, burn_in, root_mean_square
 
 LAGS = 2
-"""Lags of y and of all regressors that are put beside the regressors of a run."""
+"""Number of lags of y and of all regressors that are added to the regressors of a run."""
 
 
 class Comparison(NamedTuple):
@@ -36,19 +36,19 @@ class Comparison(NamedTuple):
 
 
 def persistence(y: Array) -> Array:
-    """For every sample the last output seen before it; NaN before the first."""
+    """For every sample the last known output before it; NaN before the first."""
     seen = np.where(np.isfinite(y), np.arange(len(y)), -1)
     last = np.concatenate([[-1], np.maximum.accumulate(seen)[:-1]])
     return np.where(last >= 0, y[last], np.nan)
 
 
 def _error(y: Array, prediction: Array, innovation: Array) -> Array:
-    """Error of the prediction of y; the innovation of a model may be that of something else."""
+    """Error of the prediction of y; the innovation of a model may be the residual of something else."""
     return np.where(np.isfinite(innovation), y - prediction, np.nan)
 
 
 class Errors(NamedTuple):
-    """One-step errors of everyone, (T,) each, and which samples are scored."""
+    """One-step errors of all predictors, (T,) each, and which samples are scored."""
 
     tracked: Array
     persistence: Array
@@ -61,8 +61,8 @@ class Errors(NamedTuple):
 def errors(run: Track, burn: int | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
-    Where lags are missing, constants without them predict. The first ``burn`` samples are not scored, max(50, 5 n)
-    unless it is said.
+    Where lags are missing, the constants without lags predict. The first ``burn`` samples are not scored; by default
+    max(50, 5 n).
     """
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
     steady = constant_least_squares(run.model, run.record)
@@ -90,7 +90,7 @@ def _with_lags(steady: Array, y: Array, noise: Array) -> Array:
 
 
 def compare(run: Track) -> Comparison:
-    """Score a run beside persistence, constant least squares and constant ARX."""
+    """Score a run against persistence, constant least squares and constant ARX."""
     made = errors(run)
     shown = (made.tracked, made.persistence, made.constant_ls, made.constant_arx)
     tracked, last, ls, constant = (root_mean_square(error[made.scored]) for error in shown)

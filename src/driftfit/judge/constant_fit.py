@@ -1,11 +1,11 @@
-"""Least squares with constant parameters, sample by sample: what every run is measured against.
+"""Recursive least squares with constant parameters: the reference against which every run is compared.
 
-    R     triangle with R' R = sum phi phi' / noise,     R' z = sum phi y / noise       a rotation a sample (Givens)
-    R theta = z                                          from the last row up
+    R     upper triangular with R' R = sum phi phi' / noise,  R' z = sum phi y / noise     by Givens rotations
+    R theta = z                                               solved from the last row up
 
-A direction that the regressors have not spanned has a zero on the diagonal, and its parameter is 0 until they do. It is
-the estimate of ``RLS(1.0)`` from a diffuse start, without its covariance: the work is one function of one lane's arrays
-that is compiled once for all models. Cost per sample: O(n^2).
+A direction that the regressors have not yet spanned has a zero on the diagonal, and its parameter is 0 until they span
+it. The result is the estimate of ``RLS(1.0)`` from a diffuse start, without its covariance. The work is done by one
+routine on the arrays of one lane, compiled once for all models. Cost per sample: O(n^2).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from driftfit.run.program import lane_of
 from driftfit.run.seen import COLLECTED, collect
 
 FLAT = 1e-11
-"""A diagonal entry below this share of its column is taken for zero."""
+"""A diagonal entry below this share of its column counts as zero."""
 
 
 @shared
 def rotate(R: Array, row: Array, size: Array, theta: Array) -> None:
-    """Take ``row`` = [phi, y] into R (n, n + 1) = [R, z], which uses it up, and solve for theta; size (n,): columns."""
+    """Rotate ``row`` = [phi, y] into R (n, n + 1) = [R, z] and solve for theta; row is overwritten. size: (n,)."""
     n = theta.shape[0]
     for i in range(n):
         size[i] = np.hypot(size[i], row[i])
@@ -48,7 +48,7 @@ def rotate(R: Array, row: Array, size: Array, theta: Array) -> None:
 
 @kernel
 def stay(s: State, l: int) -> None:
-    """Time does nothing."""
+    """Nothing happens as time passes."""
 
 
 @kernel
@@ -72,9 +72,9 @@ STEPS = TrackerSteps(stay, learn, unknown, None, collect)
 
 
 def constant_least_squares(model: Model, record: Record) -> Array:
-    """Constants over a record: (T,) records of phi, y, dt, valid, e, ok and more.
+    """Fit constants over a record; return (T,) records of phi, y, dt, valid, e, ok and more.
 
-    Lags that are missing are filled by the predictions of these constants.
+    Missing lags are replaced by the predictions of these constants.
     """
     n = model.n
     state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
@@ -85,7 +85,7 @@ def constant_least_squares(model: Model, record: Record) -> Array:
 
 
 def _predicted(rows: Array, known: Array, e: Array) -> None:
-    """Errors e (T,) of predictions, rows [phi, y] (T, k + 1) used up, of those that are known (T,) only."""
+    """Prediction errors e (T,) at the known (T,) samples; the rows [phi, y] (T, k + 1) are overwritten."""
     k = rows.shape[1] - 1
     R, size, theta = np.zeros((k, k + 1)), np.zeros(k), np.zeros(k)
     for t in range(rows.shape[0]):

@@ -1,4 +1,4 @@
-"""Diagnose: what is wrong with a run, in numbers with their limits, and a sentence for each that is out of bounds.
+"""Diagnose: the faults of a run as numbers with limits, and a sentence for each number that is out of bounds.
 
 With z = e / s, innovations over their standard deviation, after the first max(50, 5 n) samples:
 
@@ -11,13 +11,13 @@ With z = e / s, innovations over their standard deviation, after the first max(5
     excitation        largest condition index of a window (`driftfit.judge.excitation`)        at most 100
     constancy         joint p-value of constant coefficients (`driftfit.judge.statistics.constancy`)      see below
 
-Constancy is out of bounds where the record and the tracker disagree: the coefficients move but the tracker holds them
-constant (p below 0.01), or they do not and the tracker lets them move at a price: p above 0.05, and one-step errors
+Constancy is out of bounds if the record and the tracker disagree: the coefficients move but the tracker holds them
+constant (p below 0.01), or they do not move and the tracker lets them move at a cost: p above 0.05, and one-step errors
 more than 3 % larger than those of constants, by a paired test at 1 % (of e^2 - (1.03 e_constant)^2, see
-`driftfit.judge.statistics.paired`). So fault is found with fewer than one in a hundred trackers whose drift costs less
-than that, and on short records only where it costs much more: ``benchmarks/diagnose_constancy.py``. The mean of z^2 is
-over |z| < 3 of the median scale, so that outliers are counted once, under their own name; limits are widened where a
-short record makes them too tight: by three standard errors. Source: Mehra (1970), Bar-Shalom et al. (2001, section
+`driftfit.judge.statistics.paired`). A fault is therefore found with fewer than one in a hundred trackers whose drift
+costs less than that, and on short records only if it costs much more: ``benchmarks/diagnose_constancy.py``. The mean of
+z^2 is over |z| < 3 of the median scale, so that outliers are counted once, under their own name. Limits that a short
+record makes too tight are widened by three standard errors. Source: Mehra (1970), Bar-Shalom et al. (2001, section
 5.4) for innovation tests. Cost: that of a verdict.
 """
 
@@ -49,18 +49,18 @@ if TYPE_CHECKING:
 
 PARTS = 10
 MATERIAL, SURE = 1.03, 0.01
-"""A tracker of constant coefficients is at fault where its error is more than that many times theirs, at that level."""
+"""A tracker that lets coefficients move is at fault if its error exceeds that of constants by this factor."""
 NOT_REJECTED = 0.05
-"""p from which on constants count as not rejected."""
+"""Constants count as not rejected if p is at least this."""
 BEYOND = 4.0
-"""Standard deviations from which on an innovation counts as an outlier."""
+"""An innovation beyond this many standard deviations counts as an outlier."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One number with its limits; ``advice`` is a sentence where it is out of bounds, else empty.
+    """One number with its limits; ``advice`` is a sentence if it is out of bounds, otherwise empty.
 
-    ``value`` is NaN, and in bounds, where the record is too short or the tracker carries no covariance.
+    ``value`` is NaN, and in bounds, if the record is too short or the tracker carries no covariance.
     """
 
     name: str
@@ -71,20 +71,20 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Whether the value is within its limits, or cannot be told."""
+        """Whether the value is within its limits, or not known."""
         return not (self.value < self.low or self.value > self.high)
 
 
 @dataclass(frozen=True)
 class Diagnosis(Printed):
-    """What `Track.diagnose` returns; printing it shows it, `plot` draws one page.
+    """The result of `Track.diagnose`; printing it shows a table, `plot` draws one page.
 
     Attributes
     ----------
     checks : tuple of Check
         Every number with its limits.
     ok : bool
-        All of them are within.
+        Whether all of them are within their limits.
     """
 
     checks: tuple[Check, ...]
@@ -101,7 +101,7 @@ class Diagnosis(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is out of bounds, and what to try."""
+        """A sentence for every number that is out of bounds, with a suggestion."""
         return tuple(check.advice for check in self.checks if not check.ok)
 
     def __getitem__(self, name: str) -> Check:
@@ -124,13 +124,13 @@ class Diagnosis(Printed):
 
 
 def diagnose(run: Track) -> Diagnosis:
-    """Check a run; see the module for the numbers and their limits. Never raises for what the data are."""
+    """Check a run; see the module for the numbers and their limits. Bad data never raise an error."""
     start = burn_in(run.model.n)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = run.innovation / run.innovation_std
     z = np.where(run.ok & np.isfinite(z) & (np.arange(len(run)) >= min(start, len(run) // 2)), z, np.nan)
     rows = regressors(run)
-    # without a covariance there is no scale, but correlation needs none
+    # without a covariance there is no scale, but correlation does not need one
     white = whiteness(z if np.isfinite(z).any() else np.where(run.ok, run.innovation, np.nan))
     excited, constant = excitation(rows.phi), constancy(rows.phi, rows.y)
     checks = (
@@ -176,7 +176,7 @@ def _inputs(run: Track, z: Array) -> list[Check]:
 
 
 def _robust(run: Track) -> bool:
-    """Whether the tracker discounts outliers and follows the noise by itself."""
+    """Whether the tracker discounts outliers and tracks the noise itself."""
     return isinstance(run.tracker, AdaptiveKalman)
 
 
@@ -259,7 +259,7 @@ def _constancy(run: Track, test: Constancy) -> Check:
 
 
 def holds_constant(run: Track) -> bool:
-    """Whether the tracker of a run lets no parameter move."""
+    """Whether the tracker of a run keeps all parameters constant."""
     settings = run.tracker.settings()
     if "forgetting" in settings:
         return bool(settings["forgetting"] == 1.0)

@@ -1,11 +1,11 @@
-"""Excitation: did the regressors of a window tell the parameters apart?
+"""Excitation: do the regressors of a window distinguish the parameters?
 
     R_w = (1 / W) sum over a window of psi_t psi_t',     psi_ti = phi_ti / rms of regressor i over the record
 
-The smallest eigenvalue of R_w over the largest is 1 over the squared condition index of Belsley, Kuh and Welsch (1980);
-scaling makes it independent of units, and a window in which an input stands still has a small one. 30 is where they
-call dependence moderate to strong; 100 is the limit here: there the parameters of that window come from what was known
-before.
+The smallest eigenvalue of R_w over the largest is the reciprocal of the squared condition index of Belsley, Kuh and
+Welsch (1980). Scaling makes it independent of units, and it is small in a window in which an input is constant. They
+call dependence moderate to strong from 30; the limit here is 100, beyond which the parameters of that window are
+determined by earlier samples.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Excitation(NamedTuple):
     """Windows of W samples, half overlapping."""
 
     at: Array
-    """(w,): number of the last sample of each window, among the samples used."""
+    """(w,): index of the last sample of each window, among the samples used."""
     eigenvalues: Array
     """(w, n) ascending."""
     direction: Array
-    """(n,): the scaled combination of parameters that the worst window tells least about."""
+    """(n,): the scaled combination of parameters that the worst window determines least."""
 
     @property
     def condition(self) -> Array:
@@ -41,7 +41,7 @@ class Excitation(NamedTuple):
 
 
 def excitation(phi: Array, window: int | None = None) -> Excitation:
-    """Eigenvalues of windows of regressors phi (N, n); max(50, 5 n) samples unless ``window`` says otherwise."""
+    """Eigenvalues of windows of regressors phi (N, n), of max(50, 5 n) samples unless ``window`` is given."""
     N, n = phi.shape
     W = burn_in(n) if window is None else window
     size = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.ones(n)

@@ -1,10 +1,11 @@
-"""Verdict and diagnosis of many runs at once: a fleet, or the outputs of one record. One table, one row for each.
+"""Verdict and diagnosis of many runs at once, a fleet or the outputs of one record, in one table with a row for each.
 
     q_(k) = min over j >= k of  p_(j) N / j         (p in ascending order, N runs that can be tested)
 
-A level of 5 % for each of 200 sensors would accuse ten that stand still. Here the level is the false discovery rate: of
-the runs that are said to move (q below the level), at most that share stands still on average, for tests that are
-independent or positively dependent. The same holds for "following pays". Each run is judged by itself, on all cores.
+A level of 5 % for each of 200 sensors would accuse about ten whose parameters are constant. Here the level is the false
+discovery rate: among the runs that are reported to move (q below the level), the share with constant parameters is at
+most the level on average, if the tests are independent or positively dependent. The same holds for "tracking pays".
+Each run is judged separately, on all cores.
 
 Source: Benjamini and Hochberg (1995). Cost: that of a verdict for each run.
 """
@@ -34,13 +35,13 @@ if TYPE_CHECKING:
 
 SHOWN = 20
 PATIENCE = 2.0
-"""Seconds after which there is a progress bar."""
+"""Seconds after which a progress bar appears."""
 
 Said = TypeVar("Said")
 
 
 def discoveries(p: Array) -> Array:
-    """q-values (N,) of p-values (N,): the least false discovery rate at which each is found; NaN where p is NaN."""
+    """q-values (N,) of p-values (N,): the smallest false discovery rate at which each is found; NaN where p is NaN."""
     p = np.asarray(p, float)
     known = np.flatnonzero(np.isfinite(p))
     order = known[np.argsort(-p[known], kind="stable")]
@@ -52,7 +53,7 @@ def discoveries(p: Array) -> Array:
 
 @dataclass(frozen=True)
 class Judgement:
-    """One run among many: its verdict, and the q-values of "the parameters move" and of "following them pays"."""
+    """One run among many: its verdict, and the q-values of "the parameters move" and of "tracking them pays"."""
 
     key: Hashable
     said: Verdict
@@ -70,14 +71,14 @@ class Judgement:
     def relative(self) -> float:
         """Largest change of a parameter that moves, as a share of its value before; 0 where none is named.
 
-        A value before that is smaller than the standard error of the change counts as that error.
+        If the value before is smaller than the standard error of the change, that standard error replaces it.
         """
         moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
         return max((abs(m.after - m.before) / max(abs(m.before), m.std) for m in moved), default=0.0)
 
     @property
     def change(self) -> str:
-        """The first of them in words."""
+        """The change of the first parameter that moves, in words."""
         moved = [m for m in self.said.parameters if m.moves] if self.drifts else []
         more = f" and {len(moved) - 1} more" if len(moved) > 1 else ""
         if not moved:
@@ -87,12 +88,12 @@ class Judgement:
 
 @dataclass(frozen=True)
 class ManyVerdicts(Printed):
-    """Verdicts of many runs; printing it shows the twenty that move most clearly.
+    """Verdicts of many runs; printing them shows the twenty that move most clearly.
 
     Attributes
     ----------
     rows : tuple of Judgement
-        The clearest first; those that cannot be tested last.
+        The clearest first; runs that cannot be tested come last.
     level : float
         False discovery rate.
     """
@@ -125,7 +126,7 @@ class ManyVerdicts(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words."""
+        """The verdict in sentences."""
         tested, paying = (int(np.isfinite([getattr(row, q) for row in self.rows]).sum()) for q in ("q", "q_pays"))
         drifting, pays = len(self.drifting), sum(row.pays for row in self.rows)
         found = (
@@ -168,7 +169,7 @@ class ManyVerdicts(Printed):
         for sentence in self.sentences:
             yield Text(f" {sentence}")
         table = table_of("The clearest first", "", "what moves most", "p", "q", "error", "LS", "pays", names=2)
-        table.columns[1].no_wrap = False  # words give way to numbers
+        table.columns[1].no_wrap = False  # words are wrapped before numbers
         for column, width in zip(table.columns[2:], (8, 8, 7, 7, 4), strict=True):
             column.ratio, column.min_width = None, width
         for row in self.rows[:SHOWN]:
@@ -181,7 +182,7 @@ class ManyVerdicts(Printed):
 
 @dataclass(frozen=True)
 class ManyDiagnoses(Printed):
-    """Diagnoses of many runs; printing it shows how often each number is out of bounds, and the worst runs.
+    """Diagnoses of many runs; printing them shows how often each number is out of bounds, and the worst runs.
 
     Attributes
     ----------
@@ -212,7 +213,7 @@ class ManyDiagnoses(Printed):
 
     @property
     def worst(self) -> tuple[Hashable, ...]:
-        """Keys, those with most numbers out of bounds first."""
+        """Keys of the runs; those with the most numbers out of bounds come first."""
         return tuple(sorted(self.of, key=lambda key: -len(self.of[key].sentences)))
 
     @property
@@ -256,7 +257,7 @@ def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
 
 
 def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: str) -> dict[Hashable, Said]:
-    """What is said of each run, on all cores; the first is alone, so that only one thread compiles."""
+    """The result of ``judge`` for each run, on all cores; the first runs alone, so that only one thread compiles."""
     from driftfit.run.fleet import cores
 
     keys, tracks = list(runs), list(runs.values())

@@ -1,4 +1,4 @@
-"""Pictures of what judges a run."""
+"""Plots of diagnostics, alarms and selections."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Health(NamedTuple):
 
 
 def draw_diagnosis(said: Health) -> Figure:
-    """Six pictures on one page."""
+    """Six plots on one page."""
     figure = new_figure(11.0, 8.2)
     axes = figure.subplots(3, 2)
     _innovations(axes[0, 0], said)
@@ -133,7 +133,7 @@ def _paths(axis: Axes, said: Health) -> None:
 def plot_alarms(
     run: Track, rule: AlarmRule, statistic: Array, active: Array, start: int, labels: Array | None = None
 ) -> Figure:
-    """The output, and each statistic over its limit (a probability as it is), with alarms and labels shaded."""
+    """The output, and each statistic over its limit (probabilities unscaled), with alarms and labels shaded."""
     c = len(rule.names)
     figure = new_figure(9.5, 1.5 * c + 2.0)
     axes = figure.subplots(c + 1, 1, sharex=True)

@@ -12,10 +12,10 @@ from driftfit.run.result import Track
 
 
 class Rows(NamedTuple):
-    """The N samples that can be used, scaled to the noise variance of weight 1."""
+    """The N usable samples, scaled to the noise variance of weight 1."""
 
     at: Array
-    """(N,): their places in the record."""
+    """(N,): their sample numbers in the record."""
     phi: Array
     """(N, n)"""
     y: Array
@@ -23,7 +23,7 @@ class Rows(NamedTuple):
 
 
 def regressors(run: Track) -> Rows:
-    """The samples of a regression that a record makes for the model of a run."""
+    """The record as samples of a regression for the model of a run."""
     out = constant_least_squares(run.model, run.record)
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run.known.part(at).noise

@@ -1,17 +1,17 @@
-"""Segments of a whole record: between which dates were the parameters constant, and how sure are the dates?
+"""Segments of a whole record: between which dates were the parameters constant, and how certain are the dates?
 
     min over breaks of  sum over segments of min_theta sum (y_t - phi_t' theta)^2 / noise  +  penalty * number of breaks
 
-The minimum is found exactly by pruned dynamic programming (`driftfit.judge.statistics.partition`) on rows that have
-been divided by the level of the noise, made white where it is an autoregression, and held within three levels of the
-fit, so that an outlier is no segment (`driftfit.judge.statistics.noise`). The penalty is such that a record of
-constant parameters is divided with the probability ``false``. Each date comes with an interval that holds the true one
-with at least the probability ``level`` (`driftfit.judge.statistics.break_dates`), given that there is a break.
+The minimum is found exactly by pruned dynamic programming (`driftfit.judge.statistics.partition`). Rows are first
+divided by the level of the noise, whitened if it is an autoregression, and limited to three levels from the fit, so
+that an outlier does not become a segment (`driftfit.judge.statistics.noise`). The penalty is chosen so that a record of
+constant parameters is divided with probability ``false``. Each date has an interval that contains the true one with
+probability at least ``level`` (`driftfit.judge.statistics.break_dates`), given that there is a break.
 
-Use it on complete records in which parameters jump and stay; the `Bank` says on-line what this says afterwards, and
-`Track.smooth` follows parameters that drift: a slow drift is cut into steps here. A record of more than 2000 samples is
-divided on a grid of as many places, and every date then moved to its likeliest place among all samples between its
-neighbours; two breaks nearer to each other than ``shortest`` are not told apart.
+Use it on complete records in which parameters jump and are constant in between. A `Bank` does the same on-line, and
+`Track.smooth` estimates parameters that drift: a slow drift is cut into steps here. A record of more than 2000 samples
+is first divided on a grid with that many positions, and every date is then moved to the most likely position among all
+samples between its neighbours; two breaks closer than ``shortest`` are not distinguished.
 
 Source: Bai and Perron (1998, 2003) for breaks in regressions; Killick, Fearnhead and Eckley (2012) for the pruning; Yao
 (1987), Bai (1997) for dates. Departures: whitening, outliers, the penalty from a rate of false breaks, and dates from
@@ -47,14 +47,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CELLS = 2000
-"""At most so many places for breaks are compared at once."""
+"""Largest number of positions for breaks that are compared at once."""
 SWEEPS = 10
 
 
 class Break(NamedTuple):
-    """A change of parameters: the first sample of the new ones, and an interval for it.
+    """A change of parameters: the first sample with the new ones, and an interval for it.
 
-    ``date, first, last`` are times where the record has them, sample numbers otherwise; ``at``: sample number of date.
+    ``date, first, last`` are times if the record has them, otherwise sample numbers; ``at`` is the sample number of
+    date.
     """
 
     date: Any
@@ -64,7 +65,7 @@ class Break(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Samples start .. stop - 1 of the record, with constant theta (n,) and its standard errors (n,)."""
+    """Samples start .. stop - 1 of the record, with constant theta (n,) and standard errors (n,)."""
 
     start: int
     stop: int
@@ -74,21 +75,21 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True)
 class Segmentation(Printed):
-    """What `segment` returns; printing it shows it.
+    """The result of `segment`; printing it shows a table.
 
     Attributes
     ----------
     breaks : tuple of Break
-        In the order of time; one less than segments.
+        Sorted by time; one fewer than segments.
     segments : tuple of Segment
     level : float
         An interval holds its date with at least this probability.
     penalty : float
-        Of a break, in units of the noise variance.
+        Penalty of a break, in units of the noise variance.
     noise : float
         Standard deviation of the noise, the median over time.
     ar : tuple of float
-        Autoregression of the noise; empty where it is white.
+        Autoregression of the noise; empty if it is white.
     """
 
     breaks: tuple[Break, ...]
@@ -101,7 +102,7 @@ class Segmentation(Printed):
 
     @property
     def theta(self) -> Array:
-        """Parameters of every sample, (T, n)."""
+        """Parameters at every sample, (T, n)."""
         return np.repeat([s.theta for s in self.segments], [s.stop - s.start for s in self.segments], axis=0)
 
     def summary(self) -> str:
@@ -164,28 +165,28 @@ def segment(
     shortest: int | None = None,
     **record: Any,
 ) -> Segmentation:
-    """Divide a record where the parameters of a model change.
+    """Divide a record at the dates at which the parameters of a model change.
 
     Parameters
     ----------
     y, u : as for `track`
         Output and inputs.
     model : Model or None
-        What is constant within a segment. None: the mean of y, with coefficients of u where there is one.
+        The model whose parameters are constant within a segment. None: the mean of y, with coefficients of u if given.
     level : number
-        Of the intervals for dates.
+        Level of the intervals for dates.
     false : number
-        Chance that a record of constant parameters is divided, which sets the penalty; where the noise is correlated
-        and its autoregression is estimated it may be several times that.
+        Probability that a record of constant parameters is divided, which determines the penalty. If the noise is
+        correlated and its autoregression is estimated, the probability may be several times that.
     shortest : int or None
-        Samples in the shortest segment; max(10, 4 n) by default.
+        Number of samples in the shortest segment; max(10, 4 n) by default.
     record
-        More of `track`: ``data, time, dt, weights, units``.
+        Further arguments of `track`: ``data, time, dt, weights, units``.
 
     Raises
     ------
     ValueError
-        Numbers out of range, or what `track` refuses.
+        For numbers out of range, and for everything that `track` does not accept.
     """
     if model is None:
         model = Regression(0 if u is None else None, intercept=True)
@@ -196,7 +197,7 @@ def segment(
 
 
 def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: int | None = None) -> Segmentation:
-    """Divide the record of a run; see `segment`. The tracker does not enter."""
+    """Divide the record of a run; see `segment`. The tracker is not used."""
     for name, given in (("level", level), ("false", false)):
         if not 0.0 < given < 1.0:
             raise ValueError(f"segment: {name} must be between 0 and 1, such as 0.95; got {given!r}.")
@@ -212,7 +213,7 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
         return _undivided(run, rows.phi, rows.y, level)
     Q = orthonormal(rows.phi / size)[0]
     found = noise(Q, fit.residual, CELLS, least, quiet=false)
-    # a value that is held still votes for one side; without its row it does not
+    # a value limited by the fit still supports one side; without its row it does not
     used = np.abs(found.near) <= HELD * found.level
     X, z = Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
     breaks, spans = _dated(X / found.white, z / found.white, found, least, level)
@@ -230,7 +231,7 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
 
 
 def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[list[int], list[tuple[int, int]]]:
-    """Likeliest dates, each between its neighbours until all stay, and their intervals."""
+    """The most likely dates, each between its neighbours until all are stable, and their intervals."""
     breaks, N = [int(b) for b in found.breaks], len(z)
     spans = [(b, b) for b in breaks]
     p = len(found.ar)
@@ -249,7 +250,7 @@ def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[
 
 
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
-    """theta and its standard errors, Huber's for a noise that is white once whitened."""
+    """theta and its standard errors, Huber's for noise that is white after whitening."""
     c = found.level[a:b]
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
@@ -260,7 +261,7 @@ def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, 
 
 
 def _undivided(run: Track, phi: Array, y: Array, level: float) -> Segmentation:
-    """One segment: too few samples, regressors that do not span, or no noise at all."""
+    """A single segment: too few samples, regressors that do not span, or no noise at all."""
     n = phi.shape[1]
     theta = np.linalg.lstsq(phi, y, rcond=None)[0] if len(y) else np.full(n, np.nan)
     spread = float(np.std(y - phi @ theta)) if len(y) else float("nan")

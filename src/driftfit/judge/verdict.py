@@ -1,12 +1,12 @@
-"""Verdict: is the time variation real, which parameters move, by how much and when, and does following them pay?
+"""Verdict: is the time variation real, which parameters move, by how much and when, and does tracking them pay?
 
-Two questions that have different answers:
+The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over a stretch, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so that outliers, a changing noise
-  variance, changing inputs and correlated noise do not pass for drift. They ask the record, not the tracker: q and r
-  do not enter. Where constants are true, "they move" is said with probability ``level``, as
+  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
+  do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
   ``benchmarks/verdict_error_rate.py`` verifies.
 * *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
   same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
@@ -25,6 +25,7 @@ many times within the record leaves little trace in a cumulated score. Cost: thr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,18 +45,19 @@ from driftfit.show.parts.text import Printed, facts, table_of
 
 RIVALS = ("persistence", "constant LS", "LS with lags", "constant ARX")
 CORRELATED = 1e-3
-"""Below this p-value of whiteness the residuals of segments are said to be correlated."""
+"""If the p-value of whiteness of the residuals of segments is below this, they are reported as correlated."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """What the record says of one parameter.
+    """The verdict on one parameter.
 
-    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which tells apart
-    parameters with correlated regressors, given the moves of those named before it. ``moves``: named as one that moves.
-    ``at``, ``when``: the sample, and its time as text, of its clearest step; ``before``: its value before its first
-    step; ``after``: the value furthest from that, ``std`` the standard error of their difference; ``last``: its value
-    after the last step, which is ``before`` again after a fault that passed.
+    ``statistic``, ``p``: Hansen's L and its p-value. ``p_own``: p-value of the path of the estimate, which separates
+    parameters with correlated regressors, given the changes of those named before it. ``moves``: whether it is named as
+    moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
+    first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
+    its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
+    and last sample of an interval that contains the date of its clearest step with 95 % confidence.
     """
 
     name: str
@@ -69,29 +71,31 @@ class Moved:
     after: float
     std: float
     last: float
+    earliest: int
+    latest: int
 
 
 @dataclass(frozen=True)
 class Verdict(Printed):
-    """What `Track.verdict` returns; printing it shows it.
+    """The result of `Track.verdict`; printing it shows the sentences and tables.
 
     Attributes
     ----------
     drifts : bool or None
-        The parameters move: ``p`` is below ``level``. None where the record cannot tell.
+        Whether the parameters move: ``p`` is below ``level``. None if the record does not determine it.
     pays : bool or None
         The run predicts better than constant least squares on the past, without lags or with them, whichever is the
         better: the p-value of `constants` is below ``level``. None where there are too few samples to compare.
     p : float
-        Joint test of all parameters; NaN where the record cannot tell.
+        p-value of the joint test of all parameters; NaN if the record does not determine it.
     statistic : float
-        Its part that is Nyblom's.
+        Nyblom's statistic of all parameters.
     level : float
-        Error rate: how often constants are said to move.
+        Error rate: how often constant parameters are reported as moving.
     parameters : tuple of Moved
     alike : tuple of str
-        Where parameters move and none is named: those of which one moves, their regressors being too similar to tell
-        which.
+        If parameters move and none is named: those of which one moves; their regressors are too similar to tell which
+        one.
     since : str
         Time of the step that explains most of it.
     rms : float
@@ -101,7 +105,7 @@ class Verdict(Printed):
     samples, scored : int
         Samples in the test, and in the comparison.
     correlated : bool
-        The residuals are correlated, also within segments of constant coefficients.
+        Whether the residuals are correlated, even within segments of constant coefficients.
     lags : int
         Lags of correlation that were allowed for.
     burn : int
@@ -136,7 +140,7 @@ class Verdict(Printed):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The verdict in words."""
+        """The verdict in sentences."""
         return tuple(filter(None, (f"{self._drift()} {self._gain()}", self._which(), self._caution())))
 
     def _drift(self) -> str:
@@ -167,11 +171,11 @@ class Verdict(Printed):
         if not self.drifts:
             return ""
         if not self.moving and len(self.alike) == 1:
-            return f"It probably is {self.alike[0]}, from about {self.since}; its own test alone does not show it."
+            return f"It probably is {self.alike[0]}, from about {self.since}; its own test does not confirm it."
         if not self.moving and len(self.alike) < len(self.parameters):
             return (
                 f"It is one of {', '.join(self.alike)}, from about {self.since}; their regressors are too similar to "
-                "tell which."
+                "tell which one."
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
@@ -234,7 +238,7 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
 
 
 def _told(moved: Moved) -> str:
-    """What one parameter did, in words."""
+    """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:
         return text
@@ -243,7 +247,7 @@ def _told(moved: Moved) -> str:
 
 
 def p_text(p: float) -> str:
-    """A p-value as it is written."""
+    """A p-value as text."""
     return "nan" if np.isnan(p) else "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
 
 
@@ -260,12 +264,12 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     run : Track
         What `track` returned.
     level : number
-        Error rate of "the parameters move".
+        Error rate of the statement that the parameters move.
     lags : int or None
-        Lags of correlation of the noise to allow for; None finds them from the record, and 0 is for a model whose
+        Lags of correlation of the noise to allow for; None estimates them from the record, and 0 is for a model whose
         one-step errors are known to be white.
     burn : int or None
-        So many samples at the beginning are not scored; max(50, 5 n) by default.
+        Number of samples at the beginning that are not scored; max(50, 5 n) by default.
 
     Raises
     ------
@@ -309,12 +313,13 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i
     at, own = int(test.at[i]), float(test.p_own[i])
     before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
+    span: Sequence[int] = (at, at)
     if steps is not None:
         own = float(steps.p[i])
         if named:
-            at = steps.first(i) or 0
+            at, span = steps.first(i) or 0, steps.span(i) or (at, at)
             before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
-    sample = int(rows.at[min(at, len(rows.at) - 1)]) if len(rows.at) else 0
+    sample, *span = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
-    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last)
+    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last, *span)

@@ -1,4 +1,4 @@
-"""Models: signals to a regression, and what theta means. A module in this folder that defines a `Model` is found."""
+"""Models turn signals into a regression and name its parameters. Any module here that defines a `Model` is found."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from driftfit.models.base import Model
 
 
 def found() -> dict[str, type[Model]]:
-    """Every model that this folder holds, by class name."""
+    """Every model in this folder, by class name."""
     return classes_in(__name__, __path__, Model)

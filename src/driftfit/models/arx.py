@@ -1,15 +1,15 @@
-"""ARX: autoregression with exogenous inputs, the workhorse of on-line identification.
+"""ARX: autoregression with exogenous inputs, the standard model of on-line identification.
 
     y_t = sum_{i=1..na} a_i y_{t-i} + sum_{inputs} sum_{j=1..nb} b_j u_{t-nk-j+1} (+ c) + v_t
     phi_t = [y_{t-1} .. y_{t-na}, u1_{t-nk} .. u1_{t-nk-nb+1}, u2 ..., (1)],   theta_t = [a_1 .., b_1 .., (c)]
 
-The signs of a are those of the regression; MATLAB's polynomials A(z) carry the other sign (`polynomials` converts).
-With nk = 0 the present input is used. The model owns its lags, so nobody builds a design matrix.
+The signs of a are those of the regression; MATLAB's polynomials A(z) have the opposite sign (`polynomials` converts).
+With nk = 0 the present input is used. The model stores its own lags, so you never build a design matrix.
 
-Missing outputs: the lag is filled with the model's own prediction, where that has a finite variance, for at most ``na``
-outputs in a row; after that samples cannot be used until real lags are back, because an unstable estimate would run
-away. A missing input makes every sample that needs it unusable. A gap in time above 1.5 nominal intervals makes the
-lags that reach across missing.
+Missing outputs: the lag is filled with the model's own prediction, if that has a finite variance, for at most ``na``
+outputs in a row. After that, samples cannot be used until real lags are available again, because an unstable estimate
+would diverge. A missing input makes every sample that needs it unusable. A gap in time above 1.5 nominal intervals
+makes the lags that reach across it missing.
 
 Several outputs (``ny=2``) have a regression each, all on the same regressors, and are bound as `JointARX`:
 
@@ -51,11 +51,12 @@ class ARX(Model):
     nb, nk : int, or one per input
         Lags of each input, and its delay in samples (0 uses the present input).
     inputs : int, names, or None
-        How many inputs, or their names. None: as many as ``nb`` or ``nk`` list, else as many as u has (`Live`: one).
+        How many inputs, or their names. None: as many as ``nb`` or ``nk`` have entries, else as many as u has columns
+        (`Live`: one).
     intercept : bool
         Add a constant as the last parameter.
     start : "drop" or "zero"
-        "drop": until the lags are filled nothing happens at all. "zero": the unknown past is zero.
+        "drop": nothing is used until the lags are filled. "zero": the unknown past is zero.
     ny : int or names
         Outputs, columns of y. With several, each has a regression of its own on the lags of all of them and on the
         inputs (`JointARX`).
@@ -182,7 +183,7 @@ class ARX(Model):
 
     @property
     def output_lags(self) -> int:
-        """How many entries of phi, from its first, are past outputs: a bank of hypotheses cleans them leaf by leaf."""
+        """The number of leading entries of phi that are past outputs: a bank of hypotheses corrects them by leaf."""
         return self.na
 
     @property
@@ -207,7 +208,7 @@ class ARX(Model):
     def noise_response(self, theta: Array, h: int) -> Array:
         """Response of 1 / A(z) to an impulse, (h,)."""
         A, _ = self.polynomials(theta)
-        from scipy import signal  # a third of a second to import, for forecasts only
+        from scipy import signal  # this import takes a third of a second, and only forecasts need it
 
         response: Array = signal.lfilter([1.0], A, np.eye(1, h)[0])
         return response
@@ -230,16 +231,16 @@ class ARX(Model):
 
 @kernel
 def take_input(s: State, l: int) -> None:
-    """The present input stands first among its lags."""
+    """The present input is the first of its lags."""
     for j in range(s.u_lag.shape[0]):
         s.u_lag[j, 0, l] = s.u[j, l]
 
 
 @lru_cache
 def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> ModelSteps:
-    """The steps of one structure: orders are constants, so every loop unrolls."""
+    """The steps for one set of orders, which are constants, so that every loop is unrolled."""
     m = len(lags)
-    # without inputs the loops over them never run, but an empty tuple cannot be typed
+    # without inputs the loops over them never run, but Numba cannot type an empty tuple
     nb = tuple(b for b, _ in lags) or (0,)
     nk = tuple(k for _, k in lags) or (0,)
     at = tuple(int(na + sum(nb[:j])) for j in range(max(m, 1)))
@@ -255,7 +256,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
             s.y_lag[i, l] = lag
             s.phi[i, l] = lag
         for j in range(m):
-            # the present input takes place 0, so lag k is entry k and nk = 0 needs no case of its own
+            # the present input has position 0, so lag k is entry k, and nk = 0 needs no special case
             for i in range(depth - 1, 0, -1):
                 lag = s.u_lag[j, i - 1, l]
                 s.u_lag[j, i, l] = np.nan if broken else lag
@@ -264,7 +265,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
                 s.phi[at[j] + i, l] = s.u_lag[j, nk[j] + i, l]
         if intercept:
             s.phi[n, l] = 1.0
-        # "drop": until every lag has been filled once no time passes for the tracker
+        # "drop": no time passes for the tracker until every lag has been filled once
         before, dt, complete = s.started[l], s.dt[l], 1.0
         for i in range(s.phi.shape[0]):
             complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
@@ -276,7 +277,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
     def push(s: State, l: int) -> None:
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
-        # a prediction of infinite variance knows nothing (a diffuse start): as a lag it would pass for an output
+        # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
         y, y_hat, filled, seen = s.y[l], s.y_hat[l], s.filled[l], s.seen[l] > 0.0
         known = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf)) & (filled < na)
         fill = y_hat if known else np.nan
@@ -363,7 +364,7 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
 
     @kernel
     def push(s: State, l: int) -> None:
-        for o in range(ny):  # lane o follows output o
+        for o in range(ny):  # lane o belongs to output o
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
             informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)

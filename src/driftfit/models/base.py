@@ -1,4 +1,4 @@
-"""What every model offers: signals to a regression, and names for its parameters."""
+"""The interface of every model: from signals to a regression, and the names of its parameters."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Model(Settings, ABC):
 
     @abstractmethod
     def bind(self, inputs: int | Sequence[str]) -> Model:
-        """This model for that many inputs, or for inputs of these names; ValueError where they do not fit."""
+        """This model for that many inputs, or for inputs of these names; ValueError if they do not fit."""
 
     @property
     @abstractmethod
@@ -42,14 +42,14 @@ class Model(Settings, ABC):
 
     @property
     def input_names(self) -> tuple[str, ...]:
-        """Names of the inputs in their order, by which signals with names are matched; empty where they have none."""
+        """Names of the inputs in order, by which named signals are matched; empty if they have none."""
         return ()
 
     @property
     def dimensions(self) -> tuple[tuple[int, int | None], ...] | None:
         """For every parameter (p, j): its unit is that of y to the power p, over that of input j (None: over nothing).
 
-        None where a model cannot say; its parameters then have no units, and scaled signals cannot be undone.
+        None if a model does not declare it; its parameters then have no units, and scaling cannot be undone.
         """
         return None
 
@@ -60,7 +60,7 @@ class Model(Settings, ABC):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs; several are followed by `driftfit.run.outputs`."""
+        """Names of the outputs; several outputs are run by `driftfit.run.outputs`."""
         return ("y",)
 
     @property
@@ -78,7 +78,7 @@ class Model(Settings, ABC):
         return tuple(f"{name}[{output}]" for name in self.names)
 
     def alone(self, output: str) -> Model | None:
-        """The model of one of several outputs, where its regression needs none of the others; None where it does."""
+        """The model of one of several outputs, if its regression needs none of the others; otherwise None."""
         return None
 
     @abstractmethod
@@ -92,10 +92,10 @@ class Model(Settings, ABC):
 
     @property
     def apply(self) -> Step | None:
-        """The compiled step that puts the input of a sample, ``s.u``, in its place after the sample has been taken in.
+        """The compiled step that stores the input of a sample, ``s.u``, after the sample has been processed.
 
-        It must leave the record as if the input had come with the output. None where an output needs the input of its
-        own sample: then there is nothing to predict it from before.
+        It must leave the record as if the input had come with the output. None if an output needs the input of its own
+        sample, because then it cannot be predicted before the input is known.
         """
         return None
 
@@ -146,26 +146,26 @@ class Model(Settings, ABC):
 
     @property
     def reach(self) -> int:
-        """How many past samples the regressors of a sample hold; a model that can be run forward says so."""
+        """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
         return 0
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
-        """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back among the lags.
+        """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.
 
         Parameters
         ----------
         theta : (D, n)
-            A system a row.
+            One system per row.
         y : (D, p)
-            Outputs before, p at least `reach`.
+            Earlier outputs, p at least `reach`.
         u : (D or 1, p + h, m)
-            Inputs before, and at the h samples that are asked for.
+            Earlier inputs, and the inputs at the h samples.
         noise : (D, h)
-            Noises of the equation.
+            Noise of the equation.
         span : (low, high), a number or (D,) each
-            Outputs that were seen, for a model that has to be inverted.
+            Range of the observed outputs, for a model that has to be inverted.
 
-        ValueError for a model that does not say how.
+        ValueError for a model that cannot be run forward.
         """
         raise ValueError(
             f"{type(self).__name__} cannot be run forward, so nothing can be simulated; give your own model "
@@ -173,13 +173,13 @@ class Model(Settings, ABC):
         )
 
     def output_slope(self, theta: Array, y: Array) -> Array:
-        """Slope against y of what the model is fitted to, at outputs y (...): what turns its errors into those of y."""
+        """Derivative of the fitted quantity with respect to y, at outputs y (...): for its errors in y."""
         return np.ones(np.shape(y))
 
     def noise_factor(self, theta: Array, y: Array) -> float:
-        """By what the noise variance of a tracker is multiplied at an output."""
+        """Factor of the noise variance of a tracker at an output."""
         return 1.0
 
     def follows(self, other: Model) -> bool:
-        """Whether the memory of the other model is that of this one, so that a run can go on from it."""
+        """Whether the memory of the other model is that of this one, so that its run can be continued."""
         return (self.n, self.m, self.steps) == (other.n, other.m, other.steps)

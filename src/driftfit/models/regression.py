@@ -2,10 +2,10 @@
 
     phi_t = [u_t1 .. u_tm, (1)]
 
-Use it when the regressors are known at the time of the output (hedge ratios, factor betas, sensor calibration); use
-`ARX` when the output has a memory. Several outputs either have one theta each, on the same regressors (``ny=2``), or
-measure the same theta, each with regressors of its own (``ny=2, shared=True``). A sample with a missing regressor or
-output is skipped: time passes, nothing is learned. Cost per sample: O(n).
+Use it if the regressors are known at the time of the output (hedge ratios, factor betas, sensor calibration); use
+`ARX` if the output depends on its past. Several outputs either have one theta each, on the same regressors (``ny=2``),
+or measure the same theta, each with its own regressors (``ny=2, shared=True``). A sample with a missing regressor or
+output is skipped: time passes, but nothing is learned. Cost per sample: O(n).
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Regression(Model):
     Parameters
     ----------
     regressors : int, names, or None
-        How many columns u has, or what they are called. None: as many as u turns out to have.
+        How many columns u has, or their names. None: as many as u has.
     intercept : bool
         Add a regressor that is always 1, as the last parameter.
     ny : int or names
         Outputs, columns of y.
     shared : bool
-        All outputs measure one theta: u is then (T, ny, m), a row of regressors for each output.
+        All outputs measure one theta: u is then (T, ny, m), with a row of regressors for each output.
     """
 
     regressors: int | tuple[str, ...] | None = None

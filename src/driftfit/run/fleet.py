@@ -1,11 +1,11 @@
-"""Fleets: many series, or many settings over one series, side by side in the lanes of tiles, on all cores.
+"""Fleets: many series, or many settings for one series, in parallel in the lanes of tiles, on all cores.
 
 A tile holds up to thirty-two series of one model and one kind of tracker; the compiled step works on all its lanes at
-once. Tiles are handed to a pool of threads, which run at the same time because compiled code releases the GIL. Every
-lane does the arithmetic that its series alone would do, in the same order, so results agree bit for bit.
+once. Tiles are distributed over a pool of threads, which run in parallel because compiled code releases the GIL. Every
+lane does the same arithmetic in the same order as its series would alone, so results agree bit for bit.
 
-Series are sorted by length, so that those of one tile end at about the same time. A lane that has ended is driven on
-with dt = 0 and no output, which changes nothing but the lags of its model; its state is taken at its own end.
+Series are sorted by length, so that those of one tile end at about the same time. A lane whose series has ended
+continues with dt = 0 and no output, which changes only the lags of its model; its state is copied when its series ends.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from driftfit.run.warm_start import carried, first_interval
 from driftfit.trackers.base import Tracker
 
 BLOCK = 256
-"""Samples that are brought into lane order at a time: a block of a tile stays in the second-level cache."""
+"""Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
 
 FEWEST = 10
-"""Fewer series than this run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
+"""Fewer series than this are run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
 
 LARGEST = 10
 """With more parameters than this loops over lanes stay scalar and are slower than single lanes (docs/design.md)."""
@@ -51,14 +51,14 @@ _thread = threading.local()
 
 
 class Many(Plain):
-    """Results of many series, from key to `Track` like a dict; ``by`` names what the keys stand for."""
+    """Results of many series, from key to `Track` like a dict; ``by`` names the meaning of the keys."""
 
     failed: dict[Hashable, str]
-    """Why a key has no result."""
+    """The reason why a key has no result."""
 
     @property
     def by(self) -> tuple[str, ...]:
-        """Names of what tells the results apart, one for each part of a key."""
+        """Names of what identifies the results, one for each part of a key."""
         raise NotImplementedError
 
     def runs(self) -> dict[Hashable, Track]:
@@ -183,8 +183,8 @@ def run_fleet(
 ) -> Fleet:
     """Run every series of ``records`` by its program and return the results; all have one bound model.
 
-    ``failed`` gives the reasons of what could not become a series. An interrupt (Ctrl-C) stops the
-    fleet and returns what is finished, with a warning.
+    ``failed`` gives the reasons why units did not become series. An interrupt (Ctrl-C) stops the fleet and returns what
+    is finished, with a warning.
     """
     lanes: list[Lane | None] = [None] * len(programs)
     starts, records = _warm(programs, records, before)
@@ -210,7 +210,7 @@ def run_fleet(
 
 
 def _warm(programs: Sequence[Program], records: Records, before: Fleet | None) -> tuple[dict[int, State], Records]:
-    """(fields that each series takes over, by its number; the records with the intervals since the runs before)."""
+    """(fields that each series takes over, by its index; the records with the intervals since the earlier runs)."""
     if before is None:
         return {}, records
     starts: dict[int, State] = {}
@@ -225,7 +225,7 @@ def _warm(programs: Sequence[Program], records: Records, before: Fleet | None) -
 
 
 class Job:
-    """One tile and the series in its lanes; lanes beyond ``live`` repeat the last series and are not looked at."""
+    """One tile and the series in its lanes; lanes beyond ``live`` repeat the last series and are ignored."""
 
     def __init__(self, run: Any, tile: Array, series: Array, live: int, out: Array) -> None:
         self.run = run
@@ -286,7 +286,7 @@ def _tiles(programs: Sequence[Program], padded: Array) -> Array:
 def _run_jobs(jobs: Sequence[Job], records: Records) -> None:
     """Run all jobs on a pool of threads and mark those that are done."""
     for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
-        _drive(job, records, 0)  # compiles, before the threads wait for each other to do it
+        _drive(job, records, 0)  # compiles, so that threads do not wait for each other
     total = sum(len(job.out) * job.live for job in jobs)
     with (
         Progress(console=Console(stderr=True), transient=True, disable=total <= SHOWN) as progress,
@@ -348,10 +348,10 @@ def _gather(
     y: Array, u: Array, known: Array, first: Array, length: Array, a: int, b: int,
     to_y: Array, to_u: Array, to_known: Array,
 ) -> None:  # fmt: skip
-    """Bring samples a to b of every lane's series into lane order; a lane that has ended gets NaN, and dt = 0.
+    """Copy samples a to b of every lane's series into lane order; a lane that has ended gets NaN and dt = 0.
 
-    Sample by sample and not lane by lane: then the block is written row after row (4 ns per series and step with four
-    inputs; lane by lane it is 12, because each store opens another cache line).
+    The copy goes sample by sample and not lane by lane, so that the block is written row after row (4 ns per series and
+    step with four inputs; lane by lane it takes 12, because each store opens another cache line).
     """
     L, m = len(first), u.shape[1]
     changing = known.shape[0] > 1

@@ -3,9 +3,9 @@
     ARX(.., ny=2), Regression(n, ny=2)     yo_t = phi_t' theta_o,t + v_o,t     the outputs are lanes of one tile
     Regression(n, ny=2, shared=True)       yo_t = phi_o,t' theta_t + v_o,t     see `driftfit.run.shared_outputs`
 
-Each output may have settings of its own, as a mapping from its name to its tracker; all of one kind, for they share the
-compiled step. Each output of a record is a `Track` of its own (``run["level"]``): a regression on the regressors that
-the joint run used, with everything that a Track can do.
+Each output may have its own settings, as a mapping from its name to its tracker; all trackers are of one kind, because
+they share the compiled step. Each output of a record is a `Track` (``run["level"]``): a regression on the regressors
+that the joint run used, with all methods of a Track.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from driftfit.trackers.base import Tracker
 
 
 class Outputs(Many):
-    """A record with several outputs, each with a theta of its own.
+    """A record with several outputs, each with its own theta.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Outputs(Many):
 
     @property
     def timed(self) -> bool:
-        """Whether samples have times; else `time` counts them."""
+        """Whether samples have times; otherwise `time` numbers them."""
         return self.record.time is not None
 
     @property
@@ -100,7 +100,7 @@ class Outputs(Many):
         raise AttributeError(missing(name, self.outputs[0]) if not name.startswith("_") else name)
 
     def _written(self, name: str) -> Array:
-        """A field of what the driver wrote, the output before the parameter."""
+        """A field of the driver's output, with the output axis before the parameter axis."""
         return np.moveaxis(self._out[name], -1, 1)
 
     @property
@@ -129,12 +129,12 @@ class Outputs(Many):
 
     @property
     def time(self) -> Array:
-        """Times given, or sample numbers."""
+        """The given times, or sample numbers."""
         return np.arange(len(self)) if self.record.time is None else self.record.time
 
     @cached_property
     def loglik(self) -> float:
-        """Sum over the outputs: their noises are taken to be independent."""
+        """Sum over the outputs: their noises are assumed to be independent."""
         return sum(track.loglik for track in self.values())
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
@@ -148,7 +148,7 @@ class Outputs(Many):
 
     @cached_property
     def _seen(self) -> Array:
-        """What the tracker saw: the regressors, which all outputs share."""
+        """The samples as the tracker received them, with the regressors that all outputs share."""
         steps = self.programs[0].steps._replace(store=collect)
         tile = tile_of(self.programs, self.starts)
         out = np.empty(len(self), output_type(tile, COLLECTED))
@@ -156,7 +156,7 @@ class Outputs(Many):
         return out
 
     def __getitem__(self, output: str | int) -> Track:
-        """The record of one output, by name or place."""
+        """The record of one output, by name or index."""
         if output not in self.outputs and output not in range(len(self.outputs)):
             raise KeyError(f"there is no output {output!r}; there are {', '.join(self.outputs)}.")
         return self._tracks[output if isinstance(output, int) else self.outputs.index(output)]
@@ -166,7 +166,7 @@ class Outputs(Many):
         return tuple(self._track(lane) for lane in range(len(self.outputs)))
 
     def _track(self, lane: int) -> Track:
-        """One output by itself, as a regression where the others are among its regressors."""
+        """One output alone, as a regression whose regressors may contain the other outputs."""
         alone, u = self.programs[lane].alone, self.u
         known, names, units = Known(self.record.known.columns[..., lane]), self.labels.u, dict(self.labels.units)
         if alone is None:
@@ -213,13 +213,13 @@ class Outputs(Many):
         return dict(self.items())
 
     def end(self) -> End:
-        """Where the run ended, for another one to begin (`warm_start`)."""
+        """The end of the run, from which another one can continue (`warm_start`)."""
         lanes = range(len(self.outputs))
         states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
         return End(self.programs, states, None if self.record.time is None else self.record.time[-1])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the result to one file, without pickle; complete or not at all."""
+        """Write the result to one file without pickle, completely or not at all."""
         arrays = {"y": self.y, "u": self.u, "known": self.record.known.columns}
         arrays |= {} if self.record.time is None else {"time": self.record.time}
         arrays |= {f"out_{name}": self._out[name] for name in names_of(self._out)}
@@ -233,7 +233,7 @@ class Outputs(Many):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote."""
         header, arrays = storage.read(path, "outputs of a record")
         model = storage.rebuild(header["model"], Model)
         programs = [Program(model, storage.rebuild(one, Tracker)) for one in header["trackers"]]
@@ -254,7 +254,7 @@ def lanes_of(record: Record) -> tuple[Array, Array, Array]:
 
 
 def missing(name: str, output: str) -> str:
-    """What to say of an attribute that a run of several outputs does not have."""
+    """The message for an attribute that a run of several outputs does not have."""
     if hasattr(Track.public(), name):
         return f"{name} is of one output at a time: run[{output!r}].{name}"
     known = [one for one in dir(Outputs.public()) if one[0] != "_"]

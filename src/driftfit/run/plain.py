@@ -1,8 +1,9 @@
-"""Results as plain data, and the classes that users get in their place.
+"""Results as plain data, and the public classes that replace them.
 
-A verb such as `smooth` acts on a result and lives above it, so a result cannot have it as a method without a circle.
-Below the verbs results are plain data; the facade (`driftfit.results`, `driftfit.streams`) declares a class of each
-kind that has the verbs as methods too, with ``public=True``, and from then on that is what the plain one makes.
+A verb such as `smooth` takes a result and is in a higher layer, so a result cannot have it as a method without a
+circular import. Below the verbs, results are plain data. The facade (`driftfit.results`, `driftfit.streams`) declares a
+class of each kind that also has the verbs as methods, with ``public=True``; from then on the plain class makes
+instances of that class.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Program: a bound model with a tracker. It makes the tiles that hold their state and keeps the compiled drivers.
 
-Nothing else asks for tiles or drivers of a model and a tracker; a tile of several lanes has a program for each of them.
+No other module makes tiles or drivers of a model and a tracker; a tile of several lanes has a program for each of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
-"""Samples between two looks at the progress bar."""
+"""Samples between two updates of the progress bar."""
 
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
@@ -29,16 +29,16 @@ State = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class Program:
-    """A bound model and the tracker that follows its parameters."""
+    """A bound model and the tracker that estimates its parameters."""
 
     model: Model
     tracker: Tracker
     output: str | None = None
-    """Which of several outputs it follows, in a lane beside the others."""
+    """Which of several outputs it belongs to, in one of several lanes."""
 
     @property
     def alone(self) -> Program | None:
-        """The program of its output by itself; None where the model needs the other outputs, or has none."""
+        """The program of its output alone; None if the model needs the other outputs, or has none."""
         model = None if self.output is None else self.model.alone(self.output)
         return None if model is None else Program(model, self.tracker)
 
@@ -52,7 +52,7 @@ class Program:
 
     @property
     def start(self) -> State:
-        """Fields of a lane before the first sample, beside those of the model."""
+        """Fields of a lane before the first sample, other than those of the model."""
         if self.output is None:
             return self.tracker.state_for(self.model)
         own = self.model if self.alone is None else self.alone.model
@@ -60,32 +60,32 @@ class Program:
 
     @property
     def steps(self) -> TrackerSteps:
-        """What the tracker compiles for this model."""
+        """The compiled steps of the tracker."""
         return self.tracker.steps_for(self.model)
 
     @property
     def shapes(self) -> tuple[Any, ...]:
-        """Names and shapes of the tracker's state: programs with the same ones and the same steps may share a tile."""
+        """Names and shapes of the tracker's state: programs with equal shapes and equal steps may share a tile."""
         return tuple((name, np.shape(value)) for name, value in self.tracker.state_for(self.model).items())
 
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
-        """The compiled loops; ``steps`` take the place of the tracker's own, to look inside."""
+        """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         return drivers(self.model.steps, self.steps if steps is None else steps, keep)
 
     def tile(self, state: State | None = None, **more: Any) -> Array:
-        """A tile of one lane at its start, or with the given fields; ``more`` are fields beside the tracker's own."""
+        """A tile of one lane at its start, or with the given fields; ``more`` are fields besides the tracker's own."""
         return tile_of([self], () if state is None else (state,), **more)
 
     def resting(self, state: State) -> Array:
-        """A tile with the state of a run; what was known of its last sample alone is left behind."""
+        """A tile with the state of a run, without the known factors of its last sample."""
         return self.tile({name: value for name, value in state.items() if name not in STANDING})
 
     def written(self, tile: Array, T: int, keep: str = "std") -> Array:
-        """Room for what a driver writes of T samples of a tile."""
+        """An array for the driver's output of T samples of a tile."""
         return np.empty(T, output_type(tile, self.tracker.outputs, keep))
 
     def run(self, tile: Array, record: Record, keep: str = "std") -> Array:
-        """Drive a tile of one lane over a record; returns what the driver wrote, (T,) records of `output_type`."""
+        """Run a tile of one lane over a record; returns the driver's output, (T,) records of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep)
         with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
@@ -98,7 +98,7 @@ class Program:
 
 
 STANDING = ("interval", "noise", "drift", "each")
-"""Fields that hold what is known of one sample."""
+"""Fields with the known factors of one sample."""
 
 
 def tile_of(programs: Sequence[Program], states: Sequence[State] = (), **more: Any) -> Array:
@@ -113,7 +113,7 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = (), **more: A
 
 
 def lane_of(record: Record) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record as the drivers of a tile of one lane take them."""
+    """(y, u, known) of a record in the form that drivers of a tile of one lane take."""
     return record.y[:, None], record.u[:, :, None], record.known.columns[:, :, None]
 
 

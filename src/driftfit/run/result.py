@@ -1,4 +1,4 @@
-"""Track as plain data: the result of a run, the same whatever ran. Its verbs are in `driftfit.results`."""
+"""Track as plain data: the result of a run, the same for every mode. Its verbs are in `driftfit.results`."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from driftfit.trackers.base import Tracker
 
 
 class Lane(NamedTuple):
-    """Where the result of one series is: what was written for its tile, the tile's end state, the lane."""
+    """Where the result of one series is stored: the driver's output for its tile, the end state, the lane."""
 
     out: Array
     tile: Array
     lane: int = 0
 
     def written(self, name: str) -> Array:
-        """A field of what the driver wrote."""
+        """A field of the output of the driver."""
         field: Array = self.out[name][..., self.lane]
         return field
 
     def alone(self, program: Program) -> Lane:
-        """A copy in a tile of its own, without the series beside it."""
+        """A copy in a separate tile, without the other series."""
         if self.tile["theta"].shape[-1] == 1:
             return self
         tile = program.tile(state_of(self.tile, self.lane))
@@ -51,10 +51,10 @@ class Track(Plain):
     Attributes
     ----------
     theta, std : (T, n)
-        Parameters after each sample, and their standard deviations: inf for what has not been seen yet, NaN where the
-        tracker carries no covariance.
+        Parameters after each sample, and their standard deviations: inf for parameters that are not determined yet, NaN
+        if the tracker has no covariance.
     prediction, innovation, innovation_std : (T,)
-        One-step prediction made before the output was seen, its error, and the standard deviation of that error.
+        One-step prediction made before the output was observed, its error, and the standard deviation of that error.
     ok : (T,) bool
         Which samples were used.
     y, u, time : (T,), (T, m), (T,) or None
@@ -68,7 +68,7 @@ class Track(Plain):
         self._lane = lane
 
     def __reduce__(self) -> Any:
-        """A copy, and what is sent to another process, leaves the other series of a fleet's tile behind."""
+        """A copy, or a run sent to another process, does not contain the other series of a fleet's tile."""
         return type(self), (self.program, self.record, self._lane.alone(self.program), self.start)
 
     @property
@@ -89,17 +89,17 @@ class Track(Plain):
 
     @property
     def labels(self) -> Labels:
-        """What signals are called, in which units they are, and what was left out."""
+        """Names and units of the signals, and what was left out."""
         return self.record.labels
 
     @property
     def known(self) -> Known:
-        """What was known of every sample beside its signals."""
+        """The known factors of every sample."""
         return self.record.known
 
     @property
     def timed(self) -> bool:
-        """Whether samples have times; else `time` counts them."""
+        """Whether samples have times; otherwise `time` numbers them."""
         return self.record.time is not None
 
     @property
@@ -109,16 +109,16 @@ class Track(Plain):
 
     @property
     def last(self) -> Any:
-        """The time of the last sample; None where samples have none."""
+        """The time of the last sample; None if samples have no times."""
         return None if self.record.time is None else self.record.time[-1]
 
     @property
     def state(self) -> dict[str, Array]:
-        """The state after the last sample, field by field; views, not to be written to."""
+        """The state after the last sample, field by field; these are views and must not be written to."""
         return state_of(self._lane.tile, self._lane.lane)
 
     def written(self, name: str) -> Array:
-        """A field of what the driver wrote of every sample, (T, ..): one of the tracker's ``outputs``, for example."""
+        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example."""
         return self._lane.written(name)
 
     def stores(self) -> tuple[str, ...]:
@@ -137,7 +137,7 @@ class Track(Plain):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the parameters, empty where they are not known."""
+        """Units of the parameters, empty if they are not known."""
         dimensions = self.model.dimensions
         if dimensions is None or self.names != self.model.names:
             return ("",) * len(self.names)
@@ -145,7 +145,7 @@ class Track(Plain):
 
     @property
     def time(self) -> Array:
-        """Times given, or sample numbers."""
+        """The given times, or sample numbers."""
         return np.arange(len(self)) if self.record.time is None else self.record.time
 
     def time_text(self, t: int) -> str:
@@ -190,8 +190,8 @@ class Track(Plain):
     def loglik(self) -> float:
         """Log-likelihood of the record: the sum of `log_density`; the diffuse likelihood after a diffuse start.
 
-        To the sum comes -1/2 log F for each sample that determined a new direction. NaN for trackers without an
-        innovation variance.
+        For each sample that determined a new direction -1/2 log F is added. NaN for trackers without an innovation
+        variance.
         """
         if not self.tracker.covariance:
             return float("nan")
@@ -202,10 +202,10 @@ class Track(Plain):
 
     @cached_property
     def log_density(self) -> Array:
-        """(T,): log density of each used sample given those before it, NaN where there is none.
+        """(T,): log density of each used sample given earlier ones, NaN where there is none.
 
-        The Gaussian one of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses that of
-        their mixture. A model whose innovation is not that of y adds its log Jacobian.
+        It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses it
+        is that of their mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
         s = self.innovation_var
         counted = self.ok & np.isfinite(s) & (s > 0.0)
@@ -238,7 +238,7 @@ class Track(Plain):
         return self.tracker.cov(self.lane(t))
 
     def covariances(self) -> Array:
-        """Covariances (T, n, n) of theta after every sample; replays the record unless they were kept."""
+        """Covariances (T, n, n) of theta after every sample; replays the record unless they were stored."""
         return self.written("P") if self.keeps_cov else self.program.run(self.fresh(), self.record, "cov")["P"][..., 0]
 
     def lane(self, t: int) -> dict[str, Array]:
@@ -249,7 +249,7 @@ class Track(Plain):
         return state_of(tile)
 
     def fresh(self) -> Array:
-        """A tile of one lane as it was before the first sample."""
+        """A tile of one lane at its start, before the first sample."""
         return self.program.tile(self.start)
 
     def again(self, y: Array) -> Self:
@@ -258,7 +258,7 @@ class Track(Plain):
         return type(self)(self.program, record, Lane(self.program.run(tile, record), tile), self.start)
 
     def end(self) -> End:
-        """Where the run ended, for another one to begin (`warm_start`)."""
+        """The end of the run, from which another one can continue (`warm_start`)."""
         return End((self.program,), ({name: value.copy() for name, value in self.state.items()},), self.last)
 
     def polynomials(self) -> tuple[Array, list[Array]]:
@@ -266,11 +266,11 @@ class Track(Plain):
         return self.model.polynomials(self.theta)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the result to one file, without pickle; complete or not at all."""
+        """Write the result to one file without pickle, completely or not at all."""
         storage.write(path, *self.stored())
 
     def stored(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """(header, arrays): what `save` writes."""
+        """(header, arrays): the content of a saved file."""
         header = {
             "kind": "track",
             "model": storage.describe(self.model),
@@ -288,12 +288,12 @@ class Track(Plain):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote."""
         return cls.from_stored(path, *storage.read(path, "track"))
 
     @classmethod
     def from_stored(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        """The inverse of `stored`; ``path`` is for the message of an error."""
+        """The inverse of `stored`; ``path`` is named in error messages."""
         program = Program(storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker))
         record = Record(
             arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
@@ -313,7 +313,7 @@ def track_record(program: Program, record: Record, keep: str = "std", start: Sta
 
 
 def burn_in(n: int) -> int:
-    """Samples at the start of a run of n parameters that are not judged: they show where it began."""
+    """Number of samples at the start of a run of n parameters that are not judged, because they depend on the start."""
     return max(50, 5 * n)
 
 

@@ -1,4 +1,4 @@
-"""What a tracker saw of every sample, after the model and the missing-data rule have spoken."""
+"""Samples as a tracker receives them, after the model and the missing-data rule."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ COLLECTED = ("phi", "y", "dt", "valid")
 
 @kernel
 def collect(o: State, s: State, l: int) -> None:
-    """Store what the tracker saw, after the model and the missing-data rule have spoken."""
+    """Store the sample as the tracker receives it, after the model and the missing-data rule."""
     for i in range(s.phi.shape[0]):
         o.phi[i, l] = s.phi[i, l]
     o.y[l] = s.y[l]

@@ -1,8 +1,8 @@
 """Several outputs that all measure one theta: ``Regression(n, ny=2, shared=True)``.
 
-Rows of one instant are successive samples between which no time passes: correcting with one row after the other is the
-correction with all of them, for independent noises of variance r / weight. What is predicted for the second output
-knows the first one already.
+Rows of one instant are successive samples between which no time passes: correcting with one row after the other equals
+the correction with all of them, for independent noises of variance r / weight. The prediction of the second output
+uses the first one.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Shared(Plain):
 
     @property
     def timed(self) -> bool:
-        """Whether samples have times; else `time` counts them."""
+        """Whether samples have times; otherwise `time` numbers them."""
         return self.instants is not None
 
     def by_output(self, values: Array) -> Array:
@@ -55,7 +55,7 @@ class Shared(Plain):
         return values.reshape(len(self), -1)
 
     def last_rows(self, values: Array) -> Array:
-        """Of each instant what holds after all its rows."""
+        """The values of each instant after all its rows."""
         return values[len(self.outputs) - 1 :: len(self.outputs)]
 
     @property
@@ -93,7 +93,7 @@ class Shared(Plain):
 
     @property
     def time(self) -> Array:
-        """Times given, or sample numbers."""
+        """The given times, or sample numbers."""
         return np.arange(len(self)) if self.instants is None else self.instants
 
     @property
@@ -110,18 +110,18 @@ class Shared(Plain):
         return self.last_rows(low), self.last_rows(high)
 
     def end(self) -> End:
-        """Where the run ended, for another one to begin (`warm_start`)."""
+        """The end of the run, from which another one can continue (`warm_start`)."""
         return self.rows.end()._replace(last=None if self.instants is None else self.instants[-1])
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the result to one file, without pickle; complete or not at all."""
+        """Write the result to one file without pickle, completely or not at all."""
         header, arrays = self.rows.stored()
         arrays |= {} if self.instants is None else {"instants": self.instants}
         storage.write(path, {**header, "kind": "shared outputs", "shared": storage.describe(self.model)}, arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
-        """Read what `save` wrote."""
+        """Read a file that `save` wrote."""
         header, arrays = storage.read(path, "shared outputs")
         rows = Track.from_stored(path, header, arrays)
         return cls(rows, storage.rebuild(header["shared"], Model), arrays.get("instants"))

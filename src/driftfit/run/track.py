@@ -1,4 +1,4 @@
-"""Record mode: whole series in one call, causal at every sample. The public face is `driftfit.track`."""
+"""Record mode: whole series in one call, causal at every sample. The public function is `driftfit.track`."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
 
 Result = Track | Fleet | Outputs | Shared | OutputsFleet
-"""What `track` gives: by the number of series, of settings and of outputs."""
+"""The result of `track`, which depends on the number of series, of settings and of outputs."""
 
 
 def track(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
     by: str | Sequence[str] | None = None, keep: str = "std", warm_start: Any = None, prob: Any = None,
 ) -> Result:  # fmt: skip
-    """Follow the parameters of a model; arguments are those of `driftfit.track`, time and the like in a `Reading`."""
+    """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
     check_roles("track", model, tracker, several=True)
     one_of("track", "keep", keep, ("std", "cov"))
     reading = Reading() if reading is None else reading
@@ -68,7 +68,7 @@ def track_one(
     model: Model, tracker: Tracker, y: Any, u: Any = None, reading: Reading | None = None, keep: str = "std",
     warm_start: Run | None = None,
 ) -> Track:  # fmt: skip
-    """`track` for one series of one output under one tracker."""
+    """`track` for one series of one output with one tracker."""
     run = track(model, tracker, y, u, reading, keep=keep, warm_start=warm_start)
     assert isinstance(run, Track)
     return run
@@ -77,9 +77,10 @@ def track_one(
 def records_of(
     y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
 ) -> tuple[Records, dict[Hashable, str]]:
-    """What is to be run, from arrays or a table, and the reasons of what cannot be."""
+    """The records to be run, from arrays or a table, and the reasons of those that cannot be."""
     if data is not None:
-        from driftfit.data.tables import read_records  # narwhals and polars take as long to import as all the rest
+        # imported here, because narwhals and polars take as long to import as everything else
+        from driftfit.data.tables import read_records
 
         return read_records(data, y, u, by, reading)
     if by not in (None, "row"):
@@ -92,7 +93,7 @@ def records_of(
 
 
 def _checked(tracker: Tracker, keep: str) -> Tracker:
-    """The tracker, if its settings are complete and it has what is to be kept."""
+    """The tracker, if its settings are complete and it can keep what is requested."""
     if keep == "cov" and not tracker.covariance:
         raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
     return check_ready(tracker)

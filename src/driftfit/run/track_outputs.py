@@ -28,11 +28,11 @@ from driftfit.trackers.base import Tracker
 
 
 class Signals(NamedTuple):
-    """A checked record: y (T, ny), time (T,) or None, and what is known of every sample."""
+    """A checked record: y (T, ny), time (T,) or None, and the known factors of every sample."""
 
     y: Array
     u: Array
-    """(T, m), or (T, ny, m) where the outputs share one theta."""
+    """(T, m), or (T, ny, m) if the outputs share one theta."""
     time: Array | None
     gaps: Array
     """(T,): nominal intervals."""
@@ -46,8 +46,8 @@ class Signals(NamedTuple):
 class OutputsFleet(Many):
     """Results of many records with several outputs, by key; ``failed`` gives the reason of each without a result.
 
-    Verdict, diagnosis, summary and report are over every output of every record, with keys (key, output); over every
-    record where its outputs share one theta.
+    Verdict, diagnosis, summary and report treat every output of every record, with keys (key, output), or every record
+    if its outputs share one theta.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class OutputsFleet(Many):
 def track_outputs(
     model: Model, tracker: Any, y: Any, u: Any, data: Any, by: Any, reading: Reading, keep: str, before: Any
 ) -> Outputs | Shared | OutputsFleet:
-    """Follow a model with several outputs; the arguments are those of `track`."""
+    """Track a model with several outputs; the arguments are those of `track`."""
     failed: Mapping[Hashable, str] = {}
     if reading.units is not None and data is None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
@@ -150,7 +150,7 @@ def run_one(model: Model, tracker: Any, signals: Signals, keep: str, before: Run
 
 
 def restricted(model: Model, found: Mapping[Hashable, Signals], reading: Reading) -> dict[Hashable, Signals]:
-    """The records with NaN for what is outside valid ranges or in a stretch to leave out, counted."""
+    """The records with NaN outside valid ranges and in excluded intervals, which are counted."""
     if not reading.limits and not reading.exclude:
         return dict(found)
     keys, out = list(found), {}
@@ -171,7 +171,7 @@ def restricted(model: Model, found: Mapping[Hashable, Signals], reading: Reading
 
 
 def _warn(model: Model, found: Mapping[Hashable, Signals]) -> None:
-    """Say it where most samples cannot be used because of dt."""
+    """Warn if most samples cannot be used because of dt."""
     timed = [one for one in found.values() if one.time is not None]
     if timed:
         time, gaps = (np.concatenate(parts) for parts in zip(*((one.time, one.gaps) for one in timed), strict=True))
@@ -188,7 +188,7 @@ def keep_of(keep: str, tracker: Tracker) -> str:
 
 
 def known_of(program: Program, signals: Signals) -> Known:
-    """What the driver is told of every sample, (T, k, ny)."""
+    """The known factors of every sample for the driver, (T, k, ny)."""
     gaps, noise, drift = signals.gaps, signals.noise, signals.drift
     T, ny = noise.shape
     common = np.ones(T) if drift.ndim == 2 else drift
@@ -258,7 +258,7 @@ def shared_inputs(u: Any, T: int, ny: int) -> Array:
 
 
 def noise_of_each(weights: Any, T: int, ny: int) -> Array:
-    """Factors of the noise variance, (T, ny), from weights: a number, (T,), or (T, ny) for outputs of unlike noise."""
+    """Factors of the noise variance, (T, ny), from weights: number, (T,), or (T, ny) for outputs that differ."""
     given = as_numbers("weights", weights)
     if given.ndim < 2:
         return np.repeat(np.broadcast_to(noise_of(given, T), T)[:, None], ny, axis=1)

@@ -1,4 +1,4 @@
-"""A warning of parameters that a record could not tell apart: one, whether it is one series or thousands."""
+"""A warning of parameters that a record does not determine: one warning, for one series or thousands."""
 
 from __future__ import annotations
 

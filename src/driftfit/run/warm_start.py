@@ -1,8 +1,8 @@
-"""Warm starts: a run that begins where another one ended.
+"""Warm starts: a run that continues where another one ended.
 
 Everything carries over: the parameters, their covariance, the lags of the model, and the time of the last sample, so
-that a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
-value, a larger q for example.
+a record cut in two gives the same bits as the whole. A setting that differs between the two trackers takes its new
+value, for example a larger q.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from driftfit.data.record import Labels
 from driftfit.run.program import Program, State
 
 _LEFT = ("interval", "noise", "drift", "each", "F")
-"""Fields that stay behind: what an operator set for the stream, and the diffuse likelihood of the run before."""
+"""Fields that are not carried over: an operator's settings of the stream, and the diffuse likelihood of that run."""
 
 
 class End(NamedTuple):
@@ -36,7 +36,7 @@ class Run(Protocol):
     """What a warm start can begin from: a `Track`, a `Live`, or one of several outputs."""
 
     def end(self) -> End:
-        """Where it ended."""
+        """The end of the run."""
 
 
 def carried(run: Run | None, programs: Sequence[Program]) -> tuple[State, ...]:
@@ -67,7 +67,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def first_interval(run: Run, time: Any, labels: Labels) -> float:
-    """Nominal intervals from the end of a run to the first sample of the next; 1 where either knows no time."""
+    """Nominal intervals from the end of a run to the first sample of the next; 1 if either has no time."""
     last = run.end().last
     if last is None or time is None:
         return 1.0

@@ -1,9 +1,9 @@
 """Results as tables: polars, pandas, pyarrow, Arrow streams, CSV and Parquet.
 
-One row a sample. The columns: what tells the series of a fleet apart, the time (or the sample number) and the signals
-under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
-``theta_<name>`` and ``std_<name>``. Units stand where each format has room for them: ``attrs`` in pandas, the metadata
-of fields in pyarrow, the metadata of the file in Parquet.
+One row per sample. The columns are those that identify the series of a fleet, the time (or the sample number), the
+signals under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
+``theta_<name>`` and ``std_<name>``. Units are stored where each format has room for them: ``attrs`` in pandas, the
+metadata of fields in pyarrow, the metadata of the file in Parquet.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def units_of(result: Result) -> dict[str, str]:
 
 
 def forecasts_table(runs: Mapping[Any, Track], labels: Labels, h: int, u: Any) -> pl.DataFrame:
-    """The forecasts of many runs, one after the other, a row a sample."""
+    """The forecasts of many runs in one table, one row per sample."""
     parts = []
     for key, run in runs.items():
         found = forecast(run, h, u.get(key) if isinstance(u, Mapping) else u)
@@ -154,7 +154,7 @@ def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
 
     frame = pd.DataFrame({name: table[name].to_numpy() for name in table.columns})
     for name, kind in table.schema.items():
-        if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy knows no zones: these are UTC
+        if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy has no time zones: these times are UTC
             frame[name] = frame[name].dt.tz_localize("UTC").dt.tz_convert(kind.time_zone)
     frame.attrs["units"] = dict(units)
     return frame
@@ -169,7 +169,7 @@ def _to_pyarrow(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
 
 
 def to_parquet(result: Result, path: str | PathLike[str]) -> None:
-    """Write a result as Parquet; units, model and tracker go into the metadata of the file, under "driftfit"."""
+    """Write a result as Parquet; units, model and tracker are stored in the metadata of the file, under "driftfit"."""
     records, _ = _records(result)
     trackers = dict.fromkeys(repr(one) for run in records for one in trackers_of(run))
     about = {"model": repr(records[0].model), "trackers": list(trackers), "units": units_of(result)}
@@ -182,7 +182,7 @@ def trackers_of(run: Single) -> tuple[Tracker, ...]:
 
 
 def check_ending(path: str | PathLike[str]) -> str:
-    """The ending of a file that results can be written to; ValueError for any other."""
+    """The ending of a file to which results can be written; ValueError for any other."""
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
         raise ValueError(f"{path}: results are written to {', '.join(ENDINGS)}, by the ending of the name.")
@@ -190,7 +190,7 @@ def check_ending(path: str | PathLike[str]) -> str:
 
 
 def write(result: Result, path: str | PathLike[str]) -> None:
-    """Write a result: a table as .csv or .parquet, or a whole run as .npz, by the ending of the name."""
+    """Write a result: a table as .csv or .parquet, or a complete run as .npz, depending on the ending of the name."""
     ending = check_ending(path)
     if ending == ".npz" and isinstance(result, Fleet | OutputsFleet):
         raise ValueError(f"{path}: an .npz file holds one run; write a fleet as .parquet, or fleet[key].save(...).")

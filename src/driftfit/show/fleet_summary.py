@@ -1,12 +1,12 @@
 """The summary of a fleet: which series moved most, and by how much.
 
-The path of a parameter is looked at once the start is over, after max(50, 5 n) samples (a third of a short record) and
-as soon as the parameter is known at all. With theta_0 the value there, a parameter has moved by
+The path of a parameter counts after the start, that is after max(50, 5 n) samples (a third of a short record) and as
+soon as the parameter is determined. With theta_0 its value there, a parameter has moved by
 
     max_t |theta_t - theta_0| / sqrt(var_t + var_0)
 
 standard deviations, and a series by the largest of its parameters. Without a covariance the excursion
-max_t |theta_t - theta_0| stands in units of its median over the fleet.
+max_t |theta_t - theta_0| is given in units of its median over the fleet.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ SHOWN = 20
 class Unit:
     """One series: the parameter that moved most, by how many standard deviations, from and to which value.
 
-    ``moved`` is NaN where nothing can be said: no parameter was known after the start. ``error`` is the root mean
-    square one-step error after the start, ``persistence`` that of the last output seen, on the same samples.
+    ``moved`` is NaN if no parameter was determined after the start. ``error`` is the root mean square one-step error
+    after the start, and ``persistence`` that of repeating the last output, on the same samples.
     """
 
     key: Hashable
@@ -51,7 +51,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class FleetSummary(Printed):
-    """What `Fleet.summary` returns: ``units``, those that moved most first; printing it shows the first twenty."""
+    """What `Fleet.summary` returns: ``units``, sorted by how much they moved; printing it shows the first twenty."""
 
     model: str
     trackers: tuple[str, ...]
@@ -117,7 +117,7 @@ def summary_of(
 
 @dataclass(frozen=True)
 class _Path:
-    """The path of every parameter of one series after the start: (n,) each, and where the start was over."""
+    """The path of every parameter of one series after the start, (n,) each, and where the start ended."""
 
     begin: int
     start: Array

@@ -1,4 +1,4 @@
-"""Parts of a page: sections, tables, and pictures as SVG in the colours of the page."""
+"""Parts of an HTML page: sections, tables, and pictures as SVG in the colours of the page."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 LONG = 3000
-"""Records longer than this have the points of their pictures as an image inside the SVG."""
+"""In longer records the points of pictures are an image inside the SVG."""
 
 SHORT = 12
-"""A table of at most so many rows is not broken over two pages."""
+"""A table with at most this many rows is not split between two printed pages."""
 
 INK = "#1b1b1b"
-"""Text and axes while a picture is drawn; becomes the ink of the page."""
+"""Colour of text and axes while a picture is drawn; replaced by the text colour of the page."""
 
 COLOURS = {INK: "ink", BLUE: "blue", RED: "red", GREY: "grey", "#b0b0b0": "rule"}
 
 
 def document(heading: str, sections: Sequence[str]) -> str:
-    """Sections as one page."""
+    """Combine sections into one page."""
     body = "\n".join(sections)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -43,7 +43,7 @@ def section(title: str, body: str) -> str:
 
 
 def table(caption: str, heads: tuple[str, ...], rows: Sequence[tuple[str, ...]], words: Sequence[int] = ()) -> str:
-    """A table; cells are HTML already, and ``words`` the columns that are read as text, besides the first."""
+    """A table; cells are HTML already, and ``words`` are the columns aligned as text, besides the first."""
     kinds = [' class="words"' if column in words else "" for column in range(len(heads))]
 
     def line(tag: str, cells: tuple[str, ...]) -> str:
@@ -62,7 +62,7 @@ def picture(figure: Figure, run: Track, caption: str) -> str:
 
 
 def svg(figure: Figure, thin: bool = False) -> str:
-    """A figure as SVG text whose colours are those of the page; ``thin`` makes images of what it draws of samples."""
+    """A figure as SVG text in the colours of the page; ``thin`` turns what it draws for each sample into an image."""
     import matplotlib
 
     for axis in figure.axes:
@@ -83,7 +83,7 @@ def svg(figure: Figure, thin: bool = False) -> str:
 
 
 def _inked(axis: object) -> None:
-    """Give text, ticks and frame of an axis the ink of the page."""
+    """Give text, ticks and frame of an axis the text colour of the page."""
     from matplotlib.axes import Axes
 
     assert isinstance(axis, Axes)

@@ -1,4 +1,4 @@
-"""What every report has: its style sheet, light, dark and in print, and how to read it."""
+"""The parts common to all reports: the style sheet (light, dark and print), and the section "How to read this"."""
 
 STYLE = """
 :root { color-scheme: light dark; --page: #ffffff; --ink: #1d2126; --soft: #5d6670; --rule: #d9dee3; --card: #f5f7f9;

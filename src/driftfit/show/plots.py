@@ -1,4 +1,4 @@
-"""Pictures of results. matplotlib is imported here and nowhere else."""
+"""Pictures of results. matplotlib is imported only here."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def plot_track(run: Track, level: float = 0.95) -> Figure:
 
 
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-    """One parameter of the series that moved most, a panel a series, all at one scale."""
+    """One parameter of the series that moved most, one panel per series, all on one scale."""
     units = summarise(fleet).units
     if which is None:
         which = Counter(unit.parameter for unit in units[:most]).most_common(1)[0][0]

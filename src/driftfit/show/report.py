@@ -1,8 +1,9 @@
-"""Report: one self-contained page about a run, for someone who has never seen this library.
+"""Report: one self-contained page about a run, for a reader who does not know this library.
 
-Verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and what was skipped. Pictures
-are inline SVG in the colours of the page, which follow the reader's light or dark setting and turn light for print;
-nothing is loaded from anywhere. What a long record draws is an image inside the SVG, so that the page stays small.
+The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and what was
+skipped. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and turn
+light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which keeps
+the page small.
 """
 
 from __future__ import annotations
@@ -47,33 +48,33 @@ def report(
     run : Track
         What `track` returned.
     path : str or path
-        Where the page goes; ends in .html.
+        File to write; its name ends in .html.
     title : str or None
-        Its heading; the names of the signals otherwise.
+        The heading; None uses the names of the signals.
     alarms : Alarms or None
-        What `detect` found: their dates, causes and picture.
+        The result of `detect`: the page then shows the dates, causes and a picture of the alarms.
     labels : (T,) or None
-        True where something was wrong: the dates, and which of them the alarms found.
+        True where something was wrong: the page then shows these dates, and which of them the alarms found.
 
     Raises
     ------
     ValueError
         If the path does not end in .html or .htm, or labels have another length than the record.
     OSError
-        If it cannot be written.
+        If the file cannot be written.
     """
     check_path(path).write_text(page(run, title, alarms, labels), encoding="utf-8")
 
 
 def check_path(path: str | PathLike[str]) -> Path:
-    """Where a page goes; ValueError where the name is not that of a page."""
+    """The path of a page; ValueError if its name does not end in .html."""
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"report: the page is HTML, so its name must end in .html; got {str(path)!r}.")
     return Path(path)
 
 
 def page(run: Track, title: str | None = None, alarms: Alarms | None = None, labels: Array | None = None) -> str:
-    """The page as text."""
+    """The page as HTML text."""
     facts, said, health = summarise(run), verdict(run), diagnose(run)
     heading = title or _heading(run)
     sections = [

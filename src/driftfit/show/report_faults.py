@@ -1,4 +1,4 @@
-"""What was wrong, on a page: the dates of labels, the alarms with dates and causes, and their picture."""
+"""The section about faults: the dates of labels, the alarms with dates and causes, and their picture."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 LISTED = 100
-"""Rows of a table."""
+"""Most rows in a table."""
 
 PICTURED = 4
-"""Pictures of alarms on a page about many."""
+"""Most pictures of alarms on a page about many series."""
 
 PICTURE = "The output, and each statistic over its limit (dashed). Red: an alarm is on. Grey: labelled as wrong."
 
 
 def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
-    """The section: labels, alarms, and the picture of the alarms."""
+    """The section for one run: labels, alarms, and the picture of the alarms."""
     wrong = None if labels is None else _checked(run, labels)
     parts = [] if wrong is None else [_labels(run, alarms, wrong)]
     if alarms is not None:
@@ -38,7 +38,7 @@ def faults(run: Track, alarms: Alarms | None, labels: Array | None) -> str:
 
 
 def many_faults(runs: Mapping[Hashable, Track], alarms: ManyAlarms | None, labels: Mapping[Hashable, Array]) -> str:
-    """The section about many: a row for each with labels or alarms, and pictures of the most extreme."""
+    """The section for many runs: a row for each with labels or alarms, and pictures of the most extreme."""
     watched = {} if alarms is None else {row.key: row for row in alarms.rows}
     strange = [key for key in labels if key not in runs]
     if strange:

@@ -1,7 +1,7 @@
-"""Report of many runs: one self-contained page about a fleet, or about the outputs of one record.
+"""Report on many runs: one self-contained page about a fleet, or about the outputs of one record.
 
-The verdict over all of them first, then one table with a row for each, pictures of those that move most clearly, and
-how often each diagnostic is out of bounds. The page has the looks of `driftfit.show.report`.
+The page gives the verdict on all runs first, then a table with one row per run, pictures of those that change most
+clearly, and how often each diagnostic is out of bounds. It has the style of `driftfit.show.report`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 LISTED = 200
-"""Rows of the table."""
+"""Most rows in the table."""
 PICTURED = 4
-"""Runs with pictures."""
+"""Most runs with pictures."""
 NAMED = 4
-"""Fewer runs, or models, than these are named and not counted."""
+"""Fewer runs, or models, than this are listed by name instead of counted."""
 LEVEL = 0.05
 
 MANY = """<p>Each row was tested separately. Among many tests some reject by chance: q is the share of false rejections
@@ -45,7 +45,7 @@ def page_of_many(
     alarms: ManyAlarms | None = None,
     labels: Mapping[Hashable, Array] | None = None,
 ) -> str:
-    """The page as text; ``failed`` says why some have no result; ``labels`` of a key are true where it was wrong."""
+    """The page as HTML text; ``failed`` gives the reasons of missing results; ``labels`` by key are true for faults."""
     if not runs:
         raise ValueError("report: no series has a result to report.")
     said, health = verdicts(runs, LEVEL, None), diagnoses(runs)

@@ -1,4 +1,4 @@
-"""The summary of a run: parameters now, and the comparison that keeps the numbers honest."""
+"""The summary of a run: the present parameters, and a comparison with simpler methods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
 
 @dataclass(frozen=True)
 class Row:
-    """One parameter: now, its 95 % band, and the range of its path once the start is over."""
+    """One parameter: its value, its 95 % band, and the range of its path after the start."""
 
     name: str
     theta: float
@@ -106,7 +106,7 @@ def _signals(run: Track) -> str:
 
 
 def _missing(run: Track) -> tuple[tuple[str, str], ...]:
-    """What was taken as missing though a number stood there."""
+    """Readings that were counted as missing although they contain a number."""
     return (("Taken as missing", counts(run.labels.missing)),) if run.labels.missing else ()
 
 

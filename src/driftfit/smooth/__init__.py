@@ -1,1 +1,1 @@
-"""Smoothers: what a complete record says about theta at every sample, past and future together."""
+"""Smoothers: estimates of theta at every sample from the complete record, past and future."""

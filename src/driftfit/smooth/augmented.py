@@ -9,13 +9,13 @@ With N_m(b; t) = b + phi_t (y_t - phi_t' b) / (m / weight_t + phi_t' phi_t), swe
     schedule="constant"  w = lam, until a sweep changes theta by less than tol
 
 w = 1/2 with corrected ends is block Gauss-Seidel on the normal equations and converges to the exact smoother, in more
-sweeps the larger mu is; the exact smoother costs about as much as a few sweeps, so this one is for comparison. The
-power schedule does not converge to that path: it passes near it while w is about 1/2 and then leaves it, and its tol is
-a number of sweeps, not an accuracy. w = lam other than 1/2 minimises another cost, in which later or earlier increments
-weigh more.
+sweeps for larger mu. The exact smoother costs about as much as a few sweeps, so this one is for comparison only. The
+power schedule does not converge to that path: it passes near it while w is about 1/2 and then departs from it, and its
+tol determines the number of sweeps, not an accuracy. A w = lam other than 1/2 minimises another cost, which gives later
+or earlier increments more weight.
 
 Source: Chen et al., "augmented flexible least squares for time-varying parameter systems", eq. 28-30. Departures: index
-errors at t = T are corrected as above. Cost: O(T n) a sweep.
+errors at t = T are corrected as above. Cost: O(T n) per sweep.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from driftfit.trackers.augmented_fls import AugmentedFLS
 
 
 class AugmentedPath(NamedTuple):
-    """What the sweeps left."""
+    """The result of the sweeps."""
 
     theta: Array
     """(T, n)"""
@@ -57,7 +57,7 @@ def augmented(
     Parameters
     ----------
     run : Track
-        Of `AugmentedFLS`, evenly sampled: its mu and theta0 (theta before the first sample) are used.
+        A run of `AugmentedFLS`, evenly sampled: its mu and theta0 (theta before the first sample) are used.
     schedule : "power" or "constant"
         How the weight of the past changes from sweep to sweep.
     lam : number in (0, 1)
@@ -69,7 +69,7 @@ def augmented(
     tol : number
         0.01 for "power", 1e-10 for "constant".
     max_sweeps : int
-        Stop at the latest here.
+        Largest number of sweeps.
 
     Raises
     ------

@@ -1,20 +1,20 @@
 """The exact fixed-interval smoother: off-line flexible least squares, the mean and covariance of every theta_t.
 
-It minimises, and gives the posterior of,
+It minimises the following cost, and computes the corresponding posterior distribution,
 
     J = sum_t weight_t (y_t - phi_t' theta_t)^2 + sum_t |G^-1 E_t^-1 (theta_t - theta_{t-1})|^2 / drift_t + prior
 
-with G G' = q and E_t the roots of the factors of each parameter's drift, on one of two paths. The fast one
-(`driftfit.smooth.parts.elimination`) serves a diagonal q and a diffuse start and tests its own result by a step of
-refinement; where the test fails, and for everything else, the safe one (`driftfit.smooth.parts.two_filters`) works on
-square roots of information. ``Path.method`` says which one it was. Second differences in the place of first ones are
-in `driftfit.smooth.parts.slopes`.
+with G G' = q and E_t the square roots of the factors of each parameter's drift. There are two methods. The fast one
+(`driftfit.smooth.parts.elimination`) handles a diagonal q with a diffuse start, and tests its own result by a step of
+refinement. If the test fails, and in all other cases, the safe one (`driftfit.smooth.parts.two_filters`) works on
+square roots of information. ``Path.method`` names the method that was used. Second differences instead of first ones
+are in `driftfit.smooth.parts.slopes`.
 
-Where the regressors never span all directions, a constant shift in the complement costs nothing; the first point then
+If the regressors never span all directions, a constant shift in the complement costs nothing. The first point then
 takes theta0 there, the limit of a vanishing prior, and std is inf for parameters that are not determined. Rank is
 decided on regressors with columns scaled to unit rms.
 
-Use it on a complete record. Bands hold under the random-walk model and its q. Cost: O(T n^3).
+Use it on a complete record. Bands are valid under the random-walk model and its q. Cost: O(T n^3).
 
 Source: Kalaba and Tesfatsion (1989) for flexible least squares; Rauch, Tung and Striebel (1965) for the smoother.
 Departure: the rule for undetermined directions.
@@ -31,7 +31,7 @@ from driftfit.trackers.parts.information import triangular_root
 
 
 def smooth(walk: Walk, keep: str = "std") -> Path:
-    """Solve the problem; keep="cov" adds the covariances of every sample and of neighbours."""
+    """Solve the problem; keep="cov" adds the covariances of every sample and of neighbouring samples."""
     if len(walk.trend):
         return slopes.smooth(walk, keep)
     n = walk.phi.shape[1]

@@ -3,13 +3,13 @@
     minimise  sum_t rho(a_t) + sum_t |G^-1 (theta_t - theta_{t-1})|^2 / drift_t
     a_t = sqrt(weight_t) (y_t - phi_t' theta_t);   rho(a) = a^2 for |a| <= delta,  2 delta |a| - delta^2 beyond
 
-by reweighting: solve with weight_t min(1, delta / |a_t|) until the cost stands still. Each step minimises a quadratic
-that lies on or above the cost and touches it, so the cost never rises; it is convex, so the limit is the minimum.
+by reweighting: solve with weight_t min(1, delta / |a_t|) until the cost converges. Each step minimises a quadratic
+upper bound that touches the cost, so the cost never rises; it is convex, so the limit is the minimum.
 
-Certificate: with psi = clip(a, -delta, delta) the gradient is zero, sum_t sqrt(weight_t) phi_t psi_t = 0 and
-theta_{t+1} - theta_t = drift_{t+1} q sum_{i > t} sqrt(weight_i) phi_i psi_i. What is left of both is reported.
+Certificate: with psi = clip(a, -delta, delta) the gradient is zero if sum_t sqrt(weight_t) phi_t psi_t = 0 and
+theta_{t+1} - theta_t = drift_{t+1} q sum_{i > t} sqrt(weight_i) phi_i psi_i. The residuals of both are reported.
 
-Use it when a few outputs are wrong. Bands are those of the last weighted problem and are approximate. It does not help
+Use it if a few outputs are wrong. Bands are those of the last weighted problem and are approximate. It does not help
 against wrong regressors. Source: Huber (1964); reweighting after Beaton and Tukey (1974). Cost: 10 to 50 exact
 smoothings.
 """
@@ -35,18 +35,18 @@ EFFICIENT = 1.345
 
 
 class Huber(NamedTuple):
-    """A path that outliers do not pull."""
+    """A path that is robust to outliers."""
 
     path: Smoothed
     """The weighted problem at the solution."""
     delta: float
-    """Where residuals stop to count by their square, in units of y."""
+    """The residual above which the penalty is linear, in units of y."""
     weights: Array
-    """(T,): min(1, delta / |residual|), below 1 for samples that were held back; 0 where there is none."""
+    """(T,): min(1, delta / |residual|), below 1 for downweighted samples; 0 for samples that were not used."""
     costs: Array
     """The cost after every step; it never rises."""
     certificate: float
-    """What is left of the gradient, relative: 0 at the minimum."""
+    """Relative norm of the remaining gradient: 0 at the minimum."""
 
 
 def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps: int = 200) -> Huber:
@@ -55,19 +55,19 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
     Parameters
     ----------
     run : Track
-        Of a random-walk tracker.
+        A run of a random-walk tracker.
     delta : number
-        In units of y. None: 1.345 standard deviations, these from the median absolute deviation of the leave-one-out
-        residuals of the quadratic smoother. inf gives that smoother.
+        In units of y. None: 1.345 standard deviations, estimated from the median absolute deviation of the
+        leave-one-out residuals of the quadratic smoother. inf gives that smoother.
     tol : number
         Stop when a step lowers the cost by less than this share.
     max_steps : int
-        Stop at the latest here; the certificate says how far it got.
+        Largest number of steps; the certificate shows how close the result is.
 
     Raises
     ------
     ValueError
-        If delta is not positive, or the tracker is no random walk in Gaussian noise.
+        If delta is not positive, or the tracker does not describe a random walk in Gaussian noise.
     """
     whole("huber", "max_steps", max_steps, 1)
     walk = walk_of(run)
@@ -94,12 +94,12 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
 
 
 def spread_of(smoothed: Smoothed) -> float:
-    """Standard deviation of the noise from leave-one-out residuals, half of which may be anything."""
+    """Standard deviation of the noise from leave-one-out residuals, half of which may be arbitrary."""
     return float(median_abs_deviation(smoothed.loo, scale="normal", nan_policy="omit"))
 
 
 def certificate(walk: Walk, path: Path, delta: float) -> float:
-    """The larger of both conditions' remainders, relative to the data's pull and to what walks."""
+    """The larger of the two residuals of the gradient, each relative to the size of its terms."""
     theta, walks = path.theta, path.slope if len(walk.trend) else path.theta
     root = np.sqrt(np.where(walk.weight > 0.0, walk.weight, np.nan))
     residual = walk.residual(theta)

@@ -1,13 +1,13 @@
-"""Piecewise constant parameters: least squares on each stretch between two changes.
+"""Piecewise constant parameters: least squares on each segment between two changes.
 
     theta_k = argmin sum_{t in segment k} w_t (y_t - phi_t' theta)^2,   cov = r (Phi' W Phi)^-1
 
-It is the limit of the smoother given events as the covariance of a jump grows and that of the drift vanishes; it is not
-a method of its own. Changes come from a `Bank`, or from the user; what a bank takes for
-a fault of the sensor is left out. r is pooled over the segments unless it is given. A
-segment that does not determine a direction takes the solution of least norm there, and its std is inf.
+This is the limit of the smoother with given events as the covariance of a jump grows and that of the drift vanishes.
+Changes come from a `Bank`, or from the user; samples at which a bank detects a sensor fault are left out. r is pooled
+over the segments unless it is given. A segment that does not determine a direction takes the minimum-norm solution
+there, and its std is inf.
 
-Use it when parameters stand still between changes and the stretches are what matters. Cost: O(T n^2).
+Use it if parameters are constant between changes and the segments are of interest. Cost: O(T n^2).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 class Segments:
-    """Stretches of a record with constant parameters.
+    """Segments of a record with constant parameters.
 
-    ``bounds`` (k + 1,): segment j is ``bounds[j]`` to ``bounds[j + 1]``, the end left out; ``theta``, ``std`` (k, n);
-    ``covs`` (k, n, n); ``used`` (k,) samples; ``r`` the noise variance.
+    ``bounds`` (k + 1,): segment j goes from ``bounds[j]`` to ``bounds[j + 1]``, without the end; ``theta``, ``std``
+    (k, n); ``covs`` (k, n, n); ``used`` (k,) samples; ``r`` the noise variance.
     """
 
     def __init__(self, run: Track, breaks: Any = None, r: float | None = None) -> None:
@@ -44,7 +44,7 @@ class Segments:
         self.run, self.names, self.bounds = run, run.names, np.array([0, *inner, T])
         seen = replay(run)
         known = seen["ok"][:, 0] > 0.0
-        if run.tracker.weighs:  # a sensor at fault tells nothing of the segment
+        if run.tracker.weighs:  # samples with a sensor fault carry no information about the segment
             known &= faults(run.tracker, run, Hypotheses(run).events()) == 1.0  # type: ignore[arg-type]
         self._ok, self._phi, self._y = known, seen["phi"][..., 0], seen["y"][:, 0]
         self._weight = 1.0 / seen["used_noise"][:, 0]
@@ -80,7 +80,7 @@ class Segments:
         return np.repeat(self.theta, np.diff(self.bounds), axis=0)
 
     def table(self) -> Any:
-        """One row a segment, as a polars table: start, end, samples, parameters and their standard deviations."""
+        """One row per segment, as a polars table: start, end, samples, parameters and their standard deviations."""
         import polars as pl
 
         columns: dict[str, Any] = {"start": self.bounds[:-1], "end": self.bounds[1:] - 1, "samples": self.used}

@@ -41,7 +41,7 @@ def plot_smoothed(run: Track, theta: Array, low: Array, high: Array) -> Figure:
 
 
 def plot_segments(run: Track, bounds: Sequence[int], theta: Array, std: Array, level: float) -> Figure:
-    """Constant parameters with bands, stretch by stretch, over the tracked path."""
+    """Constant parameters with bands, segment by segment, over the tracked path."""
     n = len(run.names)
     figure = new_figure(9.0, 1.7 * n + 0.8)
     axes = figure.subplots(n, 1, sharex=True, squeeze=False).ravel()

@@ -21,9 +21,9 @@ from driftfit.trackers.base import RandomWalk
 
 @lru_cache
 def attentive(steps: TrackerSteps) -> TrackerSteps:
-    """Steps that note the factor of the noise variance when the tracker is at work, and what the tracker notes itself.
+    """Steps that store the factor of the noise variance when the tracker runs, and what the tracker notes itself.
 
-    A model may make it larger than what the user gave (measurement noise that comes in through a curve).
+    A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """
     predict, begin, note = steps.predict, steps.begin, steps.note
 
@@ -51,7 +51,7 @@ def attentive(steps: TrackerSteps) -> TrackerSteps:
 
 
 def replay(run: Track) -> Array:
-    """Run the tracker over its record again and return what it saw, (T,) records.
+    """Run the tracker over its record again and return the samples as it received them, (T,) records.
 
     Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
     """
@@ -65,7 +65,7 @@ def replay(run: Track) -> Array:
 def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     """The problem behind a run; ValueError if its tracker does not describe a random walk in Gaussian noise.
 
-    ``prior`` replaces what the tracker takes theta to be.
+    ``prior`` replaces the random walk that the tracker assumes.
     """
     own, tracker = prior is None, run.tracker
     each = run.known.more if own and run.known.more.size else NONE

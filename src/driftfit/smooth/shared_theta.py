@@ -1,7 +1,8 @@
-"""The smoothed path of outputs that share one theta: one theta an instant, one residual an output.
+"""The smoothed path of outputs that share one theta: one theta per instant, one residual per output.
 
-Rows of one instant are successive samples between which theta does not move, so what holds after its last row holds for
-the instant, and the lag from one instant to the next is that from its last row to the first of the next.
+Rows of one instant are successive samples between which theta does not move. The estimate after its last row is
+therefore that of the instant, and the lag from one instant to the next is that from its last row to the first row of
+the next.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class SmoothedShared(Smoothed):
         self.cost, self.method, self.r = rows.cost, rows.method, rows.r
 
     def _last(self, values: Array) -> Array:
-        """Of each instant what holds after all its rows."""
+        """The values of each instant after all its rows."""
         return values[self._ny - 1 :: self._ny]
 
     def _by_output(self, values: Array) -> Array:
@@ -48,7 +49,7 @@ class SmoothedShared(Smoothed):
 
     @property
     def slope(self) -> Array:
-        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        """Change of theta per nominal interval, (T, n), if the slope is a random walk (``differences=2``)."""
         return self._last(self.rows.slope)
 
     @cached_property

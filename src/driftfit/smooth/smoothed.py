@@ -1,4 +1,4 @@
-"""Smoothed: the path of a complete record, with what judges it."""
+"""The smoothed path of a complete record, and statistics to judge it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from driftfit.smooth.plots import plot_smoothed
 from driftfit.smooth.problem import walk_of
 
 ALONE = 1e-12
-"""Below this sqrt(1 - leverage) a sample alone determines a direction, and says nothing when it is left out."""
+"""Below this sqrt(1 - leverage) a sample alone determines a direction, and its leave-one-out residual is undefined."""
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,24 +32,26 @@ class Smoothed:
     theta, std : (T, n)
         Posterior mean and standard deviation; std is inf for parameters that the record does not determine.
     residual, loo : (T,)
-        y - phi' theta; and the same with theta from all samples but this one. The first is *not* a measure of fit: it
-        is shrunk by 1 - leverage. NaN where there is no sample; loo also where a sample alone determines a direction.
+        y - phi' theta; and the same with theta from all samples but this one. The first is *not* a measure of fit,
+        because it is shrunk by 1 - leverage. NaN where there is no sample, and loo also where a sample alone determines
+        a direction.
     leverage : (T,)
         Share of a sample in its own fit, in [0, 1].
     press, alone : float, int
-        Weighted mean square of ``loo``, and how many samples it leaves out because they alone determine a direction.
+        Weighted mean square of ``loo``, and the number of samples that it leaves out because they alone determine a
+        direction.
     cost, measurement_cost, dynamic_cost : float
-        The least J, and its two parts: weighted squared residuals, and the rest.
+        The minimum of J, and its two parts: weighted squared residuals, and the rest.
     r : float
-        Noise variance: the tracker's, or J / (N - rank) where it carries none (J / N under a proper prior).
+        Noise variance: the tracker's, or J / (N - rank) if it has none (J / N under a proper prior).
     rank : (T,) int
         Rank of the regressors up to each sample.
     method : "fast" or "safe"
-        Which path the solver took; it tests its own result.
+        The method of the solver, which tests its own result.
     walk : Walk
         The problem that was solved.
 
-    Bands hold under the random-walk model and its drift; they do not cover a drift that is set wrongly.
+    Bands are valid under the random-walk model and its drift; they do not account for a wrong drift.
     """
 
     def __init__(self, walk: Walk, path: Path, run: Track, order_by: Any = None) -> None:
@@ -97,7 +99,7 @@ class Smoothed:
 
     @property
     def time(self) -> Array:
-        """Times given, or sample numbers."""
+        """The given times, or sample numbers."""
         return self.run.time
 
     @cached_property
@@ -106,7 +108,7 @@ class Smoothed:
 
     @property
     def slope(self) -> Array:
-        """Change of theta per nominal interval, (T, n), where it is the slope that walks (``differences=2``)."""
+        """Change of theta per nominal interval, (T, n), if the slope is a random walk (``differences=2``)."""
         return self._of_slopes(self._path.slope)
 
     @cached_property
@@ -170,13 +172,13 @@ class Smoothed:
         return cov
 
     def lag_cov(self, t: int) -> Array:
-        """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` where given."""
+        """Covariance (n, n) of theta at samples t and t + 1, rows for t; t counts along ``order_by`` if given."""
         lag: Array = self.r * self._covariances.lag_cov[t]
         return lag
 
     @cached_property
     def _covariances(self) -> Path:
-        """The path with its covariances; solved again unless they were kept."""
+        """The path with its covariances; the problem is solved again unless they were kept."""
         return self._path if len(self._path.cov) else solve(self.walk, "cov", self.order_by)
 
     def plot(self, level: float = 0.95) -> Figure:
@@ -185,7 +187,7 @@ class Smoothed:
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
-    """The smoothed path in time order; with ``order_by`` theta walks along that variable instead of along time."""
+    """The smoothed path in time order; with ``order_by`` theta is a random walk along that variable instead of time."""
     if order_by is None:
         return exact.smooth(walk, keep)
     arranged, order = ordered(walk, order_by)
@@ -199,7 +201,7 @@ def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:
 
 
 def noise_variance(walk: Walk, path: Path) -> float:
-    """J / (N - rank); NaN, with a warning, where nothing is left over to estimate it from."""
+    """J / (N - rank); NaN, with a warning, if there are no degrees of freedom from which to estimate it."""
     free = walk.used - (int(path.rank.max()) if walk.p0 is None else 0)
     least = 1e-28 * float(np.sum(walk.weight * walk.y**2))
     if free <= 0 or path.cost <= least:

@@ -1,18 +1,18 @@
-"""Group total variation: a path of few jumps, constant in between.
+"""Group total variation: a path with few jumps that is constant in between.
 
     minimise  F = sum_t weight_t (y_t - phi_t' theta_t)^2 + penalty sum_t |theta_{t+1} - theta_t|_2
 
 by reweighting: solve flexible least squares with D_t = penalty / (2 sqrt(|Delta_t|^2 + eta^2)) I. Each step minimises a
-quadratic that lies on or above F (with eta) and touches it, so that cost never rises; F is convex.
+quadratic upper bound of F (with eta) that touches it, so the cost never rises; F is convex.
 
 Certificate: with g_t = 2 sum_{i > t} weight_i phi_i (y_i - phi_i' theta_i), the minimum has |g_t| <= penalty everywhere
 and g_t = penalty Delta_t / |Delta_t| at a jump. A path with |g_t| <= penalty costs at most
-sum(penalty |Delta_t| - g_t' Delta_t) more than the best one: that gap is what stops the iteration. At
+sum(penalty |Delta_t| - g_t' Delta_t) more than the best one; the iteration stops by this gap. At
 penalty >= penalty_max = max |g_t| of constant least squares the path is constant.
 
-Use it for parameters that jump (switching systems). It shrinks jumps towards each other; `refit` estimates each segment
-anew. The norm couples parameters, so put them into comparable units first. Source: Rudin, Osher and Fatemi (1992) for
-the penalty, Yuan and Lin (2006) for groups. Cost: 100 to 1,000 exact smoothings.
+Use it for parameters that jump (switching systems). It shrinks the jumps; `refit` estimates each segment again without
+shrinkage. The norm couples parameters, so scale them to comparable units first. Source: Rudin, Osher and Fatemi (1992)
+for the penalty, Yuan and Lin (2006) for groups. Cost: 100 to 1,000 exact smoothings.
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ SMOOTHING = 1e-6
 
 
 class Piecewise(NamedTuple):
-    """A path of few jumps."""
+    """A path with few jumps."""
 
     theta: Array
     """(T, n)"""
     jumps: Array
     """Samples at which a new segment begins."""
     refit: Array
-    """(T, n): least squares on each segment by itself."""
+    """(T, n): separate least squares on each segment."""
     penalty_max: float
-    """From this penalty on the path is constant."""
+    """At this penalty and above the path is constant."""
     costs: Array
     """F with eta after every step; it never rises."""
     pull: float
     """max |g_t| / penalty: at most 1 at the minimum."""
     gap: float
-    """How much more than the least F this path may cost, as a share of F."""
+    """Upper bound of how much this path costs above the minimum, as a share of F."""
 
 
 def total_variation(run: Track, penalty: float, tol: float = 1e-4, max_steps: int = 1000) -> Piecewise:
-    """Smooth a run under a price for jumps.
+    """Smooth a run with a penalty on jumps.
 
     Parameters
     ----------
     run : Track
-        Of any tracker; only its regressors and outputs are used.
+        A run of any tracker; only its regressors and outputs are used.
     penalty : number
-        Price of a jump of size 1, in squared units of y; positive.
+        Penalty of a jump of size 1, in squared units of y; positive.
     tol : number
-        Stop when the gap is below this share of the cost and |g_t| above the penalty by at most a thousandth.
+        Stop when the gap is below this share of the cost, and |g_t| exceeds the penalty by at most a thousandth.
     max_steps : int
-        Stop at the latest here; ``pull`` and ``gap`` say how far it got.
+        Largest number of steps; ``pull`` and ``gap`` show how close the result is.
 
     Raises
     ------

@@ -7,12 +7,13 @@
     I      = [-R_d U + sqrt(R_d^2 U^2 - (R_d^2 + X_d^2)(U^2 - U_p^2))] / (R_d^2 + X_d^2)     current, kA (mOhm, V)
     R_arc  = U / I                                                measured, mOhm
 
-The last three have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, increasing in R, so
-that the whole is a Hammerstein-Wiener system. A change of b_arc is a change of scale of that inverse and an offset:
-with d_1 = 1 the b_j carry it and d stays. Score a, p1, p2, ratios b_j / b_1, and the local gain b_1 / F'(R).
+The last three equations have a closed inverse, L = (U_p R / sqrt((R + R_d)^2 + X_d^2) - a_arc) / b_arc, which increases
+in R, so the whole is a Hammerstein-Wiener system. A change of b_arc changes the scale of that inverse and adds an
+offset: with d_1 = 1 this appears in the b_j, and d is constant. Score a, p1, p2, the ratios b_j / b_1, and the local
+gain b_1 / F'(R).
 
-Source: Feng and Hong (2021), example 4. Departures: the working point L0 = 20 cm is ours (the paper says "around the
-working point"; about zero the length would be negative), and records whose arc leaves 2 to 45 cm are drawn again.
+Source: Feng and Hong (2021), example 4. Departures: the working point L0 = 20 cm is our choice (the paper says "around
+the working point"; around zero the length would be negative), and records whose arc leaves 2 to 45 cm are redrawn.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ SHORTEST, LONGEST = 2.0, 45.0
 
 
 class Furnace(NamedTuple):
-    """A record: input u (T,), resistance R (T,), length L (T,), gradient b_arc (T,), and v (T,)."""
+    """One record: input u (T,), resistance R (T,), length L (T,), gradient b_arc (T,), and v (T,)."""
 
     u: Array
     R: Array
@@ -46,7 +47,7 @@ class Furnace(NamedTuple):
 
     @property
     def length_per_resistance(self) -> Array:
-        """dL/dR, (T,), by which the local gain of an estimate is scored: 0.0378 / (dL/dR)."""
+        """dL/dR (T,), which determines the true local gain: 0.0378 / (dL/dR)."""
         return slope(self.R, self.gradient)
 
 
@@ -70,7 +71,7 @@ def slope(R: Array, gradient: Array) -> Array:
 
 
 def valve(u: Array, p1: float = THRESHOLDS[0], p2: float = THRESHOLDS[1], limit: float = VOLTAGE) -> Array:
-    """The dead zone, and the limits beyond which the input moves the valve no more, (61)."""
+    """The valve with its dead zone, and the limits beyond which the input has no further effect, (61)."""
     held = np.clip(u, -limit, limit)
     return np.where(held >= p1, held - p1, np.where(held <= p2, held - p2, 0.0))
 
@@ -103,8 +104,10 @@ class Switching(NamedTuple):
 def switching(
     seed: int = 0, T: int = 3000, half: int = 50, low: float = 0.02, high: float = 4.0, noise: float = 0.05
 ) -> Switching:
-    """An arc that burns in every other half period of its voltage: i = g u + v, u a sine of ``half`` samples a half
-    period and amplitude 1, g switching between ``low`` and ``high``, v white with standard deviation ``noise``.
+    """Simulate an arc that burns in every other half period of its voltage.
+
+    i = g u + v, where u is a sine of amplitude 1 with ``half`` samples per half period, g switches between ``low`` and
+    ``high``, and v is white with standard deviation ``noise``.
     """
     t = np.arange(T)
     u, g = np.sin(np.pi * (t + 0.5) / half), np.where(t // half % 2 == 0, low, high)

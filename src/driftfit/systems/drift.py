@@ -1,4 +1,4 @@
-"""Drift laws: how a true parameter moves in a simulation.
+"""Drift laws: how a true parameter changes in a simulation.
 
     Constant         x_t = start
     RandomWalk       x_{t+1} = x_t + N(0, std^2), reflected at `limits` where they are given
@@ -8,12 +8,12 @@
     Jump             x_t = start for t < at, start + size from then on
     Free             x_t = function(t)
 
-Sample numbers t start at 0. A law is frozen and has no memory: `Law.path` gives the same path for the same generator
-state. `paths` turns one law a parameter into an array (T, n); there a plain number is a constant and a plain function
-is `Free`.
+Sample numbers t start at 0. A law is frozen and has no state: `Law.path` returns the same path for the same state of
+the generator. `paths` turns one law per parameter into an array (T, n); there a plain number is a constant and a plain
+function is `Free`.
 
 A sine increment moves x by amplitude / omega around its mean; a random walk without limits is unbounded.
-Source: the usual laws of simulation studies of time-varying systems; anything else, such as the sum of a sine and a
+Source: the usual laws of simulation studies of time-varying systems. Any other law, such as the sum of a sine and a
 ramp, is a function of t.
 """
 
@@ -29,16 +29,16 @@ from driftfit.engine.kernel import Array
 
 
 class Law(ABC):
-    """How one parameter moves."""
+    """How one parameter changes."""
 
     @abstractmethod
     def path(self, T: int, rng: np.random.Generator) -> Array:
-        """Its values at T samples, (T,). Only a random walk draws from ``rng``."""
+        """The values at T samples, (T,). Only a random walk draws from ``rng``."""
 
 
 @dataclass(frozen=True)
 class Constant(Law):
-    """A parameter that stays."""
+    """A constant parameter."""
 
     start: float
 
@@ -48,7 +48,7 @@ class Constant(Law):
 
 @dataclass(frozen=True)
 class RandomWalk(Law):
-    """Steps of standard deviation ``std``; ``limits = (low, high)`` reflect the path back into their interval."""
+    """Steps of standard deviation ``std``; ``limits = (low, high)`` reflect the path back into this interval."""
 
     start: float
     std: float
@@ -67,7 +67,7 @@ class RandomWalk(Law):
 
 @dataclass(frozen=True)
 class Ramp(Law):
-    """A steady change of ``step`` per sample."""
+    """A constant change of ``step`` per sample."""
 
     start: float
     step: float
@@ -128,19 +128,19 @@ class Free(Law):
 
 
 def paths(laws: Sequence[Law | float | Callable[[Array], Array]], T: int, rng: np.random.Generator) -> Array:
-    """One path a law, (T, n); drawn in the order of the laws."""
+    """One path per law, (T, n); drawn in the order of the laws."""
     return np.stack([as_law(law).path(T, rng) for law in laws], axis=1) if len(laws) else np.zeros((T, 0))
 
 
 def as_law(law: Law | float | Callable[[Array], Array]) -> Law:
-    """A law as it is, a number as `Constant`, a function as `Free`."""
+    """Return a law unchanged, a number as `Constant`, and a function as `Free`."""
     if isinstance(law, Law):
         return law
     return Free(law) if callable(law) else Constant(float(law))
 
 
 def reflect(path: Array, limits: tuple[float, float] | None) -> Array:
-    """A path folded into [low, high] as by mirrors at both ends; None leaves it alone."""
+    """Reflect a path at both ends of [low, high]; with None it is returned unchanged."""
     if limits is None:
         return path
     low, high = limits

@@ -5,12 +5,12 @@
     sum_k d_k,t g_k(y0_t) = w_t
 
 with c_1 = d_1 = 1, v = w = 0 before the record, and y = y0 + measurement noise. Coefficients follow the laws of
-`driftfit.systems.drift`. An unstable linear block has a bounded output only under feedback: give u as a function of the
-past outputs. `example` has examples 1 to 3 of Feng and Hong (2021), `driftfit.systems.arc_furnace` the fourth.
+`driftfit.systems.drift`. An unstable linear block has a bounded output only under feedback: pass u as a function of the
+past outputs. `example` gives examples 1 to 3 of Feng and Hong (2021), `driftfit.systems.arc_furnace` the fourth.
 
-The output block is inverted by Newton's method within a bracket, for all samples at once; `invert` never returns one of
-several roots silently. Departures from the paper: N(0, 0.002) is a standard deviation, and the laws of b in example 3
-are increments (``literal=True`` takes them as levels, which moves b by 0.04 %).
+The output block is inverted by Newton's method within a bracket, for all samples at once. `invert` raises an error
+instead of choosing one of several roots. Departures from the paper: N(0, 0.002) is a standard deviation, and the laws
+of b in example 3 are increments (``literal=True`` takes them as levels, which changes b by 0.04 %).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Laws = Sequence[Law | float | Callable[[Array], Array]]
 
 
 class Simulated(NamedTuple):
-    """A record and its truth."""
+    """A record with its true parameters."""
 
     model: HammersteinWiener
     y: Array
@@ -74,7 +74,7 @@ class Simulated(NamedTuple):
 
 
 def _late(path: Array, k: int) -> Array:
-    """A path k samples later, NaN before it begins."""
+    """A path delayed by k samples, NaN before it begins."""
     return np.concatenate([np.full(min(k, len(path)), np.nan), path[: max(len(path) - k, 0)]])
 
 
@@ -99,20 +99,21 @@ def simulate(
     model : HammersteinWiener
         Orders and bases.
     a, b, c, d : laws, numbers or functions of the sample numbers
-        na, nb, n_in - 1 and n_out - 1 of them: c_1 and d_1 are 1.
+        na, nb, n_in - 1 and n_out - 1 of them, because c_1 and d_1 are 1.
     u : (T,), a function (t, y) or None
-        Input; a function gets the sample number and the outputs before it, (t,). None: white, of variance 1.
+        The input. A function receives the sample number and the earlier outputs (t,). None draws white noise of
+        variance 1.
     snr_db : number or None
-        Measurement noise of standard deviation std(y0) 10^(-snr_db / 20).
+        Adds measurement noise of standard deviation std(y0) 10^(-snr_db / 20).
     equation_noise : number
         Standard deviation of white noise added to w.
     limit : number
-        Outputs larger than this count as out of reach.
+        Outputs larger than this count as unreachable.
 
     Raises
     ------
     NotMonotoneError
-        Where the output block does not increase, or w is out of its reach (an unstable linear block).
+        If the output block does not increase, or w is out of its range (an unstable linear block).
     """
     counts = {"a": model.na, "b": model.nb, "c": model.into.n - 1, "d": model.out.n - 1}
     for (name, count), given in zip(counts.items(), (a, b, c, d), strict=True):
@@ -193,16 +194,16 @@ def first_unstable(a: Array) -> int | None:
 
 
 START = {"a": (-0.6, 0.4), "b": (0.7, -0.36), "c": (0.4, -0.7), "d": (-0.4, 0.6)}
-"""Coefficients at the beginning of examples 1 to 3, without the leading 1 of c and d."""
+"""Coefficients at the start of examples 1 to 3, without the leading 1 of c and d."""
 WALK = 0.002
 CUBIC = HammersteinWiener(2, 2, input=Polynomial(3), output=Polynomial(3))
 
 
 def example(number: int, seed: int = 0, T: int = 5000, snr_db: float | None = None, literal: bool = False) -> Simulated:
-    """Example 1, 2 (both: a random walk of every parameter) or 3 (ramps, sines, a walk of c, a jump of d) of the paper.
+    """Example 1, 2 (both: a random walk of every parameter) or 3 (ramps, sines, a random walk of c, a jump of d).
 
-    A seed whose walk leaves the region where the linear block is stable and the output block increasing is replaced by
-    seed + 1000, and so on.
+    If the random walk of a seed leaves the region where the linear block is stable and the output block increases, it
+    is replaced by seed + 1000, and so on.
     """
     laws: dict[str, Laws] = {name: [RandomWalk(x, WALK) for x in values] for name, values in START.items()}
     if number == 3:
@@ -226,7 +227,7 @@ def example(number: int, seed: int = 0, T: int = 5000, snr_db: float | None = No
 
 
 def unstable_in_closed_loop(T: int = 2000, seed: int = 0) -> Simulated:
-    """An unstable linear block (a pole at 1.05) that a proportional controller keeps bounded."""
+    """An unstable linear block (with a pole at 1.05) whose output a proportional controller keeps bounded."""
     rng = np.random.default_rng(seed)
     reference = rng.normal(0.0, 0.5, T)
     model = HammersteinWiener(1, 1, input=Polynomial(3), output=Polynomial(3))

@@ -1,7 +1,7 @@
-"""The output of a static block whose inverse is known: y with sum_k d_k g_k(y) = w, for all samples at once.
+"""Invert a static block: find y with sum_k d_k g_k(y) = w, for all samples at once.
 
-Newton's method within a bracket. Never one of several roots silently: where the block does not increase within the
-bracket, or does not reach a level, it says so.
+Newton's method within a bracket. If the block does not increase within the bracket, or does not reach a level, an error
+is raised; one of several roots is never returned silently.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial
 LIMIT = 1e3
 """Outputs beyond which the inversion gives up."""
 GRID = 200
-"""Points at which the slope of a block that is no polynomial is looked at."""
+"""Points at which the slope of a block that is not a polynomial is evaluated."""
 
 
 class NotMonotoneError(ValueError):
-    """An output block that is not increasing where it is used, or does not reach a level."""
+    """The output block does not increase where it is used, or does not reach a level."""
 
 
 def invert(basis: Basis, d: Array, w: Any, limit: float = LIMIT, first: int = 0) -> Array:
     """y (T,) with sum_k d_k g_k(y) = w, for d (T, n) and w (T,).
 
-    From [-1, 1], or the range of the basis, each end moves out by the present width until the levels enclose w; then
-    Newton steps, replaced by bisection when they leave the bracket.
+    From [-1, 1], or the range of the basis, each end moves out by the present width until the levels enclose w. Then
+    Newton steps follow; a step that leaves the bracket is replaced by bisection.
 
     Raises
     ------
     NotMonotoneError
-        Naming the first sample (counted from ``first``) at which the block does not increase within the bracket, or
-        whose w is not reached within ``limit``.
+        Names the first sample (counted from ``first``) at which the block does not increase within the bracket, or
+        does not reach w within ``limit``.
     """
     d, w = np.asarray(d, dtype=float), np.asarray(w, dtype=float)
     low, high = _bracket(basis, d, w, limit, first)
@@ -89,11 +89,11 @@ def _check_rising(basis: Basis, d: Array, low: Array, high: Array, first: int) -
 
 
 def _suspects(basis: Basis, d: Array, low: Array, high: Array) -> Array:
-    """Points (T, g) in the brackets of which one has a slope of 0 or less if any has."""
+    """Points (T, g) in the brackets; if the slope is 0 or less anywhere, it is so at one of them."""
     middle = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 3 if isinstance(basis, Polynomial) else GRID)
     if not isinstance(basis, Polynomial) or basis.degree < 2:
         return middle
-    k = basis.degree - 1  # a polynomial changes sign at the roots of its slope: look between them, and at the extrema
+    k = basis.degree - 1  # the slope of a polynomial changes sign at its roots: test between them, and at the extrema
     roots = [np.roots((np.arange(1, k + 2) * row)[::-1]) for row in d] if k > 2 else _roots(d)
     found = np.full((len(d), 3 * k), np.nan)
     for t, row in enumerate(roots):

@@ -1,10 +1,10 @@
-"""Systems whose parameters jump, with sensors that fail: what banks of hypotheses are tried on.
+"""Systems whose parameters jump, with sensors that fail; banks of hypotheses are tested on them.
 
     y_t = a1 y_{t-1} + a2 y_{t-2} + b0 u_t + e_t,   e ~ N(0, 0.3^2), u ~ N(0, 1)
 
-a1 is uniform in (-1.6, 1.6), a2 in (-0.9, 0.6), redrawn until both poles are below 0.93; b0 is uniform in +-(0.5, 2).
-After 30 samples a jump comes with probability 0.01: four in ten move b0 alone by +-(0.7, 2), the others draw everything
-anew. In between parameters drift by 0.002 a step and never come nearer to instability than a pole of 0.96.
+a1 is uniform in (-1.6, 1.6) and a2 in (-0.9, 0.6), redrawn until both poles are below 0.93; b0 is uniform in
++-(0.5, 2). After 30 samples a jump occurs with probability 0.01: four in ten jumps change b0 alone by +-(0.7, 2), the
+others redraw all parameters. Between jumps the parameters drift by 0.002 per step, with poles below 0.96.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MODEL = ARX(2, 1, nk=0, start="zero")
 
 
 class Jumping(NamedTuple):
-    """One record with its truth."""
+    """One record with its true parameters."""
 
     y: Array
     """(T,), as measured."""
@@ -31,13 +31,13 @@ class Jumping(NamedTuple):
     jumps: Array
     """Samples of the jumps."""
     kinds: Array
-    """(T,): covariance that was active before each sample, 0 drift, 1 all, 2 gain, or the regime."""
+    """(T,): the covariance that was active before each sample (0 drift, 1 all, 2 gain), or the regime."""
     bad: Array
     """(T,) bool: outliers, or a frozen sensor."""
 
 
 def poles(a1: float, a2: float) -> float:
-    """The largest modulus."""
+    """The largest modulus of the poles."""
     return float(np.abs(np.roots([1.0, -a1, -a2])).max())
 
 
@@ -58,7 +58,7 @@ def drifted(rng: np.random.Generator, theta: Array, size: float) -> Array:
 
 
 def jumping(seed: int, T: int = 600, fault: str = "none", K: float = 10.0, sigma: float = SIGMA) -> Jumping:
-    """A record; ``fault`` is "none", "innovation", "additive", "frozen" or "regimes"; ``sigma`` is that of e."""
+    """Simulate a record; ``fault`` is "none", "innovation", "additive", "frozen" or "regimes"; ``sigma`` scales e."""
     rng = np.random.default_rng(seed)
     theta, u = draw(rng), rng.standard_normal(T)
     path, kinds, bad = np.empty((T, 3)), np.zeros(T, int), np.zeros(T, bool)

@@ -1,8 +1,9 @@
-"""The tracking benchmark's scenarios: ways in which parameters, noise and inputs behave, one function each.
+"""The scenarios of the tracking benchmark: how parameters, noise and inputs behave, one function each.
 
-A scenario is a function ``name(rng, T, n)`` that returns a `Plan`: the true path of the parameters in units in which 1
-is large, the noise standard deviation of every sample, and what is wrong with inputs and outputs. `simulate` plays a
-plan as a regression on white inputs or as an ARX(2, 2). To add one, write one function; it is found by being here.
+A scenario is a function ``name(rng, T, n)`` that returns a `Plan`: the true path of the parameters on a scale on which
+1 is large, the noise standard deviation of every sample, and the faults of inputs and outputs. `simulate` runs a plan
+as a regression on white inputs or as an ARX(2, 2) model. To add a scenario write one function here; it is found
+automatically.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from driftfit.engine.kernel import Array
 
 T_DEFAULT = 1000
 NOISE = 0.3
-"""Standard deviation of the noise where a scenario does not say otherwise."""
+"""Standard deviation of the noise unless a scenario sets it."""
 
 
 @dataclass
 class Plan:
-    """What happens in a scenario; paths are relative to a nominal system."""
+    """The content of a scenario; paths are relative to a nominal system."""
 
     path: Array
     noise: Array
@@ -35,7 +36,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Simulated:
-    """A simulated record: y (T,), u (T, m), theta (T, n), which samples are outliers, and the oracle's knowledge."""
+    """A simulated record: y (T,), u (T, m), theta (T, n), which samples are outliers, and what the oracle knows."""
 
     y: Array
     u: Array

@@ -8,10 +8,10 @@
 
 v_k is white and Gaussian with standard deviation ``std``; everything before the first sample is zero. The defaults are
 the four examples of Chen et al., "augmented flexible least squares for time-varying parameter systems", section 6,
-whose noise N(0, v) is read as a variance. `example(name, s)` gives them under the seeds of this library's reproduction.
+whose noise N(0, v) is read as a variance. `example(name, s)` generates them with the seeds of our reproduction.
 
-Departures: the paper leaves the start of the autoregression open (zero here), and its definition of the exponential
-autoregression mixes the lags of the exponent (`delay` here).
+Departures: the paper does not give the start of the autoregression (zero here), and its definition of the exponential
+autoregression is ambiguous about the lag in the exponent (`delay` here).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def rational(
     g: Callable[[Any], Any] = lambda u: 1.0 + u * u,
     u: Array | None = None,
 ) -> Simulated:
-    """Example 2: a ratio of polynomials, seen as a linear system whose coefficients vary."""
+    """Example 2: a ratio of polynomials, regarded as a linear system with varying coefficients."""
     u = slow_sine(T) if u is None else np.asarray(u, dtype=float)
     noise = rng.normal(0.0, std, len(u))
     past = np.concatenate([[0.0], u[:-1]])
@@ -77,7 +77,7 @@ def switching(
     modes: Sequence[tuple[float, float]] = ((0.3, 0.7), (0.8, 1.0)),
     at: Sequence[int] = (100,),
 ) -> Simulated:
-    """Example 3: white input; mode i + 1 holds from sample ``at[i]`` (counted from 0) on."""
+    """Example 3: white input; mode i + 1 is active from sample ``at[i]`` (counted from 0) on."""
     u = rng.normal(0.0, 1.0, T)
     mode = np.searchsorted(np.asarray(at), np.arange(T), side="right")
     return _autoregression(ARX(1, 1, start="zero"), np.array(modes)[mode], u[:, None], rng.normal(0.0, std, T))
@@ -96,7 +96,7 @@ def exp_ar(
     """Example 4: an autoregression whose coefficients depend on the size of the output."""
     base, swing = np.array(a, dtype=float), np.array(b, dtype=float)
     n = len(base)
-    y = np.zeros(T + max(n, delay))  # the zero past first
+    y = np.zeros(T + max(n, delay))  # the zero past comes first
     start = len(y) - T
     theta, phi = np.empty((T, n)), np.empty((T, n))
     noise = rng.normal(0.0, std, T)

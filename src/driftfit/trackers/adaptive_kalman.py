@@ -1,4 +1,4 @@
-"""A Kalman filter that chooses its own numbers: drift ratio, noise variance and jumps, from the data as they come.
+"""A Kalman filter that estimates its own settings: drift ratio, noise variance and jumps, from the data as they arrive.
 
 K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k r / c_i`` a nominal sample,
 where r is the present noise variance and c_i the mean square of regressor i, so ratio_k is the share of r that the
@@ -11,14 +11,14 @@ proportion are left out (`driftfit.trackers.parts.disproportion`), and r is not 
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
 (`driftfit.trackers.parts.modes.ladder`), or more noise.
 
-Reported are the mean and covariance of the mixture; the one-step variance leaves the outlier level out, so its band is
-one for samples that are not outliers.
+The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
+for samples that are not outliers.
 
-Start: exact diffuse least squares without drift until there are a few residuals to tell r from, and the filters start
-from there, in the directions that the regressors span by then. Scaling inputs or outputs changes nothing but units.
+The start is exact diffuse least squares without drift, until there are enough residuals to estimate r. The filters then
+start from there, in the directions that the regressors span by then. Scaling inputs or outputs changes only the units.
 
-Use it when nothing is known; where q and r are known, `Kalman` is as good and far cheaper. Two groups of parameters
-with very different rates are followed at one common rate unless ``groups`` says otherwise.
+Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Two groups of parameters with
+very different rates are tracked at one common rate unless ``groups`` is given.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
 levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels.
@@ -64,7 +64,7 @@ from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise,
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RESIDUALS = 4
-"""Residuals seen before the filters start."""
+"""Number of residuals before the filters start."""
 
 
 @kernel
@@ -75,12 +75,12 @@ def learn_start(s: State, l: int) -> None:
     s.count[l] += counted
     s.s[l] *= s.scale[l]
     scale = s.squares[l] / s.count[l]
-    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN stays
+    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
 
 
 @kernel
 def settle(s: State, l: int) -> None:
-    """Start the filters from least squares once there are residuals to tell r from: z = M theta ~ N(d, r I)."""
+    """Start the filters from least squares once there are residuals to estimate r: z = M theta ~ N(d, r I)."""
     if s.count[l] >= RESIDUALS:
         s.r[l] = max(s.scale[l], finest(s, l))
         s.scale[l] = 1.0
@@ -96,7 +96,7 @@ def settle(s: State, l: int) -> None:
 
 @kernel
 def learn(s: State, l: int, odd: float) -> None:
-    """What every sample tells of scales, excitation and readings."""
+    """Update scales, excitation and the resolution of readings."""
     learn_scales(s, l)
     learn_information(s, l)
     learn_proportion(s, l, odd)
@@ -104,7 +104,7 @@ def learn(s: State, l: int, odd: float) -> None:
 
 @kernel
 def follow(s: State, entering: int, l: int) -> None:
-    """One sample, once the filters run; ``entering`` is the column by which it leaves what was seen before, or -1."""
+    """One sample of the running filters; ``entering`` is the column in a new direction, or -1."""
     resolve(s, l)
     noise_prior(s, l)
     bound_leverage(s, l)
@@ -176,12 +176,12 @@ def keep_density(o: State, s: State, l: int) -> None:
 
 @dataclass(frozen=True)
 class AdaptiveKalman(Tracker):
-    """Random-walk Kalman filter without numbers to choose.
+    """Random-walk Kalman filter that needs no settings.
 
     Parameters
     ----------
     groups : sequence of sequences of indices, or None
-        Parameters that may drift at a rate of their own, such as ``[[0, 1], [2]]``. None: one rate for all.
+        Parameters with separate drift rates, such as ``[[0, 1], [2]]``. None: one rate for all.
 
     Raises
     ------
@@ -254,7 +254,7 @@ class AdaptiveKalman(Tracker):
             super().widen(lane, p)
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
-        """All filters are moved alike, so that their mixture stands where it is said to."""
+        """All filters are moved by the same amount, so that their mixture is at the given value."""
         before = lane["d"].copy()
         super().place(lane, which, values)
         lane["m"][:] += (lane["d"] - before)[:, None]

@@ -6,16 +6,16 @@
 with w the weight of the sample and d a known factor of the drift, both 1 unless given.
 
 This is epsilon-NLMS (regularised projection, affine projection of order one) with unit step. It minimises
-(y - phi' theta)^2 + mu |theta - theta_{t-1}|^2 with the past frozen, and equals a Kalman step whose covariance is reset
-to I / mu before every sample. No matrix is formed: O(n) per sample. It carries no covariance, so bands are NaN.
+(y - phi' theta)^2 + mu |theta - theta_{t-1}|^2 with the past fixed, and equals a Kalman step whose covariance is reset
+to I / mu before every sample. No matrix is formed: O(n) per sample. It has no covariance, so bands are NaN.
 
-Use it when n is large, or as the robust cheap reference. Its mu is *not* the mu of `FLS`: `from_fls_mu` converts.
-theta0 is a prior at (nearly) zero: estimates are shrunk to it while data are few, and y + phi' c does not shift theta
-by c unless theta0 shifts too. With noise and a fixed mu the error has a floor.
+Use it if n is large, or as a robust and cheap reference. Its mu is *not* the mu of `FLS`: `from_fls_mu` converts.
+theta0 is a prior at (nearly) zero: estimates are shrunk to it while there are few data, and y + phi' c does not shift
+theta by c unless theta0 shifts too. With noise and a fixed mu the error does not go to zero.
 
 Source: Chen et al., "augmented flexible least squares for time-varying parameter systems", eq. 20-22; the matrix of its
 step 6 need not be inverted (a rank-one identity makes it O(n)). Departures: alpha, and mu refers to one nominal
-interval, so that a gap of k intervals lets theta move k times as freely.
+interval, so that after a gap of k intervals theta moves k times as freely.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class AugmentedFLS(Tracker):
     Parameters
     ----------
     mu : number
-        Price of a change of theta against a squared residual; positive, in units of phi' phi.
+        Penalty on a squared change of theta relative to a squared residual; positive, in units of phi' phi.
     theta0 : number or (n,)
         theta before the first sample.
     alpha : number in (0, 2)
@@ -84,7 +84,7 @@ class AugmentedFLS(Tracker):
 
     @classmethod
     def from_fls_mu(cls, mu: float, n: int, s: float) -> AugmentedFLS:
-        """The weight that stands closest to `FLS`'s mu for n white regressors with mean phi' phi = s.
+        """The weight closest to `FLS`'s mu for n white regressors with mean phi' phi = s.
 
         mu_A = 2 mu / (n (1 + sqrt(1 + 4 mu / (n s)))): exact for n = 1 and constant phi' phi, a guide otherwise.
         """

@@ -1,4 +1,4 @@
-"""What every tracker offers: settings, a state, and two compiled steps."""
+"""The interface of every tracker: settings, a state, and compiled steps."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from driftfit.trackers.parts.varying_drift import roots
 
 
 class RandomWalk(NamedTuple):
-    """What a tracker takes theta to be: theta_t = theta_{t-1} + w_t, w_t ~ N(0, q), seen in noise of variance r."""
+    """The model of theta that a tracker assumes: theta_t = theta_{t-1} + w_t, w_t ~ N(0, q), in noise of variance r."""
 
     q: Array
     """(n, n), drift covariance per nominal sample."""
     r: float | None
-    """Noise variance; None where it is estimated, and q and p0 are in units of it."""
+    """Noise variance; None if it is estimated, and q and p0 are in units of it."""
     theta0: Array
     """(n,)"""
     p0: Array | None
-    """(n, n), or None where nothing is known before the first sample."""
+    """(n, n), or None for a diffuse start."""
     at_first_sample: bool = False
-    """Whether the prior holds at the first sample, with no drift before it."""
+    """Whether the prior refers to the first sample, with no drift before it."""
     slopes: bool = False
-    """Whether it is the slope of theta that walks, so that theta_t = theta_{t-1} + dt slope_t."""
+    """Whether the slope of theta is the random walk, so that theta_t = theta_{t-1} + dt slope_t."""
 
 
 class Tracker(Settings, ABC):
-    """How theta is followed. A subclass is a frozen dataclass whose fields are the settings.
+    """An algorithm that estimates theta. A subclass is a frozen dataclass whose fields are the settings.
 
-    ``covariance`` says whether the tracker carries one; without it, standard deviations are NaN. ``required`` names
-    settings that have no default: they may be left None only for `tune` to fill. ``width`` is how many series share a
-    tile in a fleet; a tracker that vectorises over something of its own wants 1. ``outputs`` names fields of the record
-    that are stored for every sample beside the common ones, by ``steps.store``.
+    ``covariance`` says whether the tracker has one; without it, standard deviations are NaN. ``required`` names
+    settings that have no default: they may be None only for `tune` to estimate. ``width`` is the number of series that
+    share a tile in a fleet; a tracker that is vectorised internally declares 1. ``outputs`` names further fields of the
+    record that ``steps.store`` stores for every sample.
 
-    Most trackers need only the number of parameters. One that works on the inside of a model (an extended Kalman filter
-    on its minimal parameters, a bank that cleans lags) overrides `state_for`, `steps_for` and, where its theta is not
-    the model's, `names_for`.
+    Most trackers need only the number of parameters. One that depends on the model (an extended Kalman filter on its
+    minimal parameters, a bank that corrects lags) overrides `state_for`, `steps_for` and, if its theta is not the
+    model's, `names_for`.
     """
 
     covariance: ClassVar[bool] = True
@@ -55,19 +55,19 @@ class Tracker(Settings, ABC):
     noted: ClassVar[tuple[str, ...]] = ()
     """Fields of the record that `varying` needs of every sample; ``steps.note`` stores them when a run is replayed."""
     drift_each: ClassVar[bool] = False
-    """Whether every parameter may have a drift of its own at every sample (`driftfit.trackers.parts.varying_drift`)."""
+    """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.varying_drift`)."""
     adapts: ClassVar[bool] = False
-    """Whether it finds drift and noise as it goes, so that its innovations are normal again soon after a fault."""
+    """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""
-    """Which of ``outputs`` has the log density of every sample, given those before it, as its first entry; none: that
-    is the Gaussian one of the forecast.
+    """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the Gaussian
+    density of the forecast.
     """
     output_error: ClassVar[bool] = False
-    """Whether the innovation is that of y itself, also for a model that is fitted to something else."""
+    """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
-        """The model for a linear record of these lags, where the tracker does not work on all: for general tests.
+        """The model for a linear record with these lags, if the tracker does not work with all models; used by tests.
 
         Its theta begins with -a_1 .. -a_na, b_1 .. b_nb of the `ARX` for that record.
         """
@@ -91,7 +91,7 @@ class Tracker(Settings, ABC):
         return self.steps
 
     def apply_for(self, model: Model) -> Step | None:
-        """The step that takes in an input after its sample (`Model.apply`), for a bound model."""
+        """The step that stores an input after its sample (`Model.apply`), for a bound model."""
         return model.apply
 
     def names_for(self, model: Model) -> tuple[str, ...]:
@@ -99,28 +99,28 @@ class Tracker(Settings, ABC):
         return model.names
 
     def log_density(self, out: Array) -> Array | None:
-        """The log densities (T, L) of the samples in what a driver wrote, from a tracker that has its own."""
+        """The log densities (T, L) of the samples, from the output of a driver, if the tracker computes its own."""
         if not self.density:
             return None
         field: Array = out[self.density]
         return field[:, 0] if field.ndim == 3 else field
 
     def random_walk(self, model: Model) -> RandomWalk:
-        """The random walk in Gaussian noise behind this tracker, which smoothers solve exactly."""
+        """The random walk in Gaussian noise that this tracker assumes, which smoothers solve exactly."""
         raise ValueError(
             f"{type(self).__name__} does not describe a random walk in Gaussian noise, so there is nothing to smooth; "
             "track with FLS or Kalman."
         )
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
-        """Variances of the drift before each sample (T, n), and of its noise (T,), for a tracker that finds its own.
+        """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.
 
         ``noted`` (T, ..) are the fields that ``noted`` names, e (T,) the innovations, time (T,) the intervals of drift.
         """
         raise NotImplementedError
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Further columns (T, k) of what is known of every sample, for ``steps.told``."""
+        """Further columns (T, k) of known factors at every sample, for ``steps.told``."""
         if prob is None and drift is not None and self.drift_each:
             return roots(type(self).__name__, self.names_for(model), T, drift)
         given = "prob" if prob is not None else f"drift of shape {np.shape(drift)}"
@@ -130,7 +130,7 @@ class Tracker(Settings, ABC):
         )
 
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
-        """What is known of the next sample of a stream; None is what holds otherwise."""
+        """Set the known factors of the next sample of a stream; None is the default."""
         if prob is None and drift is None:
             lane["each"][:] = 1.0
         else:
@@ -142,7 +142,7 @@ class Tracker(Settings, ABC):
         Raises
         ------
         ValueError
-            If the tracker carries no covariance that could be widened.
+            If the tracker has no covariance that could be widened.
         """
         P, n = lane.get("P"), len(p)
         if not self.covariance or P is None or P.shape != (n, n):
@@ -163,7 +163,7 @@ class Tracker(Settings, ABC):
             lane["d"][:] = lane["S"] @ lane["theta"]
 
     def cov(self, lane: Mapping[str, Array]) -> Array:
-        """Covariance (n, n) of theta from the fields of one lane; inf on the diagonal where nothing is known."""
+        """Covariance (n, n) of theta from the fields of one lane; inf on the diagonal for undetermined parameters."""
         n = len(lane["theta"])
         if not self.covariance:
             return np.full((n, n), np.nan)
@@ -173,7 +173,7 @@ class Tracker(Settings, ABC):
         return full
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        """What the summary of a run should say beside its numbers: a name and a sentence each."""
+        """Remarks for the summary of a run: a name and a sentence each."""
         return ()
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
@@ -181,5 +181,5 @@ class Tracker(Settings, ABC):
         return np.zeros(len(lane["theta"]), bool)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
-        """Which entries of theta recent regressors tell apart, (n,) bool; see `AdaptiveKalman.learning`."""
+        """Which entries of theta are distinguished by recent regressors, (n,) bool; see `AdaptiveKalman.learning`."""
         raise ValueError(f"learning: {type(self).__name__} keeps no windowed information; AdaptiveKalman does.")

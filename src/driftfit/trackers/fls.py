@@ -1,28 +1,28 @@
 """Flexible least squares, on line: the exact filter.
 
-At every t it gives the last point of the path that minimises
+At every t it computes the last point of the path that minimises
 
     J = sum_k w_k (y_k - phi_k' theta_k)^2 + sum_k (theta_{k+1} - theta_k)' D_k (theta_{k+1} - theta_k) + prior
     D_k = diag(mu / d_{k+1}) / dt_{k+1},   k <= t
 
 with w the weight of a sample, dt the interval since the last one and d known factors of the drift, one number or one
-for each parameter, 1 unless given: ``track(.., drift=1 / mu)`` of `FLS(1.0)` has a mu of its own for every step and
-parameter (``drift[0]`` stands before the first sample and is not used).
+for each parameter, 1 unless given: ``track(.., drift=1 / mu)`` with `FLS(1.0)` has a separate mu for every step and
+parameter (``drift[0]`` belongs to the time before the first sample and is not used).
 
     predict   P <- P + D^-1                                          (not before the first sample)
     correct   e = y - phi' theta;  s = phi' P phi + 1 / w;  K = P phi / s
               theta <- theta + K e;  P <- P - K (P phi)'
     scale     r = sum(e^2 / s) / count, which is J / (N - rank) after a diffuse start
 
-So it is the Kalman filter with q = 1 / mu, r = 1 and an estimated scale: mu = r / q is a ratio of variances, and is not
-free of scale ((c phi, c y, c^2 mu) gives the same path). mu = inf keeps a parameter constant.
+This is the Kalman filter with q = 1 / mu, r = 1 and an estimated scale: mu = r / q is a ratio of variances, and it
+depends on the scale ((c phi, c y, c^2 mu) gives the same path). mu = inf keeps a parameter constant.
 
-Use it when one number for "how smooth" is all that is wanted; `tune` finds it. `Kalman` takes q and r as numbers,
-`AugmentedFLS` is cheaper and carries no covariance. `run.smooth()` gives the whole path that minimises J.
+Use it to describe smoothness by one number; `tune` estimates it. `Kalman` has q and r as settings, `AugmentedFLS` is
+cheaper and has no covariance. `run.smooth()` computes the whole path that minimises J.
 
 Source: Kalaba and Tesfatsion, Time-varying linear regression via flexible least squares (1989), whose matrix recursion
-this is in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
-penalty on the first point and no large matrix; the minimum-norm answer about theta0 until the regressors span. Cost:
+is used in covariance form. Departures: an exact diffuse start (`driftfit.trackers.parts.diffuse`), which needs no
+penalty on the first point and no large matrix; the minimum-norm solution about theta0 until the regressors span. Cost:
 O(n^2).
 """
 
@@ -48,7 +48,7 @@ from driftfit.trackers.rls import correct, learn_scale, no_scale
 
 @kernel
 def drift(s: State, l: int) -> None:
-    """Between samples only: the prior stands at the first one."""
+    """Between samples only, because the prior refers to the first sample."""
     time = s.dt[l] * s.drift[l] * s.begun[l]
     for i in range(s.theta.shape[0]):
         s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
@@ -91,15 +91,15 @@ class FLS(Tracker):
     Parameters
     ----------
     mu : number or (n,)
-        Price of a squared change of theta per nominal sample against a squared residual; positive, in units of
+        Penalty on a squared change of theta per nominal sample relative to a squared residual; positive, in units of
         phi' phi. inf keeps a parameter constant.
     theta0 : number or (n,)
-        Mean of theta at the first sample; without p0 it stands only in directions that the regressors never span.
+        Mean of theta at the first sample; without p0 it remains only in directions that the regressors never span.
     p0 : number, (n,), (n, n), or None
-        Covariance of theta at the first sample, in units of the noise variance. None: nothing is known.
+        Covariance of theta at the first sample, in units of the noise variance. None: a diffuse start.
     differences : 1 or 2
-        2 prices changes of the slope, theta_{k+1} - 2 theta_k + theta_{k-1}, in the place of changes of theta, so that
-        a straight line costs nothing (`driftfit.trackers.parts.second_differences`); it starts from no knowledge.
+        2 penalises changes of the slope, theta_{k+1} - 2 theta_k + theta_{k-1}, instead of changes of theta, so that
+        a straight line costs nothing (`driftfit.trackers.parts.second_differences`); its start is diffuse.
 
     Raises
     ------

@@ -2,21 +2,21 @@
 
     theta_t = theta_{t-1} + w_t,  w ~ N(0, q);    y_t = phi_t' theta_t + v_t,  v ~ N(0, r)
 
-    predict   P <- P + q dt d,  or q_ij sqrt(d_i d_j) dt where every parameter has a factor of its own
+    predict   P <- P + q dt d,  or q_ij sqrt(d_i d_j) dt if every parameter has its own factor
     correct   e = y - phi' theta;  s = phi' P phi + r / w;  K = P phi / s
               theta <- theta + K e;  P <- P - K (P phi)'
 
 with w the weight of the sample and d known factors of the drift, 1 unless given.
 
-Use it when the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` carries no
-covariance. Without excitation P grows by exactly q per sample: finite and honest.
+Use it if the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` has no
+covariance. Without excitation P grows by exactly q per sample: it is finite, and describes the growing uncertainty.
 
-form="sqrt" keeps the square root of the information instead (`driftfit.trackers.parts.square_root`): the same numbers
-for ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r, at
-O(n^3).
+form="sqrt" keeps the square root of the information instead (`driftfit.trackers.parts.square_root`). It gives the same
+numbers for ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r,
+at O(n^3).
 
 Source: Kalman (1960); as a parameter tracker Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4.
-Departures: one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`). Cost per sample:
+Departures: only one triangle of P is kept; an exact diffuse start (`driftfit.trackers.parts.diffuse`). Cost per sample:
 O(n^2).
 """
 
@@ -85,7 +85,7 @@ class Kalman(Tracker):
     r : number
         Noise variance, in squared units of y; positive.
     p0 : number, (n,), (n, n), or None
-        Covariance of theta before the first sample. None: nothing is known (exact diffuse start).
+        Covariance of theta before the first sample. None: the exact diffuse start.
     theta0 : number or (n,)
         Mean of theta before the first sample.
     form : "covariance" or "sqrt"

@@ -5,23 +5,23 @@
               theta <- theta + K e;  P <- P - K (P phi)'
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
-the noise variance, which is estimated as it goes: sum(e^2 / s) / count over the samples after the start, and not below
-what coarse readings allow (`driftfit.trackers.parts.resolution`).
+the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
+limit of coarse readings (`driftfit.trackers.parts.resolution`).
 
-Use it when all parameters drift alike and nothing is known of noise and drift. Without excitation exponential
-forgetting would blow P up; it stops where a variance is ``c_max`` times what it was when the regressors first had full
-rank (before that: when they last showed a new direction), which does not depend on units.
+Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
+forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
+regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
-Directional forgetting (kind="directional") forgets only what a sample brings news of, after it was taken in:
+Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
     g = P phi;  P <- P + (1/lambda - 1) g g' / (phi' g)
 
-phi' P phi is then 1/lambda times what least squares would leave, the marginal of every other combination stays, and
-nothing winds up: without excitation nothing is forgotten, so it has no cap. It acts at usable samples only. With one
-parameter the two are the same.
+phi' P phi is then 1/lambda times its value in least squares, and the marginal distribution of every other combination
+is unchanged. There is no wind-up: without excitation nothing is forgotten, so no cap is needed. It acts at usable
+samples only. With one parameter the two kinds are the same.
 
-Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting belongs
-to time (dt, and also when y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
+Source: Ljung, System Identification (1999), eq. 11.12; Plackett (1950) for lambda = 1. Departures: forgetting depends
+on time (dt, and also if y is missing); the cap; an exact diffuse start. Directional forgetting: Hagglund (1983),
 Kulhavy and Karny (1984). Cost per sample: O(n^2).
 """
 
@@ -54,12 +54,12 @@ from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 @kernel
 def growth(s: State, l: int) -> float:
-    """What forgetting multiplies P with."""
+    """The factor by which forgetting multiplies P."""
     dt = s.dt[l]
     faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
     grown = 0.0
     for i in range(s.theta.shape[0]):
-        # rounding can make a variance negative: it must not grow behind the cap
+        # rounding can make a variance negative, which must not grow past the cap
         grown = max(grown, abs(s.P[i, i, l]) * s.per_cap[i, l])
     factor: float = 1.0 / min(1.0, max(faded, grown))
     return factor
@@ -80,13 +80,13 @@ def no_scale() -> dict[str, Any]:
 
 @kernel
 def learn_scale(s: State, l: int) -> None:
-    """Count the innovation; s.s becomes a variance with the scale known before this sample, s.scale takes it in."""
+    """Count the innovation; s.s becomes a variance with the scale known before this sample, and s.scale is updated."""
     counted = s.ok[l] * s.fresh[l]
     s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
     s.count[l] += counted
     s.s[l] *= s.scale[l]
     scale = s.squares[l] / s.count[l]
-    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN stays
+    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
 
 
 @kernel
@@ -109,7 +109,7 @@ def begin(s: State, l: int) -> None:
     if s.s[l] < np.inf:
         learn_scale(s, l)
     spanned_variance(s, l)
-    # the cap holds from the first direction on: regressors may stay silent before they span everything
+    # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
         known = s.rank[l] > rank and s.P[i, i, l] > 0.0
         s.per_cap[i, l] = 1.0 / (s.c_max[l] * s.P[i, i, l]) if known else s.per_cap[i, l]
@@ -137,7 +137,7 @@ def correct_direction(s: State, l: int) -> None:
 
 @kernel
 def product_of_roots(s: State, l: int) -> None:
-    """s.g = R R' phi, which loses half the digits that P phi does."""
+    """s.g = R R' phi, which loses half the digits of P phi."""
     n = s.theta.shape[0]
     for i in range(n):
         s.g[i, l] = 0.0
@@ -177,15 +177,15 @@ class RLS(Tracker):
     Parameters
     ----------
     forgetting : number in (0, 1]
-        lambda per nominal sample; 1 never forgets and is least squares.
+        lambda per nominal sample; 1 never forgets and is ordinary least squares.
     p0 : number, (n,), (n, n), or None
         Covariance of theta before the first sample, in units of the noise variance. None: exact diffuse start.
     theta0 : number or (n,)
         Mean of theta before the first sample.
     c_max : number
-        Cap of the growth of a variance, as a multiple of what it was at the start (exponential forgetting).
+        Cap of the growth of a variance, as a multiple of its value at the start (exponential forgetting).
     kind : "exponential" or "directional"
-        What is forgotten: all directions alike, or only those that the regressors excite.
+        Forget in all directions alike, or only in those that the regressors excite.
 
     Raises
     ------

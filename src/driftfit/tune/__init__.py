@@ -1,1 +1,1 @@
-"""Tuning: settings of a tracker from a record."""
+"""Tuning: estimate the settings of a tracker from a record."""

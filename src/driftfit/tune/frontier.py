@@ -1,13 +1,13 @@
-"""The frontier of flexible least squares: what fit costs in movement, over all mu.
+"""The frontier of flexible least squares: the trade-off between fit and movement over all mu.
 
     r_M^2(mu) = sum w_k (y_k - phi_k' theta_k)^2          r_D^2(mu) = sum |theta_{k+1} - theta_k|^2 / (dt d)
 
-of the smoothed path (with ``differences=2`` its slope is in the place of theta in r_D^2). It is convex; r_M^2 does not
-fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu exactly. There is no corner to choose mu by: in
-logarithms the curve has none, because r_M^2 goes to 0 with mu, and on linear axes the knee depends on the scaling;
-`tune` finds mu.
+of the smoothed path (with ``differences=2`` r_D^2 is of its slope instead of theta). The curve is convex; r_M^2 does
+not fall and r_D^2 does not rise with mu, and d r_M^2 / d r_D^2 = -mu exactly. It has no corner at which to choose mu:
+in logarithms there is none because r_M^2 goes to 0 with mu, and on linear axes the bend depends on the scaling;
+`tune` estimates mu.
 
-Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing a point.
+Source: Kalaba and Tesfatsion (1989), who call it the residual efficiency frontier. Cost: one smoothing per point.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class Frontier(NamedTuple):
-    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, in the order of mu."""
+    """mu, measurement cost r_M^2 and dynamic cost r_D^2, (S,) each, sorted by mu."""
 
     mu: Array
     measurement: Array
@@ -62,7 +62,7 @@ def frontier(
     Raises
     ------
     ValueError
-        If a mu is not positive, or what `track` refuses.
+        If a mu is not positive, and for everything that `track` does not accept.
     """
     check_role("frontier", "model", model, Model)
     if len(model.outputs) > 1 and not model.shared:
@@ -88,7 +88,7 @@ def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading, data: An
 
 
 def _movement(path: Smoothed) -> float:
-    """r_D^2 from the path itself: the difference of J and r_M^2 has no digits left where mu is large."""
+    """r_D^2 from the path itself, because the difference of J and r_M^2 has no accurate digits for large mu."""
     path = path.rows if isinstance(path, SmoothedShared) else path
     walk = path.walk
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2

@@ -1,4 +1,4 @@
-"""Intervals of settings from the likelihood: profiles, and curvature where the noise variance has a closed form."""
+"""Intervals of settings from the likelihood: profiles, or curvature if the noise variance has a closed form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from driftfit.tune.search import STEP, Search
 def intervals_of(
     search: Search, task: Task, method: str, tracker: Tracker, level: float
 ) -> dict[str, tuple[float, float]]:
-    """Intervals by name of setting; NaN where the criterion is no likelihood."""
+    """Intervals by name of setting; NaN if the criterion is not a likelihood."""
     knobs = search.knobs
     if method != "ml":
         return dict.fromkeys(knobs.names, (float("nan"), float("nan")))
@@ -38,7 +38,7 @@ def _value(knobs: Knobs, x: Array, i: int, end: float, entry: int) -> float:
 
 
 def _joint(search: Search, task: Task, level: float) -> dict[str, tuple[float, float]]:
-    """Intervals of q and r where r was found in closed form, from curvature in logarithms.
+    """Intervals of q and r, if r was estimated in closed form, from the curvature in logarithms.
 
     With g the slope of log sigma^2 over the knobs: Var log r = 2 / N + g' C g,
     Var log q_i = 2 / N + (e_i + g)' C (e_i + g).

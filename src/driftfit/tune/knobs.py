@@ -1,7 +1,7 @@
-"""Settings as knobs: which numbers of a tracker are to be found, in which range, and what a value of them means.
+"""The settings to be estimated: which numbers of a tracker, in which range, and how they are parametrised.
 
-A knob x is the log10 of a positive number, or -inf for zero where zero makes sense. Which knobs a tracker has follows
-from the settings that it was left without:
+A knob x is the log10 of a positive number, or -inf for zero if zero is allowed. The knobs of a tracker are the settings
+that were left out:
 
     mu           FLS, AugmentedFLS   mu = 10^x s, or by group mu_i = 10^x p_i;    x from -4 to max(5, 2 log10 T)
     q and r      Kalman              q_i = r 10^x / p_i;                          -x in the same range, or zero
@@ -11,9 +11,9 @@ from the settings that it was left without:
     changes      Bank                q or size^2 of every change times 100^x; x from -3 to 3, of the first also zero;
                                      prior probabilities of the others, where they are given, times 10^x, x from -2
 
-p_i is the mean square of regressor i, s their sum, v the variance that a constant theta leaves. A group shares one
-drift *as it is seen in the output*, so no unit of the data matters. T samples cannot tell a drift below 1 / T^2 from
-none (of slopes: 1 / T^4).
+p_i is the mean square of regressor i, s their sum, v the residual variance of a constant theta. A group shares one
+drift *in terms of the output*, so units of the data do not matter. T samples cannot distinguish a drift below 1 / T^2
+from none (for slopes: 1 / T^4).
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Bounds = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class Knobs:
-    """The numbers to be found, p knobs that stand for k values of settings.
+    """The numbers to be estimated: p knobs that determine k values of settings.
 
     ``low``, ``high``, ``zero`` (p,): the range of x, and whether -inf is possible. ``run(x)`` is the tracker that
-    scores x in lanes; ``profiled`` says that it works relative to the noise variance, which then is known in closed
-    form. ``build(x, sigma2)`` is the tracker that is returned. ``names`` (k,), ``owner`` (k,), ``values(x)`` (k,): what
-    the knobs mean, and which knob a value belongs to.
+    scores x in lanes; ``profiled`` means that it works relative to the noise variance, which then has a closed form.
+    ``build(x, sigma2)`` is the tracker that is returned. ``names`` (k,), ``owner`` (k,) and ``values(x)`` (k,) give the
+    names and values of the settings, and the knob to which each belongs.
     """
 
     low: Array
@@ -56,12 +56,12 @@ class Knobs:
     origin: tuple[Any, ...] = ()
 
     def __reduce__(self) -> Any:
-        """Functions cannot be sent to another process; what they were made of can."""
+        """Functions cannot be pickled, but the arguments from which they were made can."""
         return find_knobs, self.origin
 
 
 def find_knobs(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
-    """The knobs of a tracker for a record; ValueError where it has none."""
+    """The knobs of a tracker for a record; ValueError if it has none."""
     return replace(_find(task, tracker, groups, bounds), origin=(task, tracker, groups, bounds))
 
 
@@ -86,7 +86,7 @@ def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
 
 
 def members(names: Sequence[str], groups: Any) -> Array:
-    """For every parameter the number of its group, (n,)."""
+    """The index of the group of every parameter, (n,)."""
     if groups is None:
         return np.zeros(len(names), int)
     if isinstance(groups, str) and groups == "each":
@@ -102,7 +102,7 @@ def members(names: Sequence[str], groups: Any) -> Array:
 
 
 def still(task: Task, scored_by: Tracker) -> tuple[Array, float]:
-    """Mean squares of the regressors (n,), and the variance that a constant theta leaves."""
+    """Mean squares of the regressors (n,), and the residual variance of a constant theta."""
     scores = score(task, [scored_by])
     power, variance = scores.power[:, 0], float(scores.sigma2()[0])
     if not np.any(power > 0.0):
@@ -111,7 +111,7 @@ def still(task: Task, scored_by: Tracker) -> tuple[Array, float]:
 
 
 def constant(task: Task, tracker: Any) -> Tracker:
-    """The tracker with its drift taken away, or as near to that as it can be."""
+    """The tracker without drift, or with the smallest possible drift."""
     n = task.model.n
     if not tracker.covariance:
         return replace(tracker, mu=1e300)  # type: ignore[no-any-return]
@@ -123,7 +123,7 @@ def constant(task: Task, tracker: Any) -> Tracker:
 
 
 def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
-    """Ends of log10 mu, (p,) each; a drift of slopes adds up twice over the record."""
+    """Ends of log10 mu, (p,) each; a drift of slopes accumulates twice over the record."""
     times = getattr(tracker, "differences", 1)
     low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(task.record))))
     return np.full(p, low), np.full(p, high)
@@ -161,7 +161,7 @@ def _weight(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
 
 
 def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
-    """q of Kalman; an open r in closed form after a diffuse start, as a knob of its own after a given prior."""
+    """q of Kalman; a missing r in closed form after a diffuse start, or as a further knob with a given prior."""
     names = tracker.names_for(task.model)
     power, variance = still(task, constant(task, tracker))
     if len(names) != len(power):  # the tracker's parameters are not the regression's
@@ -200,7 +200,7 @@ def _drift(task: Task, tracker: Any, groups: Any, bounds: Bounds) -> Knobs:
 
 
 def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
-    """r of Kalman under a given q."""
+    """r of Kalman for a given q."""
     _, variance = still(task, constant(task, tracker))
     low, high = _ends(bounds, -9.0, 3.0)
 
@@ -215,13 +215,13 @@ def _noise(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
 
 
 MOST_PROBABLE = 0.5
-"""What the prior probabilities of all changes but the first may add up to."""
+"""Upper bound of the sum of the prior probabilities of all changes but the first."""
 
 
 def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
-    """Scales and prior probabilities of the changes of a bank; bounds are of the factors of the scales."""
+    """Scales and prior probabilities of the changes of a bank; bounds apply to the factors of the scales."""
     changes = tracker.all_changes
-    if all(one.prob is not None for one in changes):  # the first has what the others leave
+    if all(one.prob is not None for one in changes):  # the first has the remaining probability
         changes = (replace(changes[0], prob=None), *changes[1:])
     moving = [i for i, one in enumerate(changes) if any(part.any() for part in one.scales())]
     given = [] if tracker.transition is not None else [i for i, one in enumerate(changes) if i and one.prob]
@@ -251,7 +251,7 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
 
 
 def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
-    """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds are of the memory."""
+    """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds apply to the memory."""
     low, high = _ends(bounds, float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * len(task.record))))
 
     def values(x: Array) -> Array:

@@ -1,6 +1,6 @@
-"""One record under many settings at once: every lane of a tile sees the same series, each with its own tracker.
+"""One record with many settings at once: every lane of a tile runs the same series with its own tracker.
 
-For each setting a run is condensed to what the criteria need, so memory does not grow with the record:
+For each setting a run is reduced to the sums that the criteria need, so memory does not grow with the record:
 
     log-likelihood   -1/2 (N log 2 pi + sum log s + sum log F + sum e^2 / s) + sum of the model's log Jacobian
     profiled         s = sigma^2 s0:  sigma^2 = mean(e^2 / s0),
@@ -9,7 +9,7 @@ For each setting a run is condensed to what the criteria need, so memory does no
 
 N (`used`) counts the usable samples that did not determine a new direction, F are the diffuse terms of those that did.
 Trackers that estimate their own scale report s = scale s0 with the scale known before the sample; it is divided out.
-Of a tracker that weighs hypotheses the log-likelihood is the sum of the log densities of the mixture.
+For a tracker that weighs hypotheses, the log-likelihood is the sum of the log densities of the mixture.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from driftfit.run.result import burn_in
 from driftfit.trackers.base import Tracker
 
 BLOCK = 1024
-"""Samples between two condensations: a tile's output of that length stays in the cache."""
+"""Samples between two reductions: the output of a tile for that many samples fits into the cache."""
 
 
 class Task(NamedTuple):
@@ -40,23 +40,23 @@ class Task(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """What runs under S settings condense to, each (S,), but power (n, S)."""
+    """The reduced results of S settings, (S,) each, but power (n, S)."""
 
     used: Array
     log_s: Array
     squares: Array
     more: Array
-    """What adds to the log-likelihood beside the Gaussian terms: log Jacobians, or densities of a tracker's own."""
+    """Further terms of the log-likelihood: log Jacobians, or densities that the tracker computes itself."""
     h_step: Array
     power: Array
 
     def sigma2(self) -> Array:
-        """The noise variance where P is relative to it: mean(e^2 / s0)."""
+        """The noise variance if P is relative to it: mean(e^2 / s0)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self.squares / self.used)
 
     def loglik(self, profiled: bool) -> Array:
-        """The log-likelihood, with the noise variance at its maximum when ``profiled``; -inf where there is none."""
+        """The log-likelihood, with the noise variance at its maximum if ``profiled``; -inf if there is none."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if profiled:
                 body = self.used * (np.log(2.0 * np.pi * self.sigma2()) + 1.0)
@@ -68,7 +68,7 @@ class Scores(NamedTuple):
 
 @kernel
 def store_inside(o: State, s: State, l: int) -> None:
-    """Store the regressor that the tracker saw, and the scale after the sample."""
+    """Store the regressor as the tracker received it, and the scale after the sample."""
     o.scale[l] = s.scale[l]
     for i in range(s.phi.shape[0]):
         o.phi[i, l] = s.phi[i, l]
@@ -76,7 +76,7 @@ def store_inside(o: State, s: State, l: int) -> None:
 
 @cache
 def storing(store: Any) -> Any:
-    """That, and what a tracker stores by itself."""
+    """The same, and the fields that a tracker stores itself."""
 
     @kernel
     def store_both(o: State, s: State, l: int) -> None:
@@ -137,7 +137,7 @@ class _Sums:
         self.used += ok.sum(axis=0)
 
     def _likelihood(self, out: Array, ok: Array) -> Array:
-        """Add the terms of the samples that have one; returns which, (T, L)."""
+        """Add the terms of the samples that have them; returns which samples do, (T, L)."""
         before = np.concatenate([self.scale[None], out["scale"][:-1]])
         self.scale = out["scale"][-1].copy()
         with np.errstate(divide="ignore", invalid="ignore"):

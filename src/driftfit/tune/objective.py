@@ -1,4 +1,4 @@
-"""What tuning minimises: minus the log-likelihood, or the logarithm of a mean square of errors."""
+"""The objectives of tuning: minus the log-likelihood, or the logarithm of a mean square of errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from driftfit.tune.lanes import Task, score
 
 
 def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
-    """The record as a regression whose samples are sorted by a variable."""
+    """The record as a regression with samples sorted by a variable."""
     walk, _ = ordered(walk_of(run_task(task, constant(task, tracker))), order_by)
     with np.errstate(divide="ignore"):
         known = Known.of(noise=1.0 / walk.weight)
@@ -31,9 +31,9 @@ def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
 
 @dataclass(frozen=True)
 class Criterion:
-    """Points (S, p) to values (S,), to be minimised: minus the log-likelihood, or the log of a mean square.
+    """Maps points (S, p) to values (S,) to be minimised: minus the log-likelihood, or the log of a mean square.
 
-    In logarithms the unit of y is an offset, so that the tolerances of the search do not depend on it.
+    In logarithms the unit of y is only an offset, so the tolerances of the search do not depend on it.
     """
 
     task: Task
@@ -49,7 +49,7 @@ class Criterion:
             squares = score(self.task, trackers, self.h).h_step
         else:
             squares = np.array([_smoothed_score(self.task, tracker, self.method) for tracker in trackers])
-        tiny = np.finfo(float).tiny  # a perfect fit is the best there is, and has a logarithm
+        tiny = np.finfo(float).tiny  # a perfect fit is the best possible result and must have a logarithm
         return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
 
 
@@ -59,7 +59,7 @@ def run_task(task: Task, tracker: Tracker) -> Track:
 
 
 def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
-    """Mean square of the leave-one-out residuals of the smoothed path, or its rotation-invariant relative."""
+    """Mean square of the leave-one-out residuals of the smoothed path, or the rotation-invariant variant of it."""
     path = Smoothed.of(run_task(task, tracker))
     weight = path.walk.weight
     used = weight > 0.0

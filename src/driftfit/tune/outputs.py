@@ -1,8 +1,8 @@
-"""Tuning for several outputs: each output by itself, or all rows of a shared theta together.
+"""Tuning for several outputs: each output separately, or all rows of a shared theta together.
 
-Outputs with a theta each have a noise each, so each gets settings of its own: `TunedOutputs.tracker` maps the name of
-an output to its tracker, as `track` and `Live` take it. Regressors are those of constant parameters, whose predictions
-also fill missing lags.
+Outputs with a separate theta have separate noise, so each gets its own settings: `TunedOutputs.tracker` maps the name
+of an output to its tracker, in the form that `track` and `Live` take. Regressors are those of constant parameters,
+whose predictions also fill missing lags.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from driftfit.tune.lanes import Task
 from driftfit.tune.tuned import Tuned
 
 STILL = Kalman(q=0.0, r=1.0)
-"""Constant parameters, of which nothing is known before."""
+"""Constant parameters with a diffuse start."""
 
 
 class TunedOutputs(Mapping[str, Tuned]):
-    """What `tune` returns for a model with several outputs: a `driftfit.tune.Tuned` for each."""
+    """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
         self._each = dict(each)
@@ -44,7 +44,7 @@ class TunedOutputs(Mapping[str, Tuned]):
 
     @property
     def tracker(self) -> dict[str, Tracker]:
-        """The tracker of each output, by name: ready for `track` and `Live`."""
+        """The tracker of each output, by name, ready for `track` and `Live`."""
         return {name: one.tracker for name, one in self.items()}
 
     @property

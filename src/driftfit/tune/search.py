@@ -1,12 +1,12 @@
-"""The search: a grid over every knob, then a quasi-Newton method whose gradients are lanes; profiles for intervals.
+"""The search: a grid over every knob, then a quasi-Newton method with gradients from lanes; profiles for intervals.
 
-    start      all knobs together on a grid of at least 4 points a decade, then each by itself (also at zero)
+    start      all knobs together on a grid of at least 4 points per decade, then each separately (also at zero)
     refine     L-BFGS-B on the finite knobs, central differences of 1e-3 decades
-    zero       a knob whose zero is at least as good is zero
+    zero       a knob is set to zero if zero is at least as good
     profile    along the ridge x_hat + delta C e_i / C_ii, C the inverse of the Hessian: where the objective has risen
                by chi2 / 2, on either side; with one knob this is the profile itself
 
-The objective is to be minimised; it takes points (S, p) and gives values (S,), +inf where a point is impossible.
+The objective is minimised; it maps points (S, p) to values (S,), +inf for impossible points.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ STEP = 1e-3
 CURVE = 0.03
 """The same for second differences, which lose twice as many digits."""
 CYCLES = 4
-"""Rounds over the knobs, at most."""
+"""Largest number of rounds over the knobs."""
 EDGE = 0.01
-"""Decades from an end of the range that count as being there."""
+"""Distance in decades from an end of the range that counts as being at the end."""
 
 
 class Counted:
-    """An objective that remembers every point that was asked for."""
+    """An objective that stores every point at which it was evaluated."""
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
@@ -60,7 +60,7 @@ def _axis(knobs: Knobs, i: int) -> Array:
 
 
 def _grid(f: Objective, knobs: Knobs) -> Array:
-    """All knobs that have the same range together, the others at their middle; then knob by knob."""
+    """A grid over all knobs with the same range together, with the others at their middle; then knob by knob."""
     p = len(knobs.low)
     together = (knobs.low == knobs.low[0]) & (knobs.high == knobs.high[0]) & (knobs.zero == knobs.zero[0])
     points = np.where(together, _axis(knobs, 0)[:, None], _middle(knobs))
@@ -81,7 +81,7 @@ def _grid(f: Objective, knobs: Knobs) -> Array:
 
 
 def _middle(knobs: Knobs) -> Array:
-    """Where a knob that is not varied stands: at 0, which is the scale of the data, or at the nearest end."""
+    """The value of a knob that is not varied: 0, which is the scale of the data, or the nearest end."""
     return np.asarray(np.clip(np.zeros(len(knobs.low)), knobs.low, knobs.high))
 
 
@@ -89,7 +89,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
     free = np.flatnonzero(np.isfinite(x))
     if not free.size:
         return x
-    # one grid cell around the best grid point, so that a second valley cannot catch the search
+    # one grid cell around the best grid point, so that the search cannot end in another valley
     reach = 1.0 / DECADE if len(x) == 1 else np.inf
     low, high = np.maximum(knobs.low[free], x[free] - reach), np.minimum(knobs.high[free], x[free] + reach)
 
@@ -103,7 +103,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
         slopes = (values[1::2] - values[2::2]) / (2.0 * STEP)
         return float(values[0]), np.where(np.isfinite(slopes), slopes, 0.0)
 
-    from scipy import optimize  # half a second to import
+    from scipy import optimize  # this import takes half a second
 
     options = {"ftol": 1e-14, "gtol": 1e-9, "maxiter": 100}  # the logarithm of a mean square is flat: 0.01 a decade^2
     found = optimize.minimize(
@@ -115,7 +115,7 @@ def _refine(f: Objective, knobs: Knobs, x: Array) -> Array:
 
 
 def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
-    """Set to zero what is not worse there, and refine the rest again."""
+    """Set knobs to zero where that is not worse, and refine the others again."""
     candidates = np.flatnonzero(knobs.zero & np.isfinite(x))
     changed = False
     for i in candidates:
@@ -128,7 +128,7 @@ def _zeros(f: Objective, knobs: Knobs, x: Array) -> Array:
 
 
 def curvature(f: Objective, x: Array, free: Array) -> Array:
-    """The Hessian of the free knobs by second differences, NaN where the objective has none."""
+    """The Hessian of the free knobs by second differences; NaN where the objective has none."""
     k = free.size
     points = [x]
     pairs = [(i, j) for i in range(k) for j in range(i + 1)]
@@ -142,13 +142,13 @@ def curvature(f: Objective, x: Array, free: Array) -> Array:
     H = np.empty((k, k))
     for at, (i, j) in enumerate(pairs):
         pp, pm, mp, mm = values[1 + 4 * at : 5 + 4 * at]
-        # on the diagonal the two steps add up to one of twice the length, or to none
+        # on the diagonal the two steps add up to one of twice the length, or cancel
         H[i, j] = H[j, i] = (pp - pm - mp + mm) / (4.0 * CURVE**2)
     return H
 
 
 class Search:
-    """The best point, and what the objective does around it."""
+    """The best point, and the shape of the objective around it."""
 
     def __init__(self, f: Counted, knobs: Knobs, x: Array) -> None:
         self.f, self.knobs, self.x = f, knobs, x
@@ -169,7 +169,7 @@ class Search:
 
     @cached_property
     def inverse(self) -> Array:
-        """C, the inverse of the Hessian of the free knobs; diagonal where the objective is not convex."""
+        """C, the inverse of the Hessian of the free knobs; diagonal if the objective is not convex."""
         H = curvature(self.f, self.x, self.free)
         convex = np.isfinite(H).all() and np.linalg.eigvalsh(H).min(initial=np.inf) > 0.0
         C: Array = np.linalg.inv(H) if convex else np.full(H.shape, np.nan)
@@ -201,9 +201,9 @@ class Search:
         return points
 
     def profile(self, i: int, level: float) -> tuple[float, float]:
-        """Ends of the interval of knob i: where the objective has risen by half the chi-square quantile.
+        """Ends of the interval of knob i, at which the objective has risen by half the chi-square quantile.
 
-        -inf or inf where it has not before the end of the range.
+        -inf or inf if it does not rise that far within the range.
         """
         rise = 0.5 * NormalDist().inv_cdf(0.5 + level / 2.0) ** 2
         start = self.x[i] if np.isfinite(self.x[i]) else self.knobs.low[i]
@@ -211,7 +211,7 @@ class Search:
         return (-np.inf if not np.isfinite(self.x[i]) else ends[0]), ends[1]
 
     def _crossing(self, i: int, start: float, end: float, rise: float) -> float:
-        """Where the root of the rise, which is nearly linear, passes 1 between start and end."""
+        """Where the square root of the rise, which is nearly linear, passes 1 between start and end."""
         nowhere = (
             np.copysign(np.inf, end - start) if end != start else (-np.inf if end == self.knobs.low[i] else np.inf)
         )

@@ -1,18 +1,18 @@
-"""Tune: settings from a record.
+"""Tune: estimate settings from a record.
 
-    "ml"       maximum likelihood of the one-step predictions, the noise variance in closed form where it can be
+    "ml"       maximum likelihood of the one-step predictions, with the noise variance in closed form where possible
     "h-step"   least mean square of y_t - phi_t' theta_{t-h} after the start: settings for predicting h samples ahead
     "loo"      least mean square of leave-one-out residuals of the smoothed path, eps / (1 - leverage)
     "gcv"      (r_M^2 / N) / (1 - mean leverage)^2 of the smoothed path
 
-Use "ml" first: where drift is a random walk it is consistent and gives intervals, and where it is not it still was the
-best or close to it in this library's reproductions. "loo" and "gcv" choose for the smoothed path and ask for no
-distribution; "h-step" is the only one for trackers without a variance (`AugmentedFLS`). All look at the whole record:
-for a stream that tunes itself use a tracker that does.
+Use "ml" first. If drift is a random walk it is consistent and gives intervals; if not, it was still the best method or
+close to it in our reproductions. "loo" and "gcv" choose for the smoothed path and assume no distribution; "h-step" is
+the only method for trackers without a variance (`AugmentedFLS`). All of them use the whole record: for a stream, use a
+tracker that tunes itself.
 
-A grid runs as lanes: 32 settings cost about as much as a few. Then a quasi-Newton search on log settings, and profile
-intervals of the likelihood (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start; leave one
-out after Allen (1974), GCV after Craven and Wahba (1979).
+A grid runs as lanes: 32 settings cost about as much as a few. A quasi-Newton search on log settings and profile
+intervals of the likelihood follow (see `driftfit.tune`). Source: the likelihood of de Jong (1991), diffuse start;
+leave-one-out after Allen (1974), GCV after Craven and Wahba (1979).
 """
 
 from __future__ import annotations
@@ -60,46 +60,47 @@ def tune(
     limits: Any = None,
     exclude: Any = None,
 ) -> Tuned:
-    """Find the settings that a tracker was left without: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
+    """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
     ----------
     model, y, u, data, time, dt, weights, drift, limits, exclude
         As for `track`: with ``data`` the others name its columns.
     tracker : Tracker
-        What is left None is found: mu, q, r, q and r, or forgetting. Everything else stays. Of a `Bank` the scales of
-        its changes are found, as factors of the standard deviations that it has, and their prior probabilities, by its
-        log evidence.
+        Settings that are None are estimated: mu, q, r, q and r, or forgetting. All others are kept. For a `Bank` these
+        are the scales of its changes, as factors of their standard deviations, and their prior probabilities; the
+        criterion is its log evidence.
     method : "ml", "h-step", "loo" or "gcv"
         The criterion, see the module.
     groups : None, "each", or n labels
         Which parameters share a drift. None: all. With `Kalman`, and with labels, a shared drift is the same *in the
-        output*: q_i is inverse to the mean square of regressor i. ``FLS`` without groups has one mu for all, as its
-        source has. q of a group may be zero.
+        output*: q_i is proportional to the inverse of the mean square of regressor i. ``FLS`` without groups has one mu
+        for all, as in its source. q of a group may be zero.
     h : int
         Samples ahead, for "h-step".
     bounds : (low, high)
-        Range of the search; of mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
-        T^2)), of r in units of the variance that constant parameters leave, of RLS's memory in samples.
+        Range of the search: for mu or r / q in units of the mean square of the regressors (default 1e-4 to max(1e5,
+        T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
     level : number
-        Of the intervals.
+        Level of the intervals.
     order_by : (T,)
-        Tune for ``run.smooth(order_by=...)``: theta walks along this variable instead of along time.
+        Tune for ``run.smooth(order_by=...)``: theta is a random walk along this variable instead of time.
 
     Returns
     -------
-    Tuned. A model with several outputs gives `driftfit.tune.outputs.TunedOutputs`, one for each output (where they
-    share one theta: one `Tuned` for all).
+    Tuned. A model with several outputs gives `driftfit.tune.outputs.TunedOutputs`, one for each output (if they share
+    one theta, one `Tuned` for all).
 
     Warns
     -----
     UserWarning
-        When the optimum is at a bound of the search other than zero.
+        If the optimum is at a bound of the search other than zero.
 
     Raises
     ------
     ValueError
-        Nothing to find, a method that the tracker does not have, no usable sample, or what `track` refuses.
+        If there is nothing to estimate, the tracker does not support the method, no sample is usable, and for
+        everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
     one_of("tune", "method", method, METHODS)
@@ -143,7 +144,7 @@ def _tuned(
 
 
 def _warn(tuned: Tuned) -> None:
-    """Say which settings ended at a bound of the search; zero is a result."""
+    """Warn of settings that ended at a bound of the search; zero is a valid result."""
     search = tuned._search
     stuck = [
         name

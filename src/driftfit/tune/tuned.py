@@ -19,24 +19,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tuned:
-    """What `tune` returns.
+    """The result of `tune`.
 
     Attributes
     ----------
     tracker : Tracker
-        The tracker with its numbers, ready for `track` and `Live`.
+        The tracker with all its settings, ready for `track` and `Live`.
     method : str
         The criterion.
     loglik : float
         Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale as they go (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
+        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
     noise : float
-        Estimated noise variance; not to be relied on when ``at_bound`` says so.
+        Estimated noise variance; unreliable if ``at_bound`` is not empty.
     at_bound : tuple of str
-        Settings that ended at a bound of the search, or at zero; empty when the optimum is inside.
+        Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
     interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: of profiles (for "q[..]/r", "mu", "forgetting"
-        and a single "q" or "r"), or from curvature (for "q[..]" and "r" found together). NaN for other methods.
+        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
+        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
+        other methods.
     level : float
         The level of the intervals.
     """
@@ -63,16 +64,16 @@ class Tuned:
 
     @property
     def chosen(self) -> dict[str, float]:
-        """What was found, by name of setting as in ``interval``; drifts are relative to the noise variance."""
+        """The estimates by name of setting as in ``interval``; drifts are relative to the noise variance."""
         names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
         return {name: float(value) for name, value in zip(names, values, strict=True)}
 
     def _criterion(self, values: Array) -> Array:
-        """Values of the objective as what they are called."""
+        """Values of the objective converted to the criterion."""
         return -values if self.method == "ml" else np.exp(values)
 
     def curves(self) -> list[tuple[str, Array, Array]]:
-        """(name, values of the setting, criterion) along each knob, what `plot` draws."""
+        """(name, values of the setting, criterion) along each knob, for `plot`."""
         curves = []
         for i in range(len(self._search.x)):
             points, values = self._search.sweep(i)
@@ -82,12 +83,12 @@ class Tuned:
         return curves
 
     def plot(self) -> Figure:
-        """The criterion along each setting, the others following where it is a likelihood; a matplotlib figure."""
+        """The criterion along each setting, with the others optimised if it is a likelihood; a matplotlib figure."""
         return _plot(self)
 
 
 def _plot(tuned: Tuned) -> Figure:
-    """One panel a knob: the criterion over its range, the choice, and its interval."""
+    """One panel per knob: the criterion over its range, the chosen value, and its interval."""
     curves = tuned.curves()
     figure = new_figure(4.6 * min(len(curves), 2), 3.2 * -(-len(curves) // 2))
     panels = figure.subplots(-(-len(curves) // 2), min(len(curves), 2), squeeze=False).ravel()
@@ -101,7 +102,7 @@ def _plot(tuned: Tuned) -> Figure:
             panel.axvspan(max(low, axis(values).min()), min(high, axis(values).max()), color=BLUE, alpha=0.15, lw=0)
             if 0.0 < axis(best) < np.inf:
                 panel.axvline(float(axis(best)), color=RED, lw=1.0)
-        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; the top is what matters
+        if tuned.method == "ml":  # far from the optimum a likelihood falls by hundreds; only the top matters
             panel.set_ylim(criterion.max() - 12.0, criterion.max() + 1.0)
         panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
         panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(tuned.method, tuned.method))

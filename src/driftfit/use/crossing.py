@@ -1,25 +1,26 @@
 """First passage: when will a parameter, or the output, cross a limit?
 
-A parameter that walks at random is at T known as N(m, P), and its variance grows by q a sample. With c the distance of
-m from the limit and V = h q, reflection gives the probability that it has crossed by sample T + h,
+At time T a parameter that is a random walk has the distribution N(m, P), and its variance grows by q per sample. With c
+the distance of m from the limit and V = h q, reflection gives the probability that it has crossed by sample T + h,
 
     F(h) = Phi(-B) + 2 T(B, sqrt(V / P)),   B = c / sqrt(P + V),   T: Owen's function
 
-which is Phi(-c / sqrt(P)), that it is beyond already, at h = 0, and 2 Phi(-c / sqrt(V)) where P = 0. It is exact for a
-path that moves between samples too (a path that is looked at once a sample crosses a little later: as if the limit were
-0.58 sqrt(q) farther away). q is what the tracker itself adds in one nominal sample after the end, so a drift that is
-estimated (`AdaptiveKalman`) is taken as it stands then, and a tracker without drift can only be beyond already.
+At h = 0 this is Phi(-c / sqrt(P)), the probability that it is beyond the limit already, and for P = 0 it is
+2 Phi(-c / sqrt(V)). It is exact for a path that also moves between samples (a path that is observed once per sample
+crosses a little later, as if the limit were 0.58 sqrt(q) farther away). q is the covariance that the tracker itself
+adds in one nominal sample after the end, so an estimated drift (`AdaptiveKalman`) is taken at its last value, and with
+a tracker without drift the parameter can only be beyond the limit already.
 
-Where it is the slope that walks, ``FLS(differences=2)``, and for the output, paths are drawn from the covariance of the
-state at T and run on: theta walks, noise is drawn, and each output is fed back among the lags. F then is the share of
-paths that have crossed, with a standard error of at most 0.5 / sqrt(DRAWS). The output is as it would be measured, with
-its noise; for the level behind it give the parameter.
+If the slope is a random walk, ``FLS(differences=2)``, and for the output, paths are drawn from the covariance of the
+state at T and continued: theta follows its random walk, noise is drawn, and each output is fed back as a lag. F is then
+the share of paths that have crossed, with a standard error of at most 0.5 / sqrt(DRAWS). The output is the measured
+one, including its noise; for the level behind it ask for the parameter.
 
-F grows for ever more slowly, so a limit may well not be crossed within the horizon: ``probability`` is F there, and
-quantiles beyond it are infinite. Parameters of a `Bank` jump, which is no random walk: refused.
+F grows more and more slowly, so a limit may well not be crossed within the horizon: ``probability`` is F there, and
+quantiles beyond it are infinite. Parameters of a `Bank` jump and are not random walks, so an error is raised for them.
 
 Source: Karatzas and Shreve, Brownian Motion and Stochastic Calculus (1991), section 2.8 (reflection); Owen (1956).
-Cost: O(horizon), times DRAWS where paths are drawn.
+Cost: O(horizon), times DRAWS if paths are drawn.
 """
 
 from __future__ import annotations
@@ -55,17 +56,17 @@ class Crossing:
     Attributes
     ----------
     name, limit, side
-        What crosses which limit; it is "below" or "above" then.
+        What crosses which limit, and whether it is then "below" or "above" it.
     probability : float
-        That it crosses within ``horizon`` samples.
+        Probability that it crosses within ``horizon`` samples.
     median, low, high : float
-        Median of the time of the crossing, and the interval that holds it with probability ``level``: the first sample
-        by which its distribution reaches 1/2, (1 - level) / 2, (1 + level) / 2. 0 is at the end of the record
-        already, inf beyond the horizon.
+        Median of the time of the crossing, and the interval that contains it with probability ``level``: the first
+        sample by which its distribution reaches 1/2, (1 - level) / 2, (1 + level) / 2. 0 is the end of the record, and
+        inf is beyond the horizon.
     by : (horizon + 1,)
         Probability that it has crossed by the end of the record, by the sample after it, and so on.
     times : (horizon,) or None
-        When those samples are, where the record has times that are more than labels.
+        The times of those samples, if the record has times that are not only labels.
     """
 
     name: str
@@ -123,23 +124,23 @@ def crossing(
     Parameters
     ----------
     run : Track
-        The record; of a tracker with a covariance.
+        The record, of a tracker with a covariance.
     what : str
         Name of a parameter, or of the output ("y", or its column) for models that can be run forward.
     below, above : number
-        The limit; one of the two.
+        The limit; give one of the two.
     horizon : int or None
-        How many nominal samples to look ahead. None: as many as the record has, or as ``u`` has.
+        Number of nominal samples to look ahead. None: as many as the record, or ``u``, has.
     u : (horizon,), (horizon, m) or None
         Future inputs, for the output.
     level : number in (0, 1)
-        Of the interval.
+        Level of the interval.
 
     Raises
     ------
     ValueError
-        An unknown name, not exactly one limit, a tracker without a covariance, a `Bank`, a parameter of which nothing
-        is known yet, missing inputs.
+        For an unknown name, not exactly one limit, a tracker without a covariance, a `Bank`, a parameter that is not
+        determined yet, or missing inputs.
     """
     limit, side = _limit(below, above)
     if not 0.0 < level < 1.0:
@@ -173,14 +174,14 @@ def _limit(below: float | None, above: float | None) -> tuple[float, str]:
 
 
 def _known(run: Track, cov: Array, place: int | None = None) -> Array:
-    """A covariance; ValueError where nothing is known yet of what it is about."""
+    """A covariance; ValueError if a parameter that it belongs to is not determined yet."""
     if not np.isfinite(cov if place is None else cov[place, place]).all():
         raise ValueError("crossing: a parameter that it needs is not determined yet: its std is infinite.")
     return cov
 
 
 def _covariances(run: Track) -> tuple[Array, Array]:
-    """(covariance of theta at the end, what a nominal sample without an observation adds to it), (n, n) each."""
+    """(covariance of theta at the end, its increase in a nominal sample without an observation), (n, n) each."""
     tile = run.program.resting(run.state)
     lane = state_of(tile)
     update = run.program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
@@ -225,7 +226,7 @@ def _along_slopes(run: Track, lane: Mapping[str, Array], place: int, sign: float
 
 
 def _of_output(run: Track, sign: float, limit: float, h: int, u: Any) -> Array:
-    """F from paths of the output, (h + 1,); at the end itself nothing has been measured beyond it."""
+    """F from paths of the output, (h + 1,); at the end of the record itself no output is beyond the limit."""
     model = run.model
     if u is None and model.m:
         raise ValueError(
@@ -262,7 +263,7 @@ def crossings(
     runs: Mapping[Hashable, Track], by: tuple[str, ...], what: str, below: Any, above: Any, horizon: int | None,
     u: Any, level: float,
 ) -> polars.DataFrame:  # fmt: skip
-    """A table of the crossings of many runs, those that come first on top; limits and u are one for all, or by key."""
+    """A table of the crossings of many runs, earliest first; limits and u are the same for all, or given by key."""
     import polars
 
     rows: list[dict[str, Any]] = []

@@ -1,9 +1,9 @@
-"""The delta method: the standard deviation of what is computed from parameters.
+"""The delta method: standard deviations of functions of the parameters.
 
     Cov f(theta) = J Cov(theta) J',     J = df / dtheta by central differences
 
-Steps are a hundredth of a standard deviation, so that the slope is that of where theta may be. Where f bends within a
-standard deviation (a gain whose denominator is near zero) the result is a first-order number and no more.
+Steps are a hundredth of a standard deviation, so the slope is that in the region of likely theta. If f is nonlinear
+within a standard deviation (a gain whose denominator is near zero), the result is only a first-order approximation.
 """
 
 from __future__ import annotations

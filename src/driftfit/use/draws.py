@@ -1,12 +1,12 @@
-"""Forward runs of models whose predictions bend in their parameters: bands by drawing systems and noises.
+"""Forward runs of models that are nonlinear in their parameters: bands from draws of systems and noise.
 
     theta_d ~ N(theta, P),  v_d ~ N(0, r)      D systems are run forward side by side (`Model.play`)
     y_hat       with theta itself and without noise
     theta_std   spread over the systems without noise, y_std with it; the band is quantiles of the latter
 
-r is the innovation variance of the last sample that was used. The seed is fixed, so that the same question has the
-same answer; D draws give a 95 % limit to about 10 % of its width. What a curve is beyond the outputs that were seen
-nobody knows: an output block is inverted on their range, widened by a fifth. Cost: O(D h (n + 64)).
+r is the innovation variance of the last sample that was used. The seed is fixed, so the same question has the same
+answer; D draws give a 95 % limit to about 10 % of its width. The data do not determine a curve beyond the observed
+outputs: an output block is inverted on their range, widened by a fifth. Cost: O(D h (n + 64)).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Span = tuple[Any, Any]
 
 DRAWS = 200
 AT_ONCE = 8192
-"""Rows that are run side by side: what they need stays below a hundred megabytes."""
+"""Number of rows that are run in parallel: their memory stays below a hundred megabytes."""
 
 
 def simulate_by_draws(run: Track, u: Array, at: int, given: Array) -> Prediction:
-    """Free simulation with inputs u (h, m) of the system of a sample; ``given`` are the first outputs."""
+    """Free simulation with inputs u (h, m) of the system at a sample; ``given`` are the first outputs."""
     p, known, h = run.model.reach, len(given), len(u)
     (mean,), cov = taken(run, at)
     before = np.concatenate([np.zeros(p), given])
@@ -90,14 +90,14 @@ def _ahead(run: Track, at: Array, past: Array, inputs: Array, cov: Array, r: Arr
 
 
 def _played(run: Track, theta: Array, y: Array, u: Array, noise: Array, span: Span) -> Array:
-    """The model's outputs; noise of a measurement is added after, that of the equation is fed back."""
+    """The model's outputs; measurement noise is added afterwards, equation noise is fed back."""
     if not run.tracker.output_error:
         return run.model.play(theta, y, u, noise, span)
     return run.model.play(theta, y, u, np.zeros_like(noise), span) + noise
 
 
 def systems(run: Track, theta: Array) -> Array:
-    """Parameters of the regression (.., n) from what the tracker follows."""
+    """Parameters of the regression (.., n) from those of the tracker."""
     if run.names == run.model.names:
         return theta
     found = run.model.expand(theta)
@@ -109,7 +109,7 @@ def systems(run: Track, theta: Array) -> Array:
 
 
 def drawn(mean: Array, cov: Array, D: int, seed: int) -> Array:
-    """D draws (D, T, n) of normals with mean (T, n) and covariance (T, n, n); NaN where that is not known."""
+    """D draws (D, T, n) from normals with mean (T, n) and covariance (T, n, n); NaN if the covariance is not known."""
     known: Array = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], cov, 0.0))
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -126,7 +126,7 @@ def _noise(run: Track) -> Array:
 
 
 def _spans(run: Track) -> tuple[Array, Array]:
-    """Least and largest output seen until each sample, (T,) each; -1 and 1 before the first."""
+    """Smallest and largest output up to each sample, (T,) each; -1 and 1 before the first."""
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
     low, high = np.fmin.accumulate(y), np.fmax.accumulate(y)
     return np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)

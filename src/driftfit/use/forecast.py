@@ -1,20 +1,20 @@
-"""Forecasts beyond the end of a record: what theta and y will be when nobody has looked.
+"""Forecasts of theta and y beyond the end of a record.
 
     theta_{T+h} = theta_T,   Cov = P_T + h q                               (what `predict` does, h times)
     y_{T+h}     = phi' theta,  Var = phi' (P_T + h q) phi + r                  without output lags
 
-An output lag that is not known yet is its own forecast, and so has an error of its own, which depends on that of theta.
-With l the lags (L,), a the entries of theta that multiply them, C_ll and C_tl the covariances of their errors,
+An output lag that is not known yet is replaced by its own forecast, whose error depends on that of theta. With l the
+lags (L,), a the entries of theta that multiply them, C_ll and C_tl the covariances of their errors,
 
     y - y_hat   = phi' dtheta + a' dl + da' dl + v
     Var         = phi' P phi + r + 2 phi' C_tl a + a' C_ll a + tr(P_aa C_ll) + tr(C_al C_al)
 
-for normal errors: the last two terms are the product da' dl, which matters while parameters are uncertain. C_ll and
+for normal errors. The last two terms are the product da' dl, which matters while parameters are uncertain. C_ll and
 C_tl follow from the same line, sample by sample; the drift of theta enters when it happens. Cost O(h (n + L)^2). While
-an unstable system is still likely, the outputs have tails that no variance describes; the bands then are those of the
-middle. With several outputs the noises of the outputs are taken to be independent. A
-Hammerstein-Wiener model is fitted to w = F(y): its errors are those of w; to phi' P phi + r is added r sum_{0<j<h}
-psi_j^2, psi the response of 1 / A(z) to one noise, and everything is divided by the slope F'(y_hat).
+an unstable system is still likely, the outputs have tails that no variance describes; the bands are then those of the
+central part. With several outputs, their noises are assumed to be independent. A Hammerstein-Wiener model is fitted to
+w = F(y), so its errors are those of w: r sum_{0<j<h} psi_j^2 is added to phi' P phi + r, with psi the response of
+1 / A(z) to one noise, and everything is divided by the slope F'(y_hat).
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class Forecast(NamedTuple):
     std: Array
     """(h, n): its standard deviation."""
     y_hat: Array
-    """(h,): NaN where an input is not known."""
+    """(h,): NaN if an input is not known."""
     y_std: Array
-    """(h,): standard deviation of the error of y_hat; NaN for trackers without a covariance."""
+    """(h,): standard deviation of the forecast error; NaN for trackers without a covariance."""
 
 
 def forecast(run: Track, h: int, u: Any = None) -> Forecast:
@@ -60,14 +60,14 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
     run : Track
         The record.
     h : int
-        How many samples, at least 1.
+        Number of samples, at least 1.
     u : (h,), (h, m) or None
-        Future inputs; None: not known, which leaves the forecast of theta.
+        Future inputs; None: not known, so that only theta is forecast.
 
     Raises
     ------
     ValueError
-        If h is below 1, or u has not h rows and the model's number of inputs.
+        If h is below 1, or u does not have h rows and the model's number of inputs.
     """
     return forecast_from(run.program, run.program.resting(run.state), future(run.model, h, u))
 
@@ -78,7 +78,7 @@ def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
 
 
 def future(model: Model, h: int, u: Any) -> Array:
-    """Future inputs (h, m), NaN where they are not known."""
+    """Future inputs (h, m), NaN if they are not known."""
     whole("forecast", "h", h, 1)
     inputs = np.full((h, model.m), np.nan) if u is None else inputs_for(model, u, h)
     if inputs.shape[1] != model.m:
@@ -87,7 +87,7 @@ def future(model: Model, h: int, u: Any) -> Array:
 
 
 def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
-    """Forecast from the state in a tile of one lane, which is driven on."""
+    """Forecast from the state in a tile of one lane, which is advanced."""
     model, tracker = program.model, program.tracker
     look, h, now = tile.copy(), len(inputs), tile["theta"][0, :, 0].copy()
     lane = state_of(tile)
@@ -98,7 +98,7 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     for k in range(h):
         look[...] = tile
         y_hat, _, s, _ = update(look, np.nan, inputs[k])
-        # the forecast takes the place of the output among the lags, and is no observation
+        # the forecast takes the place of the output among the lags, and is not an observation
         tile["noise"] = np.inf
         update(tile, y_hat, inputs[k])
         tile["noise"] = 1.0
@@ -107,7 +107,7 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
         if lagged is not None:
             P = tracker.cov(lane)[None]
             result.y_std[k] = lagged.step(lane["phi"], lane["theta"][None], P, np.array([s]))[0]
-    if lagged is not None or tracker.output_error:  # (an output error is never fed back)
+    if lagged is not None or tracker.output_error:  # an output error is never fed back
         return result._replace(y_std=np.sqrt(result.y_std))
     response = model.noise_response(now, h)
     later = noise * model.noise_factor(now, result.y_hat[0]) * (np.cumsum(response**2) - response[0] ** 2)
@@ -124,7 +124,7 @@ def forecast_outputs(run: Outputs | Shared, h: int, u: Any = None) -> Forecast:
 
 
 def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
-    """Forecast from where a stream of several outputs stands, which is driven on."""
+    """Forecast from the present state of a stream of several outputs, which is advanced."""
     whole("forecast", "h", h, 1)
     inputs = [None] * h if u is None else list(as_numbers("u", u))
     if len(inputs) != h:
@@ -150,7 +150,7 @@ def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
 
 
 class LagErrors:
-    """Covariances of the errors of ny outputs that are forecast, where they are lags of each other; see the module."""
+    """Covariances of the errors of ny outputs that are forecast, if they are lags of each other; see the module."""
 
     def __init__(self, ny: int, na: int, n: int) -> None:
         self._shape = ny, na
@@ -166,7 +166,7 @@ class LagErrors:
     def step(self, phi: Array, theta: Array, P: Array, s: Array) -> Array:
         """Variances (ny,) of the outputs of the next sample, for phi (n,), theta (ny, n), P (ny, n, n).
 
-        ``s`` (ny,) is the variance for lags that are known.
+        ``s`` (ny,) is the variance if all lags were known.
         """
         L = len(self._ll)
         if not np.isfinite(P).all():
@@ -185,7 +185,7 @@ class LagErrors:
         return np.diag(both).copy()
 
     def _shift(self, both: Array, with_theta: Array, with_lags: Array) -> None:
-        """The new outputs become the first lags, and the last lags are forgotten."""
+        """The new outputs become the first lags, and the last lags are dropped."""
         ny, na = self._shape
         if not na:
             return

@@ -1,4 +1,4 @@
-"""The ARX system behind a stream, as it stands now: poles, gains and responses with bands, as `Track` has them."""
+"""The ARX system behind a stream, now: poles, gains and responses with bands, as `Track` has them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class LiveSystem:
     """The frozen system after the last sample of a stream; `Live.system` makes it.
 
-    The methods are those of `Track` for one sample, without the axis of time.
+    The methods are those of `Track` for one sample, without the time axis.
     """
 
     def __init__(self, live: Live) -> None:
@@ -43,7 +43,7 @@ class LiveSystem:
         return _now(system.largest_pole(self, -1))
 
     def dc_gain(self) -> Response:
-        """Gain of every input for a signal that stands, (m,), with its standard deviation."""
+        """Gain of every input for a constant signal, (m,), with its standard deviation."""
         return _now(system.dc_gain(self, -1))
 
     def step_response(self, h: int, input: int | str = 0) -> Response:
@@ -69,5 +69,5 @@ class LiveSystem:
 
 
 def _now(response: Response) -> Response:
-    """Of one sample, without the axis of time."""
+    """The response of one sample, without the time axis."""
     return Response(response.value[0], response.std[0])

@@ -13,16 +13,16 @@ from driftfit.run.result import Track
 
 
 class Prediction(NamedTuple):
-    """Outputs with what is known of their errors; NaN where inputs or lags are missing."""
+    """Outputs with the distribution of their errors; NaN if inputs or lags are missing."""
 
     y_hat: Array
-    """(T,): at the sample that is predicted."""
+    """(T,): at the predicted sample."""
     theta_std: Array
-    """(T,): standard deviation from the parameters alone, the band of the mean."""
+    """(T,): standard deviation due to the parameters alone, the band of the mean."""
     y_std: Array
-    """(T,): with the noise, the band of the output."""
+    """(T,): standard deviation including the noise, the band of the output."""
     paths: Array | None = None
-    """(D, T): outputs that were drawn, for models whose predictions bend in their parameters."""
+    """(D, T): drawn outputs, for models that are nonlinear in their parameters."""
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:
         """(low, high) of the output, (T,) each: normal, or quantiles of the drawn outputs."""
@@ -36,7 +36,7 @@ class Prediction(NamedTuple):
 
 
 def moved(values: Array, by: int, rest: float = np.nan) -> Array:
-    """Values (T, ..) so many samples later (earlier where negative)."""
+    """Values (T, ..) delayed by a number of samples (advanced if it is negative)."""
     out = np.full(values.shape, rest)
     T = len(values)
     if by >= 0:
@@ -47,7 +47,7 @@ def moved(values: Array, by: int, rest: float = np.nan) -> Array:
 
 
 def drift(run: Track, r: Array) -> Array:
-    """q per sample, (1, n, n) or (T, n, n); zero where theta itself does not walk at random."""
+    """q per sample, (1, n, n) or (T, n, n); zero if theta itself is not a random walk."""
     n = len(run.names)
     try:
         walk = run.tracker.random_walk(run.model)

@@ -1,17 +1,17 @@
-"""Preparation: small, explicit functions that note what they did, so that results come back in the user's units.
+"""Preparation: small functions that record what they did, so that results can be converted back to the user's units.
 
     flow = prepare.scale(prepare.remove_level(flow_raw, first=200), first=200)
     valve = prepare.scale(valve_raw, first=200)
     run = track(ARX(2, 2), tracker, flow, valve)
     result = prepare.restore(run, flow, valve)      # theta, bands, predictions in the units of flow_raw and valve_raw
 
-Everything that stays sample by sample is an affine map, raw_t = factor * value_t + offset_t, and maps compose. What is
-fitted is fitted on the past only: a level or a trend on the first samples, or as it goes on what lies before each
-sample; nothing looks ahead. `delay` and `feedback` judge a whole record and belong before a run, not inside it.
+Every operation that keeps the samples is an affine map, raw_t = factor * value_t + offset_t, and maps compose. Fits use
+the past only: a level or a trend is fitted to the first samples, or at each sample to those before it; nothing looks
+ahead. `delay` and `feedback` judge a whole record and belong before a run, not inside it.
 
 Source: Ljung, System Identification (1999), chapter 14 (levels, trends, scaling, delays); Box, Jenkins and Reinsel,
 Time Series Analysis (1994), section 11.2 (prewhitening before a cross-correlation); Granger (1969) (the test of
-feedback). Departure: levels and trends are never fitted on samples that come after the one they are removed from,
+feedback). Departure: levels and trends are never fitted to samples after the one from which they are removed,
 except within the first ``first`` samples.
 """
 
@@ -33,9 +33,9 @@ from driftfit.run.result import Track
 
 @dataclass(frozen=True)
 class Prepared:
-    """A signal that was prepared: raw_t = factor * value_t + offset_t.
+    """A prepared signal: raw_t = factor * value_t + offset_t.
 
-    `track` takes it like an array of its ``values`` (T,). ``notes`` says what was done, in order.
+    `track` takes it like an array of its ``values`` (T,). ``notes`` lists what was done, in order.
     """
 
     values: Array
@@ -55,7 +55,7 @@ class Prepared:
 
 
 def prepared(values: Any) -> Prepared:
-    """A signal to which nothing has been done yet."""
+    """A signal to which no operation has been applied yet."""
     if isinstance(values, Prepared):
         return values
     array = as_numbers("values", values)
@@ -71,7 +71,7 @@ def _shift(before: Prepared, offset: Array, note: str) -> Prepared:
 
 
 def _finite(before: Prepared, first: int | None) -> tuple[Array, int]:
-    """(places, count) of the finite values among the first ``first``; ValueError where there are none."""
+    """(positions, count) of the finite values among the first ``first``; ValueError if there are none."""
     count = len(before) if first is None else whole("prepare", "first", first, 1)
     places = np.flatnonzero(np.isfinite(before.values[:count]))
     if not places.size:
@@ -80,14 +80,14 @@ def _finite(before: Prepared, first: int | None) -> tuple[Array, int]:
 
 
 def remove_level(values: Any, first: int | None = None, level: float | None = None) -> Prepared:
-    """Take the operating point away.
+    """Subtract the operating point.
 
     Parameters
     ----------
     values : (T,) or Prepared
     first : int or None
         The mean of this many samples at the start is the operating point. None: at each sample the mean of all
-        samples before it (0 before the first), which follows a level that is not known beforehand.
+        earlier samples (0 before the first), which tracks a level that is not known beforehand.
     level : number or None
         The operating point, if it is known.
     """
@@ -105,7 +105,7 @@ def remove_level(values: Any, first: int | None = None, level: float | None = No
 
 
 def remove_trend(values: Any, first: int) -> Prepared:
-    """Take a straight line away that was fitted to the first ``first`` samples (T,) and is continued from there."""
+    """Subtract a straight line that was fitted to the first ``first`` samples (T,) and is continued from there."""
     before = prepared(values)
     places, count = _finite(before, first)
     if places.size < 2:
@@ -132,7 +132,7 @@ def scale(values: Any, *, by: float | None = None, first: int | None = None) -> 
 
 
 class Resampled(NamedTuple):
-    """Signals on a regular grid: ``time`` (G,), ``values`` (G,) or (G, m), ``samples`` (G,) behind each."""
+    """Signals on a regular grid: ``time`` (G,), ``values`` (G,) or (G, m), and how many ``samples`` (G,) in each."""
 
     time: Array
     values: Array
@@ -140,7 +140,7 @@ class Resampled(NamedTuple):
 
 
 def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
-    """Bring signals to a regular grid, each point from the samples of the interval that ends there.
+    """Resample signals to a regular grid, each point from the samples of the interval that ends there.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
     dt : number or duration
         Interval of the grid, whose first point is time[0], as for `track`: 10, "15min", a timedelta.
     how : "mean" or "last"
-        Mean of the interval, or the last value in it. An interval without a value is NaN.
+        Mean of the interval, or the last value in it. An interval without a value gives NaN.
     """
     one_of("resample", "how", how, ("mean", "last"))
     (axis, _), array, clock = instants(time), as_numbers("values", values), Clock.of(dt)
@@ -169,7 +169,7 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
     else:
         grid = np.full((size, columns.shape[1]), np.nan)
         for j in range(columns.shape[1]):
-            grid[bins[seen[:, j]], j] = columns[seen[:, j], j]  # of several the last stands
+            grid[bins[seen[:, j]], j] = columns[seen[:, j], j]  # the last of several values
     return Resampled(
         axis[0] + np.arange(size) * (clock.count if clock.duration is None else clock.duration),
         grid.reshape(size, *array.shape[1:]),
@@ -180,7 +180,7 @@ def resample(time: Any, values: Any, dt: Any, how: str = "mean") -> Resampled:
 class Delay(NamedTuple):
     """An estimated delay: ``samples``, the correlation there, and the correlations (max_lag + 1,) at 0, 1, ...
 
-    ``bound`` is what unrelated signals exceed at one lag with probability 5 %. For ARX, ``nk`` is ``samples``.
+    Unrelated signals exceed ``bound`` at one lag with probability 5 %. For ARX, ``nk`` is ``samples``.
     """
 
     samples: int
@@ -192,8 +192,8 @@ class Delay(NamedTuple):
 def delay(y: Any, u: Any, max_lag: int = 50, order: int = 10) -> Delay:
     """Delay from u to y in samples, from the cross-correlation after prewhitening.
 
-    An autoregression of ``order`` makes u white, and the same filter is passed over y (0: neither is filtered). Without
-    it the correlation of a slow input with itself smears the peak. Missing samples count as the mean.
+    An autoregression of ``order`` whitens u, and the same filter is applied to y (0: neither is filtered). Without it
+    the autocorrelation of a slow input smears the peak. Missing samples count as the mean.
     """
     from scipy import signal  # with stats half of the time of importing the package
 
@@ -223,13 +223,13 @@ class Feedback(NamedTuple):
 
 
 def feedback(y: Any, u: Any, lags: int = 5, level: float = 0.001) -> Feedback:
-    """Warn when the input is a function of past outputs: a controller, or an operator who reacts.
+    """Warn if the input is a function of past outputs, as with a controller or an operator who reacts.
 
-    In closed loop innovations and later inputs are correlated. An ARX model with enough lags and a delay of at least
-    one sample still tracks honestly, but correlations (`delay`), models without noise terms and too few lags mislead.
+    In closed loop, innovations and later inputs are correlated. An ARX model with enough lags and a delay of at least
+    one sample still tracks correctly, but correlations (`delay`), models without noise terms and too few lags mislead.
 
-    u is regressed on its own ``lags`` and then on those of y too; UserWarning where the second explains it better with
-    a probability by chance below ``level``.
+    u is regressed on its own ``lags`` and then also on those of y. A UserWarning is issued if the second regression is
+    better, with a p-value below ``level``.
     """
     from scipy import stats
 
@@ -252,7 +252,7 @@ def feedback(y: Any, u: Any, lags: int = 5, level: float = 0.001) -> Feedback:
 
 
 def _centred(values: Any) -> Array:
-    """Values about their mean, with 0 for what is missing."""
+    """Values minus their mean, with 0 for missing ones."""
     array = np.asarray(prepared(values))
     seen = np.isfinite(array)
     return np.where(seen, array - (array[seen].mean() if seen.any() else 0.0), 0.0)
@@ -267,9 +267,9 @@ def _past(values: Array, lags: int) -> Array:
 class Restored:
     """A run in the units of the raw signals.
 
-    ``theta``, ``std`` (T, n); ``prediction``, ``innovation``, ``innovation_std`` (T,); ``factors`` (n,) are what theta
-    was multiplied with. The intercept of a model is about the level that was removed. ``notes`` maps signals to what
-    was done to them.
+    ``theta``, ``std`` (T, n); ``prediction``, ``innovation``, ``innovation_std`` (T,); theta was multiplied by
+    ``factors`` (n,). The intercept of a model refers to the level that was removed. ``notes`` lists for every signal
+    what was done to it.
     """
 
     names: tuple[str, ...]
@@ -283,19 +283,19 @@ class Restored:
 
 
 def restore(run: Track, y: Any, u: Any = ()) -> Restored:
-    """A run on prepared signals in the units that they had before.
+    """Convert a run on prepared signals to the units of the raw signals.
 
     Parameters
     ----------
     run : Track
         What `track` returned for these signals.
     y, u : Prepared or (T,); u also a sequence of them, one per input
-        The signals as they were given to `track`.
+        The signals that were passed to `track`.
 
     Raises
     ------
     ValueError
-        If the model cannot say what its parameters multiply, or the inputs are not as many as its own.
+        If the model does not declare the units of its parameters, or the number of inputs is not that of the model.
     """
     output = prepared(y)
     several = isinstance(u, Sequence) and not (len(u) and np.isscalar(u[0]))

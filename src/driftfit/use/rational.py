@@ -1,23 +1,23 @@
-"""Rational models: numerator and denominator, with the bias of least squares taken away.
+"""Rational models: estimate numerator and denominator without the bias of least squares.
 
     y_k = phi_k' a / g_k + v_k,      g_k = 1 + psi_k' b
 
-with phi and psi made of what was known before y_k. Multiplied by g it is linear in (a, b),
+with phi and psi functions of what was known before y_k. Multiplied by g it is linear in (a, b),
 
     y_k = x_k' (a, b) + g_k v_k,     x_k = (phi_k, -y_k psi_k)
 
-but x holds y_k and with it the noise: least squares is biased, however long the record, by
+but x contains y_k and its noise: least squares is biased, however long the record, by
 
     E x x' - x0 x0' = sigma^2 [[0, 0], [0, psi psi']],      E x y - x0 y0 = -sigma^2 (0, psi)
 
-x0 and y0 without noise. Bias compensation subtracts both. It needs sigma^2, and so an estimate of a and b, which taken
-in turns from the biased one fails where the noise is large. `rational_model` therefore minimises the sum of squares of
-y - phi' a / g itself, from b = 0, which is consistent and efficient; the compensated estimate with its sigma^2 is given
-beside it: consistent as well, with a far larger variance. Use it where a and b are constant; where they drift, or g is
-not known, follow the coefficients a / g by `driftfit.trackers.fls.FLS`.
+x0 and y0 without noise. Bias compensation subtracts both. It needs sigma^2, and so an estimate of a and b; alternating
+between the two, starting from the biased estimate, fails if the noise is large. `rational_model` therefore minimises
+the sum of squares of y - phi' a / g itself, from b = 0, which is consistent and efficient. The compensated estimate
+with the resulting sigma^2 is also returned: it is consistent as well, but has a far larger variance. Use this module if
+a and b are constant; if they drift, or g is not known, track the coefficients a / g with `driftfit.trackers.fls.FLS`.
 
 Source: Billings and Zhu (1991), Int. J. Control 54; section 2.1.2 of Chen et al., "augmented flexible least squares for
-time-varying parameter systems", which names the compensation and does not give it. Cost: O(T n^2) a round.
+time-varying parameter systems", which mentions the compensation without giving it. Cost: O(T n^2) per iteration.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ def rational_model(y: Any, phi: Any, psi: Any) -> Rational:
     y : (T,)
         Samples with a missing value, in y or a regressor, are left out.
     phi, psi : (T, n), (T, m)
-        Regressors of the numerator and of the denominator; they may hold past outputs, but not the present one.
+        Regressors of the numerator and of the denominator; they may contain past outputs, but not the present one.
 
     Raises
     ------
     ValueError
-        For shapes that do not fit, regressors that hold y itself, or fewer usable samples than parameters.
+        For shapes that do not fit, regressors that contain y itself, or fewer usable samples than parameters.
     """
     output = as_output(y)
     top, below = as_inputs(phi, len(output)), as_inputs(psi, len(output))

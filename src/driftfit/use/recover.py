@@ -1,16 +1,17 @@
-"""Recover: what a path of coefficients says about the system behind it.
+"""Recover properties of the system from a path of coefficients.
 
     static_curve        y = sum a_i y_{k-i} + sum b_j f(u_{k-j})     g_j(k) = theta_j(k) u_{k-j} = b_j f(u_{k-j})
     rational_constants  y = phi' a / g                               a from theta(k) = a / g_k, g given
     switching_times     constants between switches                   the largest |theta(k) - theta(k-1)|
     exp_autoregression  y = sum (a_i + b_i e^{-r y_{k-d}^2}) y_{k-i}  a, b by least squares for every r, then r
 
-Use the first three on a smoothed path (`run.smooth()`). Where the coefficients depend on a variable, smooth along it:
-``run.smooth(order_by=u)`` follows a static curve several times more closely than smoothing in time. The product b_j f
-is all that can be known of a curve, and where f(0) is not 0 not even that: then beta = f / u is unbounded at u = 0.
+Use the first three on a smoothed path (`run.smooth()`). If the coefficients depend on a variable, smooth along it:
+``run.smooth(order_by=u)`` estimates a static curve several times more accurately than smoothing in time. The data
+determine only the product b_j f of a curve, and if f(0) is not 0 not even that: then beta = f / u is unbounded at
+u = 0.
 
-The constants of an exponential autoregression are fitted to y, never to the path, which is too far from it: smoothing
-bias and noise end in r. Cost: one or a few least-squares fits.
+The constants of an exponential autoregression are fitted to y, never to the path, whose smoothing bias and noise would
+end up in r. Cost: one or a few least-squares fits.
 
 Source: the model classes of Chen et al., "augmented flexible least squares for time-varying parameter systems", section
 2; variable projection of Golub and Pereyra (1973). Departures: the lag of the exponent is explicit; what cannot be
@@ -34,11 +35,11 @@ from driftfit.engine.settings import whole
 from driftfit.smooth.smoothed import Smoothed
 
 COLLINEAR = 0.8
-"""Correlation of two regressors above which a path splits their effect badly."""
+"""Correlation of two regressors above which a path does not separate their effects well."""
 RATES = (1e-3, 1e3)
-"""Range of r in units of 1 / mean(y^2): below, the exponential is a constant and a parabola; above, it is a spike."""
+"""Range of r in units of 1 / mean(y^2): below it the exponential is a parabola, above it a spike."""
 OFFSET = 5.0
-"""Standard errors from 0 at which a curve is said not to pass through the origin."""
+"""Standard errors from 0 at which a warning says that a curve does not pass through the origin."""
 
 
 class StaticCurve(NamedTuple):
@@ -50,10 +51,10 @@ class StaticCurve(NamedTuple):
 
 
 def static_curve(path: Smoothed, regressor: int | str) -> StaticCurve:
-    """b f(u) from the coefficient of one regressor that is a lag of an input, by its number or name.
+    """b f(u) from the coefficient of one regressor that is a lag of an input, given by its number or name.
 
-    Warns where the path cannot follow the curve: neighbouring samples with very different inputs, or residuals that are
-    not centred near u = 0, as when f(0) is not 0.
+    Warns if the path cannot represent the curve: neighbouring samples have very different inputs, or residuals are not
+    centred near u = 0, as when f(0) is not 0.
     """
     i = _column(path, regressor)
     used = np.flatnonzero(path.walk.weight > 0.0)
@@ -76,13 +77,13 @@ def _column(path: Smoothed, regressor: int | str) -> int:
 
 
 def _roughness(u: Array) -> float:
-    """Mean square step between neighbours over that between strangers: 1 for white noise, near 0 for a slow signal."""
+    """Mean square step between neighbours over that of random pairs: 1 for white noise, near 0 for a slow signal."""
     spread = 2.0 * np.var(u)
     return float(np.mean(np.diff(u) ** 2) / spread) if spread > 0.0 and len(u) > 1 else 0.0
 
 
 def _warn_if_offset(u: Array, partial: Array) -> None:
-    """Fit c0 + c1 u + c2 u^2 to what is left for the curve at the third of the samples nearest to u = 0; c0 is f(0)."""
+    """Fit c0 + c1 u + c2 u^2 to the partial residuals at the third of the samples nearest to u = 0; c0 is f(0)."""
     near = np.argsort(np.abs(u))[: len(u) // 3]
     near = near[np.isfinite(partial[near])]
     X = u[near, None] ** np.arange(3)
@@ -101,8 +102,8 @@ def _warn_if_offset(u: Array, partial: Array) -> None:
 class RationalConstants(NamedTuple):
     """Constants of a rational model, (n,) each: from the path, and by least squares of y on phi / g.
 
-    ``correlation`` is the largest between two regressors (about zero): near 1 the split between their coefficients in
-    the path is weakly determined, and the second estimate is the one to use.
+    ``correlation`` is the largest between two regressors (about zero): if it is near 1, the path hardly determines the
+    split between their coefficients, and you should use the second estimate.
     """
 
     from_path: Array
@@ -111,10 +112,10 @@ class RationalConstants(NamedTuple):
 
 
 def rational_constants(path: Smoothed, g: Callable[[Array], Any]) -> RationalConstants:
-    """a in y = phi' a / g + v, with g a known function of the regressors phi (T, n), giving (T,).
+    """a in y = phi' a / g + v, with g a known function of the regressors phi (T, n), which returns (T,).
 
-    g is asked as a function of phi, which holds the past only: a denominator that contains y_k itself is correlated
-    with the noise, and no least squares of this kind is consistent then. ValueError if phi or g holds y_k.
+    g must be a function of phi, which contains the past only: a denominator that contains y_k itself is correlated
+    with the noise, and no least squares of this kind is then consistent. ValueError if phi or g contains y_k.
     """
     if not callable(g):
         raise ValueError(
@@ -139,10 +140,11 @@ def rational_constants(path: Smoothed, g: Callable[[Array], Any]) -> RationalCon
 
 
 def switching_times(path: Smoothed, count: int = 1, apart: int = 10) -> Array:
-    """First samples of new modes, (count,) ascending: where theta steps furthest, at least ``apart`` samples apart.
+    """First samples of new modes, (count,) ascending: the largest steps of theta, at least ``apart`` samples apart.
 
-    Steps of a parameter count by what they do to the output, |step| times the rms of its regressor. Fewer come back
-    where the record is too short. Smooth with a tuned tracker: a mu that is too small hides switches in noise.
+    The step of a parameter is measured by its effect on the output, |step| times the rms of its regressor. Fewer
+    samples are returned if the record is too short. Smooth with a tuned tracker: a mu that is too small hides switches
+    in noise.
     """
     whole("switching_times", "count", count, 1)
     whole("switching_times", "apart", apart, 1)
@@ -179,8 +181,8 @@ def exp_autoregression(y: Any, n: int, delay: int = 1, level: float = 0.95) -> E
     """Fit y_k = sum_{i=1..n} (a_i + b_i e^{-r y_{k-delay}^2}) y_{k-i} + v_k to a record (T,) by variable projection.
 
     The minimum over r is flat, so the interval of r (at ``level``, from the profile of the likelihood) matters more
-    than r; an open end is 0 or inf, with a warning. Samples whose lags are missing are not used. ValueError where fewer
-    samples than 2 n + 2 are left.
+    than r; an open end is 0 or inf, with a warning. Samples with missing lags are not used. ValueError if fewer than
+    2 n + 2 samples are left.
     """
     lags, square, output = _exp_regressors(as_output(y), whole("exp_autoregression", "n", n, 1), delay)
     project = _projection(lags, square, output)
@@ -217,7 +219,7 @@ def _exp_regressors(y: Array, n: int, delay: int) -> tuple[Array, Array, Array]:
 
 
 def _lagged(y: Array, lag: int) -> Array:
-    """y moved back by ``lag`` samples; NaN where nothing is known."""
+    """y delayed by ``lag`` samples; NaN before the first sample."""
     moved = np.full(len(y), np.nan)
     moved[lag:] = y[: len(y) - lag]
     return moved

@@ -1,18 +1,18 @@
-"""Predictions over a record k samples ahead, and free simulation, with bands, given the inputs.
+"""Predictions k samples ahead over a record, and free simulation, both with bands and given inputs.
 
-The output lags that are not known yet are the predictions themselves, so that theta acts through them too:
+Output lags that are not known yet are replaced by predictions, so theta acts through them too:
 
     y_j  = phi_j' theta                                phi_j holds y_(j-1), .. of this recursion and the inputs
     S_j  = phi_j + sum_i a_i S_(j-i)                    = d y_j / d theta
     Var  = S_j' (P + j q) S_j + r sum_(i<j) psi_i^2     psi = response of 1 / A to one noise
 
-`ahead` starts from the outputs up to t at every t, with theta_t and P_t as they were then: nothing looks ahead but the
-inputs. `simulate` sees no output at all. q is the drift that the tracker assumes per sample where it says so, else 0;
-r is what makes the first step the variance that the run reported. First-order in the parameter errors.
+`ahead` starts at every t from the outputs up to t, with theta_t and P_t as they were then: nothing looks ahead except
+the inputs. `simulate` uses no output at all. q is the drift per sample that the tracker assumes, or 0 if it assumes
+none; r makes the variance of the first step equal to that of the run. First-order in the parameter errors.
 Cost: O(T k n^2) for `ahead`, O(h n^2) for `simulate`.
 
-That is for ARX and Regression. Other models that say how they run forward (`Model.play`), as Hammerstein-Wiener, are
-drawn from (`driftfit.use.draws`).
+This is for ARX and Regression. For other models that can be run forward (`Model.play`), such as Hammerstein-Wiener,
+systems are drawn (`driftfit.use.draws`).
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from driftfit.use.system import covariances, taken
 
 
 def ahead(run: Track, k: int) -> Prediction:
-    """Predict every sample from k samples before it, the inputs being given; the first k samples are NaN.
+    """Predict every sample from k samples before it, with given inputs; the first k samples are NaN.
 
     Raises
     ------
     ValueError
-        If k is below 1, the model cannot be run forward, or theta moves along a slope.
+        If k is below 1, the model cannot be run forward, or theta has a slope.
     """
     whole("ahead", "k", k, 1)
     if getattr(run.tracker, "differences", 1) > 1:
@@ -74,18 +74,18 @@ def ahead(run: Track, k: int) -> Prediction:
 
 
 def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
-    """Free simulation of the model of one sample: the outputs that inputs u (h,) or (h, m) would cause.
+    """Free simulation of the model at one sample: the outputs that inputs u (h,) or (h, m) would cause.
 
     Parameters
     ----------
     run : Track
-        Of a model that can be run forward: ARX, Regression, HammersteinWiener, or your own with `play`.
+        A run of a model that can be run forward: ARX, Regression, HammersteinWiener, or your own with `play`.
     u : (h,), (h, m), or None without inputs
         Inputs. Before them the system is at rest: inputs and outputs are zero.
     at : int
-        The sample whose parameters, covariance and noise are taken.
+        The sample whose parameters, covariance and noise are used.
     y : (h0,) or None
-        The outputs of the first samples, when the system is not at rest; they are returned as they are.
+        The outputs of the first samples, if the system is not at rest; they are returned unchanged.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
 def fit(y: Any, y_hat: Any) -> float:
     """Fit in per cent, 100 (1 - |y - y_hat| / |y - mean y|) over the samples where both are known.
 
-    100 is perfect, 0 no better than the mean, and below that worse; the measure of Ljung (1999) and of MATLAB's
-    ``compare``. NaN where nothing is known or y stands still.
+    100 is perfect, 0 is as good as the mean, and negative values are worse; the measure of Ljung (1999) and of MATLAB's
+    ``compare``. NaN if no value is known or y is constant.
     """
     measured, predicted = np.asarray(y, float), np.asarray(y_hat, float)
     if measured.shape != predicted.shape:
@@ -133,7 +133,7 @@ def fit(y: Any, y_hat: Any) -> float:
 
 
 def noise_at(run: Track, at: int) -> float:
-    """Noise variance at a sample: the one-step variance less what the parameters add to it; NaN without one."""
+    """Noise variance at a sample: the one-step variance minus the part due to the parameters; NaN if there is none."""
     sample = range(len(run))[at]
     known = np.flatnonzero(np.isfinite(run.innovation_std[: sample + 1]) & run.ok[: sample + 1])
     if not len(known):
@@ -149,7 +149,7 @@ def noise_at(run: Track, at: int) -> float:
 
 
 def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int, Array]:
-    """(na, the regressors (T, n - na) that inputs make); what is before the record is ``rest``."""
+    """(na, the regressors (T, n - na) made of inputs); values before the record are ``rest``."""
     one = [np.ones((len(u), 1))] if model.intercept else []
     if isinstance(model, Regression):
         return 0, np.hstack([u, *one])
@@ -160,11 +160,11 @@ def input_regressors(model: Model, u: Array, rest: float = np.nan) -> tuple[int,
 
 
 def _known(values: Array) -> Array:
-    """Values with NaN for what is not finite."""
+    """Values with NaN instead of infinite ones."""
     return np.where(np.isfinite(values), values, np.nan)
 
 
 def _filled(values: Array) -> Array:
-    """NaN replaced by the last number before it."""
+    """NaN replaced by the previous number."""
     place = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
     return np.where(place >= 0, values[place], np.nan)

@@ -5,13 +5,13 @@
     poles               roots of z^na A(z)                       gain of input j      B_j(1) / A(1)
     step response       of B_j / A, h samples                    frequency response   B_j(e^iw) / A(e^iw)
 
-At every sample the parameters of that sample are taken as if they stayed: the frozen system. Standard deviations come
-from the covariance of the run by the delta method (`driftfit.use.delta_method`), those of a frequency response for the
-logarithm of the magnitude and for the phase. Units: w in radians per sample, gains in units of y over units of u.
+At every sample the parameters of that sample are assumed to be constant: the frozen system. Standard deviations come
+from the covariance of the run by the delta method (`driftfit.use.delta_method`); for a frequency response they are
+those of the logarithm of the magnitude and of the phase. Units: w in radians per sample, gains in units of y over u.
 
-For economists: in a model of logarithms the gain is the long-run elasticity, b / (1 - a), which `long_run` gives with
-its standard error and with the interval of Fieller (1954). Where A(1) is not clearly different from zero the delta
-method fails, and Fieller's interval is unbounded, which is the truth.
+In econometrics: in a model of logarithms the gain is the long-run elasticity, b / (1 - a), which `long_run` returns
+with its standard error and with the interval of Fieller (1954). Where A(1) is not clearly different from zero the delta
+method fails; Fieller's interval is then unbounded, as it should be.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Followed(Protocol):
 
 
 class Response(NamedTuple):
-    """Something with its standard deviation; NaN where the tracker carries no covariance."""
+    """A value with its standard deviation; NaN if the tracker carries no covariance."""
 
     value: Array
     std: Array
@@ -59,7 +59,7 @@ class Response(NamedTuple):
 
 
 class FrequencyResponse(NamedTuple):
-    """Of one input: w (k,) in radians per sample; log magnitude and phase (radians), (T, k) each, with std."""
+    """For one input: w (k,) in radians per sample; log magnitude and phase (radians), (T, k) each, with std."""
 
     w: Array
     magnitude: Array
@@ -79,7 +79,7 @@ class LongRun(NamedTuple):
 
 
 def arx_of(run: Followed) -> ARX:
-    """The ARX model of a run; ValueError where it has another."""
+    """The ARX model of a run; ValueError if it has another model."""
     if not isinstance(run.model, ARX) or len(run.model.outputs) > 1 or run.names != run.model.names:
         raise ValueError(
             f"poles, gains and responses belong to runs of ARX with one output; this run has {run.model!r}."
@@ -88,7 +88,7 @@ def arx_of(run: Followed) -> ARX:
 
 
 def covariances(run: Track) -> Array:
-    """Covariance of theta after every sample, (T, n, n); NaN where it is not finite. Replays the record."""
+    """Covariance of theta after every sample, (T, n, n); NaN if it is not finite. Replays the record."""
     n = len(run.names)
     if not run.tracker.covariance:
         return np.full((len(run), n, n), np.nan)
@@ -96,7 +96,7 @@ def covariances(run: Track) -> Array:
 
 
 def _finite(cov: Array) -> Array:
-    """Covariances (T, n, n) with all of one NaN where a parameter of it is not known yet."""
+    """Covariances (T, n, n); all entries of one are NaN if a parameter is not determined yet."""
     known = np.asarray(np.isfinite(cov).all(axis=(1, 2), keepdims=True))
     return np.where(known, cov, np.nan)
 
@@ -115,7 +115,7 @@ def taken(run: Followed, at: Any) -> tuple[Array, Array]:
 
 
 def poles(run: Followed, at: Any = None) -> Array:
-    """Poles of the frozen systems, (T, na) complex, largest magnitude first; at= picks samples."""
+    """Poles of the frozen systems, (T, na) complex, largest magnitude first; ``at`` selects samples."""
     model = arx_of(run)
     theta = run.theta if at is None else run.theta[np.atleast_1d(at)]
     na = model.na
@@ -145,7 +145,7 @@ def largest_pole(run: Followed, at: Any = None) -> Response:
 
 
 def dc_gain(run: Followed, at: Any = None) -> Response:
-    """Gain of every input for a signal that stands, (T, m), with its standard deviation."""
+    """Static gain of every input, (T, m), with its standard deviation."""
     model = arx_of(run)
     return Response(*spread(lambda theta: _gain(model, theta), *taken(run, at)))
 
@@ -158,7 +158,7 @@ def _gain(model: ARX, theta: Array) -> Array:
 
 
 def step_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
-    """Response (T, h) to a unit step of one input at sample 0; ``at`` picks samples, None takes all (T h n numbers)."""
+    """Response (T, h) to a unit step of one input at sample 0; ``at`` selects samples, None all (T h n numbers)."""
     model, j = arx_of(run), input_of(run, input)
     whole("step_response", "h", h, 1)
     drive = np.ones(h)
@@ -207,7 +207,7 @@ def _at(polynomial: Array, w: Array) -> Array:
 
 
 def input_of(run: Followed, input: int | str) -> int:
-    """The number of an input, by number or name."""
+    """The index of an input, from its index or name."""
     m = run.model.m
     names = run.model.inputs if isinstance(run.model, ARX) and isinstance(run.model.inputs, tuple) else ()
     if isinstance(input, str):
@@ -220,12 +220,12 @@ def input_of(run: Followed, input: int | str) -> int:
 
 
 def to_scipy(run: Followed, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
-    """The frozen system of a sample, from one input to y, as `scipy.signal.dlti` (a transfer function in z)."""
+    """The frozen system at a sample, from one input to y, as `scipy.signal.dlti` (a transfer function in z)."""
     from scipy import signal
 
     model, j = arx_of(run), input_of(run, input)
     A, B = model.polynomials(run.theta[at])
-    length = max(len(A), len(B[j]))  # as many powers of z^-1 in both: then they are powers of z
+    length = max(len(A), len(B[j]))  # with equally many powers of z^-1 in both, they are powers of z
     num, den = (np.pad(part, (0, length - len(part))) for part in (B[j], A))
     lead = int(np.argmax(num != 0.0)) if np.any(num) else 0  # a leading zero coefficient makes scipy warn
     return signal.dlti(num[lead:], den, dt=dt)
@@ -254,7 +254,7 @@ def long_run(run: Followed, at: int = -1, level: float = 0.95) -> tuple[LongRun,
 def fieller(theta: Array, cov: Array, top: Array, over: Array, one: float, z: float) -> tuple[float, float]:
     """All g for which top' theta - g (one + over' theta) is within z standard deviations of 0.
 
-    (-inf, inf) where they are unbounded, as when the denominator is not clearly different from zero.
+    (-inf, inf) if this set is unbounded, as when the denominator is not clearly different from zero.
     """
     a, b = float(top @ theta), one + float(over @ theta)
     aa, ab, bb = float(top @ cov @ top), float(top @ cov @ over), float(over @ cov @ over)

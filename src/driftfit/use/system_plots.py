@@ -1,4 +1,4 @@
-"""Pictures of the system behind an ARX run: its responses over time, its poles in the plane, its fit on other data."""
+"""Plots of the system behind an ARX run: its responses over time, its poles in the plane, its fit on other data."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 TIMES = 5
-"""Samples whose responses are drawn where none are chosen."""
+"""Number of samples whose responses are drawn by default."""
 
 LONGEST = 200
-"""Most samples of a step response."""
+"""Largest number of samples of a step response."""
 
 
 def plot_system(
@@ -33,22 +33,22 @@ def plot_system(
     Parameters
     ----------
     run : Track
-        Of an ARX model.
+        A run of an ARX model.
     input : int or name
-        The input that steps.
+        The input of the step.
     at : samples
-        Where the responses are taken; five from the start's end to the last by default, dark is late.
+        The samples whose responses are drawn; by default five from the end of the start to the last. Dark is late.
     h : int
         Samples of the step response; None: until the slowest of these systems has settled, at most 200.
     level : number
-        Of the bands, pointwise, from the covariance of the run.
+        Level of the bands, which are pointwise, from the covariance of the run.
     dt : number
         Time between samples, for the axes of the responses: frequencies are then in radians per unit of time.
 
     Raises
     ------
     ValueError
-        For another model, or an input that is not there.
+        For another model, or an input that does not exist.
     """
     arx_of(run)
     j = input_of(run, input)
@@ -66,7 +66,7 @@ def plot_system(
 
 
 def _settling(run: Track, at: Array) -> int:
-    """Samples until the slowest stable pole has faded to 2 per cent."""
+    """Samples until the slowest stable mode has decayed to 2 per cent."""
     sizes = np.abs(poles(run, at)[:, 0]) if arx_of(run).na else np.zeros(1)
     slowest = float(np.max(np.where(sizes < 1.0, sizes, 0.99)))
     lags = max(nb + nk for nb, nk in arx_of(run).lags)
@@ -74,7 +74,7 @@ def _settling(run: Track, at: Array) -> int:
 
 
 def _shades(count: int) -> list[Any]:
-    """Light to dark blue, early to late."""
+    """Shades of blue, from light (early) to dark (late)."""
     from matplotlib.colors import LinearSegmentedColormap
 
     ramp = LinearSegmentedColormap.from_list("time", ["#b9d3ef", BLUE, "#0a2747"])
@@ -115,7 +115,7 @@ def _frequency(axis: Axes, run: Track, j: int, at: Array, level: float, dt: floa
 
 
 def _plane(axis: Axes, run: Track, first: int) -> None:
-    """Poles of every sample, light to dark, in the unit circle; outside it a system is unstable."""
+    """Poles at every sample, light to dark, in the unit circle; outside it a system is unstable."""
     path = poles(run)[first:]
     axis.plot(*np.array([(np.cos(x), np.sin(x)) for x in np.linspace(0.0, 2.0 * np.pi, 200)]).T, color=GREY, lw=0.8)
     axis.axhline(0.0, color=GREY, lw=0.4)
@@ -167,7 +167,7 @@ def _titled(axis: Axes, title: str) -> None:
 
 
 def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95) -> Figure:
-    """Free simulation of the model of one sample on data that it has not seen, beside what was measured.
+    """Free simulation of the model at one sample on data that it has not used, with the measured outputs.
 
     The first outputs, as many as its regressors reach back, are given to the simulation. The fit, in per cent,
     is that of `driftfit.use.simulate.fit`.

@@ -1,1 +1,1 @@
-"""What several commands share: what is typed, what is read, how errors are said."""
+"""What several commands share: parsing arguments, reading data, reporting errors."""

@@ -1,4 +1,4 @@
-"""What is typed on the command line, as models, trackers, settings, units and intervals."""
+"""Parse command line arguments into models, trackers, settings, units and intervals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Kind = TypeVar("Kind", bound=Settings)
 
 
 def given_fields(kind: type[Settings]) -> list[Field[Any]]:
-    """The settings of a model or tracker, in the order in which they are given."""
+    """The settings of a model or tracker, in the order of their positions."""
     return [field for field in fields(kind) if field.init]  # type: ignore[arg-type]
 
 
@@ -34,7 +34,7 @@ def default(field: Field[Any]) -> str:
 
 
 def lookup(what: str, name: str, known: dict[str, type[Kind]]) -> type[Kind]:
-    """A class by its name, whatever its case, and with - or _ between words."""
+    """A class by its name, in upper or lower case, with - or _ between words."""
     plain = {key.lower(): kind for key, kind in known.items()}
     wanted = re.sub(r"[-_\s]", "", name).lower()
     if wanted not in plain:
@@ -43,12 +43,12 @@ def lookup(what: str, name: str, known: dict[str, type[Kind]]) -> type[Kind]:
 
 
 def listed(given: Sequence[str] | None) -> list[str]:
-    """Names that were repeated, or separated by commas."""
+    """Names that were given in several options, or separated by commas."""
     return [name.strip() for entry in given or [] for name in entry.split(",") if name.strip()]
 
 
 def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
-    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), for outputs of these names if they are several."""
+    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), with these names if there are several outputs."""
     name, _, rest = text.partition(":")
     kind = lookup("model", name, models.found())
     known = {field.name: field for field in given_fields(kind)}
@@ -83,7 +83,7 @@ def parse_units(given: Sequence[str] | None) -> dict[str, str]:
 
 
 def own_tracker(place: str) -> type[Tracker]:
-    """The class that ``module:Class`` names; modules of the present folder are found."""
+    """The class that ``module:Class`` names; modules in the current folder are found."""
     module, _, name = place.partition(":")
     if not module or not name:
         raise ValueError(f"--with {place}: name the module and the class, such as --with mine:MyTracker.")
@@ -95,7 +95,7 @@ def own_tracker(place: str) -> type[Tracker]:
 
 
 def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tracker:
-    """A tracker from its name, or its place in a module of the user's, and ``key=value`` settings."""
+    """A tracker from its name, or its place in a user's module, and ``key=value`` settings."""
     kind = own_tracker(own) if own else lookup("tracker", name, trackers.found())
     known = [field.name for field in given_fields(kind)]
     settings: dict[str, Any] = {}
@@ -113,7 +113,7 @@ def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tr
 
 
 def add_setting(where: str, settings: dict[str, Any], known: Any, key: str, value: Any) -> None:
-    """Note a setting once, under a name that exists."""
+    """Store a setting under an existing name; it may be given only once."""
     if key not in known:
         raise ValueError(f"{where}: there is no setting {key!r}; {near(key, known)}")
     if key in settings:
@@ -122,7 +122,7 @@ def add_setting(where: str, settings: dict[str, Any], known: Any, key: str, valu
 
 
 def build(where: str, kind: type[Kind], settings: dict[str, Any]) -> Kind:
-    """Construct a model or tracker; a value of the wrong kind is the user's to put right, and so is a missing one."""
+    """Construct a model or tracker; a wrong or missing value is reported as the user's error."""
     try:
         return kind(**settings)
     except TypeError as error:
@@ -130,7 +130,7 @@ def build(where: str, kind: type[Kind], settings: dict[str, Any]) -> Kind:
 
 
 def parse_value(text: str, separator: str) -> Any:
-    """A number, several with the separator between them, true, false, none, or text as it stands."""
+    """A number, several numbers with the separator between them, true, false, none, or otherwise the text itself."""
     words = {"none": None, "true": True, "false": False}
     text = text.strip()
     if text.lower() in words:

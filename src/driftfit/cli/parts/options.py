@@ -1,4 +1,4 @@
-"""What every command that reads data takes: files and columns, the part of them to use, the model and the tracker."""
+"""The options of every command that reads data: files and columns, which part of them to use, model and tracker."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Names = list[str] | None
 
 @dataclass(frozen=True)
 class Given:
-    """The options that commands share, as they were typed."""
+    """The options that commands share, as given on the command line."""
 
     file: Annotated[
         list[str],
@@ -41,7 +41,7 @@ class Given:
     model: Annotated[
         Names,
         typer.Option(
-            help="Model and its settings by place or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
+            help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
             "arx:2,2/1,nk=0/1; regression:intercept. Default: arx:2,2,intercept, without inputs arx:2,0,intercept."
         ),
     ] = None
@@ -53,11 +53,12 @@ class Given:
     ] = None
     time: Annotated[str | None, typer.Option(help="Column of the time: numbers or dates.")] = None
     by: Annotated[
-        Names, typer.Option(help="Column that tells the series of a fleet apart, or `file`; repeat it for several.")
+        Names, typer.Option(help="Column that identifies the series of a fleet, or `file`; repeat it for several.")
     ] = None
     unit: Annotated[Names, typer.Option(help="Unit of a column: flow=l/min; repeat it.")] = None
     own: Annotated[
-        str | None, typer.Option("--with", metavar="MODULE:CLASS", help="A tracker of your own, from a module here.")
+        str | None,
+        typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker, from a module in this folder."),
     ] = None
     dt: Annotated[
         str | None, typer.Option(help="Nominal interval: a number, or 10ms, 1s, 15min, 1h, 1d, 1w for dates.")
@@ -69,17 +70,18 @@ class Given:
         typer.Option(help="Rows to use of each file, counted from 1 after the header: 100:500, 100: or :500."),
     ] = None
     separator: Annotated[
-        str | None, typer.Option(help="What separates cells: , ; tab or another sign; found from the header otherwise.")
+        str | None,
+        typer.Option(help="Separator of cells: , ; tab or another character; by default detected from the header."),
     ] = None
     decimal: Annotated[str, typer.Option(help="Decimal sign of the numbers: . or ,")] = "."
     limits: Annotated[
         Names, typer.Option(help="Valid range of a column: flow=0:80, flow=0: or flow=:80; outside is missing.")
     ] = None
     exclude: Annotated[
-        Names, typer.Option(help="Stretch to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
+        Names, typer.Option(help="Interval to leave out: FROM..TO, in times, or in rows without --time; repeat it.")
     ] = None
     start: Annotated[
-        Path | None, typer.Option(help="Begin where a saved run (.npz) or live state ended; its model and tracker.")
+        Path | None, typer.Option(help="Continue from a saved run (.npz) or live state, with its model and tracker.")
     ] = None
 
     @property
@@ -101,7 +103,7 @@ class Given:
         """The models, each bound to the inputs."""
         default = [f"arx:2,{2 if self.inputs else 0},intercept"]
         found = [parse_model(text, self.outputs) for text in self.model or default]
-        several = len(found) > 1  # then one of them may leave the inputs out
+        several = len(found) > 1  # then one of them may have no inputs
         alone = [model.shared or (several and isinstance(model, ARX) and model.nb == 0) for model in found]
         return [model if one else model.bind(self.inputs) for model, one in zip(found, alone, strict=True)]
 
@@ -110,12 +112,12 @@ class Given:
         return parse_tracker(self.tracker, self.p or [], self.own)
 
     def part(self) -> Part:
-        """Which part of the files is used, and how it is read."""
+        """Which part of the files is used, and how the files are read."""
         names = [*self.outputs, *self.inputs]
         return Part.of(self.first, self.last, self.rows, self.separator, self.decimal, self.limits, self.exclude, names)
 
     def signals(self, rows: Rows | None = None) -> dict[str, Any]:
-        """What `track` takes beside model and tracker; ``rows`` are the data where they were read."""
+        """The arguments of `track` other than model and tracker; ``rows`` are the data if they were read already."""
         outputs = self.outputs
         if rows is None and (not self.part().whole or "-" in self.file):
             rows = self.read()
@@ -125,11 +127,11 @@ class Given:
         return signals | {"by": self.by or None, "dt": parse_interval(self.dt), "units": parse_units(self.unit) or None}
 
     def read(self, *more: str) -> Rows:
-        """The columns of the part that is used, and more of them."""
+        """Read the selected part of the columns, and of ``more`` columns."""
         return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
 
     def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
-        """The run that the options ask for: a Track, an Outputs or a fleet."""
+        """Run what the options describe: a Track, an Outputs or a fleet."""
         from driftfit.tracking import track
 
         model, chosen, before = self._begun()
@@ -139,7 +141,7 @@ class Given:
             return track(model, tracker or chosen, **signals, **more)
 
     def _begun(self) -> tuple[Model, Tracker, Any]:
-        """(model, tracker, the run to begin from, or None); those of the saved run where one is given."""
+        """(model, tracker, run to continue or None); all three come from the saved run if there is one."""
         models = self.models()
         if len(models) > 1:
             raise ValueError("--model: give one model; `driftfit select` compares several.")
@@ -153,7 +155,7 @@ class Given:
         return before.model, before.tracker, before
 
     def arrays(self) -> dict[str, Any]:
-        """One series in order of time, as `tune` and `select` take it."""
+        """One series sorted by time, in the form that `tune` and `select` take."""
         outputs = self.outputs
         if self.by or len(outputs) > 1 or self.start is not None:
             raise ValueError("this command takes one series of one output; leave out --by, --start and further --y.")
@@ -170,7 +172,7 @@ class Given:
 
 
 def saved(path: Path) -> Any:
-    """A run, or a live state, from a file."""
+    """Load a run, or the state of a stream, from a file."""
     from driftfit.results import Track
     from driftfit.streams import Live
 
@@ -183,7 +185,7 @@ def saved(path: Path) -> Any:
 
 
 def reads(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose first argument is what `Given` holds, with all its options on the command line."""
+    """Give a command whose first argument is a `Given` all its options on the command line."""
     hints = get_type_hints(Given, include_extras=True)
     shared = [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=_default(f), annotation=hints[f.name])

@@ -1,6 +1,6 @@
-"""The program: its name, where it prints, and how it says what a user got wrong.
+"""The program: its name, where it prints, and how it reports errors.
 
-What a user got wrong ends in one line on stderr and exit code 2; a traceback is always a fault of the program.
+A user's error prints one line on stderr and ends with exit code 2; a traceback is always a fault of the program.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from driftfit import __version__
 from driftfit.show.parts.text import WIDTH
 
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, help="Follow the parameters of a system while they change.",
+    no_args_is_help=True, add_completion=False, help="Track the parameters of a system while they change.",
     rich_markup_mode=None,
 )  # fmt: skip
 progress = Console(stderr=True)
 
 
 def _output() -> Console:
-    """Tables as wide as they are printed from Python, or as the terminal where that is narrower."""
+    """A console as wide as that of tables printed from Python, or as the terminal if that is narrower."""
     seen = Console()
     return Console(width=min(WIDTH, seen.width) if seen.is_terminal else WIDTH, highlight=False, soft_wrap=False)
 
@@ -32,18 +32,18 @@ out = _output()
 
 
 def say(what: Any, **options: Any) -> None:
-    """Print something as it is: names of parameters hold brackets, and nothing is cut."""
+    """Print text unchanged: names of parameters contain brackets, and nothing is cut off."""
     out.print(what, markup=False, crop=False, **options)
 
 
 def main() -> None:
-    """The program that the package installs."""
+    """Run the installed program."""
     app()
 
 
 @contextmanager
 def helpful() -> Iterator[None]:
-    """Turn what a user can put right into one line and exit code 2."""
+    """Turn errors that a user can correct into one line and exit code 2."""
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
@@ -57,7 +57,7 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(help="Follow the parameters of a system while they change.")
+@app.callback(help="Track the parameters of a system while they change.")
 def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and stop.")

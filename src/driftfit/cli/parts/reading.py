@@ -1,7 +1,7 @@
-"""Parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and stretches left out.
+"""Read parts of files: ranges of rows and times, decimal commas, separators, stdin; valid ranges and exclusions.
 
-Rows are counted from 1 after the header, as in messages about cells, and ranges hold both their ends. Valid ranges and
-stretches are handed on as they are (`driftfit.data.limits`).
+Rows are counted from 1 after the header, as in messages about cells, and ranges include both ends. Valid ranges and
+intervals are passed on unchanged (`driftfit.data.limits`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Part:
-    """What is used of the files, and how they are read."""
+    """Which part of the files is used, and how they are read."""
 
     first: str | None = None
     last: str | None = None
@@ -41,7 +41,7 @@ class Part:
         cls, first: str | None, last: str | None, rows: str | None, separator: str | None, decimal: str,
         limits: Sequence[str] | None, exclude: Sequence[str] | None, names: Sequence[str],
     ) -> Part:  # fmt: skip
-        """From what was typed."""
+        """From the options of the command line."""
         if decimal not in (".", ","):
             raise ValueError(f"--decimal {decimal}: the decimal sign must be a point or a comma.")
         sign = "\t" if separator in ("tab", "\\t") else separator
@@ -52,11 +52,11 @@ class Part:
 
     @property
     def whole(self) -> bool:
-        """Whether the files are read as they are."""
+        """Whether the files are read without any restriction."""
         return self == Part(limits=self.limits, exclude=self.exclude)
 
     def restrictions(self, timed: bool) -> dict[str, Any]:
-        """limits= and exclude= of `track`; without time stretches are rows, which it numbers from 0."""
+        """limits= and exclude= of `track`; without time, intervals are rows, which `track` numbers from 0."""
         exclude: list[tuple[Any, Any]] = list(self.exclude)
         if not timed:
             exclude = [(self._sample(first), self._sample(last)) for first, last in self.exclude]
@@ -70,7 +70,7 @@ class Part:
 
 
 class Rows(NamedTuple):
-    """The chosen rows of all files: numbers (N,), times (N,) or None, and the columns that tell series apart."""
+    """The selected rows of all files: numbers (N,), times (N,) or None, and the columns that identify the series."""
 
     numbers: dict[str, Array]
     time: Array | None
@@ -78,7 +78,7 @@ class Rows(NamedTuple):
     by: list[list[Any]]
 
     def table(self, time: str | None, by: Sequence[str]) -> pl.DataFrame:
-        """As a table that `track` reads."""
+        """The rows as a table that `track` reads."""
         columns: dict[str, Any] = dict(self.numbers)
         if time is not None and self.time is not None:
             columns[time] = self.time
@@ -88,7 +88,7 @@ class Rows(NamedTuple):
         return table
 
     def order(self) -> Array:
-        """Rows that become samples of a single series: in order of time, and of rows at one time the first."""
+        """Indices of the rows of a single series, sorted by time, with the first of several rows at the same time."""
         if self.time is None:
             return np.arange(len(next(iter(self.numbers.values()))))
         order = np.argsort(self.time, kind="stable")
@@ -114,7 +114,7 @@ def _limits(entry: str, names: Sequence[str]) -> tuple[str, Range]:
 
 
 def stretch(entry: str, option: str = "--exclude") -> tuple[str, str]:
-    """``2024-03-01..2024-03-04`` as its ends."""
+    """``2024-03-01..2024-03-04`` as a pair of ends."""
     first, dots, last = entry.partition("..")
     if not (dots and first.strip() and last.strip()):
         raise ValueError(f"{option} {entry}: give an interval as FROM..TO, such as {option} 2024-03-01..2024-03-04.")
@@ -136,7 +136,7 @@ def _rows(text: str | None) -> tuple[int, int | None]:
 
 
 def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Sequence[str], part: Part) -> Rows:
-    """Read columns of files, in the order of the files."""
+    """Read columns of several files in the order of the files."""
     if (part.first or part.last) and time is None:
         raise ValueError("--from and --to are times, so they need --time; rows are chosen with --rows.")
     wanted = Wanted(tuple(dict.fromkeys(names)), time, tuple(by))
@@ -153,7 +153,7 @@ def rows_of(files: Sequence[str], names: Sequence[str], time: str | None, by: Se
 
 
 def _one(path: str, wanted: Wanted, part: Part) -> Columns:
-    """The chosen rows of one file."""
+    """The selected rows of one file."""
     where = "stdin" if path == "-" else path
     frame = _frame(path, where, part)
     if FILE in wanted.by and FILE not in frame.columns:
@@ -169,7 +169,7 @@ def _one(path: str, wanted: Wanted, part: Part) -> Columns:
 
 
 def _frame(path: str, where: str, part: Part) -> pl.DataFrame:
-    """A file as a table; cells of CSV as text."""
+    """A file as a table; cells of CSV are text."""
     try:
         with open(path, "rb") if path != "-" else sys.stdin.buffer as file:
             data = file.read()
@@ -184,7 +184,7 @@ def _frame(path: str, where: str, part: Part) -> pl.DataFrame:
 
 
 def _points(frame: pl.DataFrame, wanted: Wanted) -> list[pl.Series]:
-    """Columns of numbers with a point for the comma; a point that groups thousands goes."""
+    """Number columns with a decimal point instead of a comma; points that group thousands are removed."""
     text = [name for name in wanted.names if name in frame.columns and frame[name].dtype == pl.String]
     number = r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*)(,\d*)?([eE][+-]?\d+)?\s*$"
     made = []
@@ -196,7 +196,7 @@ def _points(frame: pl.DataFrame, wanted: Wanted) -> list[pl.Series]:
 
 
 def _between(rows: Rows, part: Part) -> Rows:
-    """The rows between the first and last time."""
+    """The rows between the first and the last time."""
     if rows.time is None or (part.first is None and part.last is None):
         return rows
     axis = rows.time
@@ -212,7 +212,7 @@ def _between(rows: Rows, part: Part) -> Rows:
 
 
 def moment(text: str, axis: Array, zone: str | None, end: bool = False) -> Any:
-    """A time as typed, of the kind of ``axis``: a number, or a date in its zone; ``end``: the last instant of a day."""
+    """A time from text, of the kind of ``axis``: a number, or a date in its zone; ``end``: its day's last instant."""
     if axis.dtype.kind != "M":
         try:
             return float(text)

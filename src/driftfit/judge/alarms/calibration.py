@@ -1,16 +1,16 @@
-"""Limits by simulation: records like one that was seen, but with parameters that stay.
+"""Limits by simulation: records like the observed one, but with constant parameters.
 
     y*_t = phi*_t' theta + v_t,     v drawn from the residuals of the run
 
-phi* holds the lags of y* itself and the inputs that were recorded; each record is tracked by the tracker of the run.
-A residual is y_t - phi_t' theta_s with s = t - 1 or s = t + LATER, whichever is smaller: an innovation that is large
-because the tracker was mistaken for a moment (a change that it saw where there was none) is no noise, and would be
-drawn again and again. The v are scaled so that innovations of a simulated record are as large as those that were seen.
-Both scales leave the tails out, and both of the simulated ones are of the same draws, so that the factor is known to a
-fraction of a percent: a tracker that is given r sees many more changes in noise that is a few percent larger.
+phi* contains the lags of y* itself and the recorded inputs; each record is tracked by the tracker of the run. A
+residual is y_t - phi_t' theta_s with s = t - 1 or s = t + LATER, whichever is smaller: an innovation that is large
+because the tracker was temporarily wrong (for example after a false change) is not noise, and would otherwise be drawn
+again and again. The v are scaled so that innovations of a simulated record are as large as the observed ones. Both
+scales disregard the tails, and both simulated ones use the same draws, so the factor is known to a fraction of a
+percent: a tracker with a given r detects many more changes in noise that is a few percent larger.
 
-The limit is the number that the statistic begins to exceed once in ``every`` samples. It is read off TIMES alarms, so
-that the rate is known to about 1 / sqrt(TIMES).
+The limit is the number that the statistic begins to exceed once in ``every`` samples. It is estimated from TIMES
+alarms, so the rate is known to about 1 / sqrt(TIMES).
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from driftfit.use.simulate import input_regressors
 TIMES = 50.0
 """Expected false alarms in all simulated records together."""
 MOST = 4000
-"""Records at the most."""
+"""Largest number of records."""
 STEPS = 6
-"""Halvings of the interval in which the rate of one of several columns is looked for."""
+"""Bisections of the interval in which the rate of one of several columns is searched."""
 LATER = 10
-"""Samples after which a tracker knows better what it saw."""
+"""Number of samples after which the tracker has recovered from an error."""
 
 
 def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track]:
@@ -56,7 +56,7 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
         return v, run.again(_played(theta, na, U, noise * v))
 
     v, made = played()
-    # innovations are larger than noise, by what the parameters add to them: scale until they are as large as those seen
+    # innovations exceed the noise by the part due to the parameters: scale until they are as large as the observed ones
     larger = core(innovations(made)) / core(v)
     pool = pool * float(np.clip(np.sqrt(core(innovations(run)) / (core(pool) * larger)), 0.2, 5.0))
     for _ in range(min(MOST, int(np.ceil(TIMES * every / len(run))))):
@@ -64,13 +64,13 @@ def null_records(run: Track, every: float, at: int, seed: int) -> Iterator[Track
 
 
 def innovations(run: Track) -> Array:
-    """Innovations after the start, at weight 1."""
+    """Innovations after the start, scaled to weight 1."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return _later(run, run.innovation / np.sqrt(run.known.noise))
 
 
 def residuals(run: Track, na: int, U: Array) -> Array:
-    """What the parameters just before or a little later leave of the outputs, the smaller of both, at weight 1."""
+    """Residuals with the parameters just before or a little later, the smaller of both, scaled to weight 1."""
     y = np.where(np.abs(run.y) < LARGEST, run.y, np.nan)
     phi = np.column_stack([*(moved(y, i + 1) for i in range(na)), U])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -81,7 +81,7 @@ def residuals(run: Track, na: int, U: Array) -> Array:
 
 
 def _later(run: Track, e: Array) -> Array:
-    """The finite ones after the start."""
+    """The finite values after the start."""
     e = e[min(burn_in(run.model.n), len(run) // 2) :]
     e = e[np.isfinite(e)]
     if len(e) < 20:
@@ -98,7 +98,7 @@ def _played(theta: Array, na: int, U: Array, e: Array) -> Array:
 
 
 def _last_known(U: Array) -> Array:
-    """Inputs with gaps filled by what stood before them."""
+    """Inputs with gaps filled by the previous value."""
     place = np.maximum.accumulate(np.where(np.isfinite(U).all(axis=1), np.arange(len(U)), 0))
     return np.where(np.isfinite(U[place]), U[place], 0.0)
 
@@ -106,8 +106,8 @@ def _last_known(U: Array) -> Array:
 def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     """Limits (c,) that the columns of the statistics together begin to exceed once in ``every`` samples.
 
-    ``made``: (statistic (T, c), first sample judged) of records. Columns have the same rate, and as much of it as they
-    can have together: those that exceed at the same time begin one alarm.
+    ``made`` contains (statistic (T, c), first sample judged) of records. All columns have the same rate, which is the
+    largest possible one: columns that exceed at the same time begin only one alarm.
     """
     parts = [np.where(np.isfinite(part), part, -np.inf) for part in (statistic[start:] for statistic, start in made)]
     allowed = sum(len(part) for part in parts) / every
@@ -127,10 +127,10 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
 
 
 def _begun(series: Sequence[Array]) -> tuple[Array, Array]:
-    """(limits, how often each is begun to be exceeded), for every limit that makes a difference.
+    """(limits, number of onsets over each), for every limit that makes a difference.
 
-    A step from a to b > a begins to exceed the limits c with a <= c < b, so that the number at c is that of the a up to
-    it less that of the b up to it.
+    A step from a to b > a is an onset over the limits c with a <= c < b, so the number at c is that of the a up to c
+    minus that of the b up to c.
     """
     before = np.concatenate([np.concatenate([[-np.inf], values[:-1]]) for values in series])
     after = np.concatenate(list(series))
@@ -141,9 +141,9 @@ def _begun(series: Sequence[Array]) -> tuple[Array, Array]:
 
 
 def _least(limits: Array, begun: Array, allowed: float) -> float:
-    """The least limit from which upwards no limit is begun to be exceeded more than ``allowed`` times.
+    """The smallest limit from which upwards no limit has more than ``allowed`` onsets.
 
-    The number grows and falls again as the limit comes down, when what is normal exceeds it: the search is from above.
+    As the limit decreases, the number grows and falls again once normal values exceed it: the search is from above.
     """
     often = np.flatnonzero(begun > allowed)
     return float(limits[min(often[-1] + 1, len(limits) - 1)] if len(often) else limits[0])

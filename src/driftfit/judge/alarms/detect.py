@@ -1,4 +1,4 @@
-"""Detect: alarms from a run, with a rate of false alarms that is set and not tuned.
+"""Detect: alarms from a run, at a set rate of false alarms.
 
     "band"          a parameter has left its reference band:      max((theta - high) / std, (low - theta) / std) > z
     "innovation"    the last W innovations are too large, or too one-sided, for what the run expects
@@ -8,26 +8,26 @@
 
 * band: z such that a Gaussian sequence begins to exceed it once in ``every`` times c samples, for c parameters watched.
   Successive errors of an estimate have the correlation 1 / (1 + d), d = mean (theta_t - theta_(t-1))^2 / var_t, since
-  a step of the filter has the variance that it takes away. The rate holds for a parameter that stands at the very edge
-  of its band, where the run's std is right; inside the band alarms are rarer.
+  a step of the filter has the variance that it removes. The rate holds for a parameter at the very edge of its band, if
+  the run's std is correct; inside the band alarms are rarer.
 * innovation: g = e / s; limits of the windowed sums of g^2 and of g from their exact rate of onsets
   (`driftfit.judge.alarms.onsets`), half of the rate for each. With ``reference`` the g are normal scores of the
-  innovations among those of the reference, so that outliers and tails that were normal there are normal later.
-* probability: the limit is found by simulation. Records with constant parameters are made from the run (its inputs,
-  its parameters at ``at``, its innovations redrawn) and tracked; the limit is exceeded by onsets at the
-  rate asked for. Any kind can be calibrated so, with ``calibrate=True``: it is slower, and does not lean on the std.
+  innovations among those of the reference, so that outliers and tails that were normal there count as normal later.
+* probability: the limit is found by simulation. Records with constant parameters are simulated from the run (its
+  inputs, its parameters at ``at``, its innovations redrawn) and tracked; onsets exceed the limit at the given rate. Any
+  kind can be calibrated in this way, with ``calibrate=True``: it is slower, and does not rely on the std.
 
 What was found stands in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
 watches a stream by it, and ``other.detect(said.rule)`` another record.
 
-Which kind when: docs/alarms.md. A tracker that finds its own drift follows a fault, and takes it for drift: its
-innovations are soon normal again, so that "innovation" rings, if at all, in the first samples of the fault.
+docs/alarms.md says which kind to use. A tracker that estimates its own drift mistakes a fault for drift and follows it:
+its innovations are soon normal again, so "innovation" gives an alarm, if at all, in the first samples of the fault.
 
-``p`` is the chance that a record without a fault gets as extreme as this one: from the same rates (the least of the
-columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
+``p`` is the probability that a record without a fault is as extreme as this one: from the same rates (the smallest of
+the columns, 1 - P(first within) exp(-samples rate), times their number), or the share of the simulated records.
 
-Nothing looks ahead of an alarm but the calibration. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many
-runs as 50 every / T for a calibration.
+Only the calibration looks ahead. Verified by ``benchmarks/alarm_rates.py``. Cost: O(T), and as many runs as
+50 every / T for a calibration.
 """
 
 from __future__ import annotations
@@ -57,38 +57,38 @@ if TYPE_CHECKING:
 
 
 class Score(NamedTuple):
-    """Alarms against labels of what was wrong."""
+    """Alarms compared with labels of faults."""
 
     events: int
-    """Stretches of samples with a true label."""
+    """Intervals of samples with a true label."""
     found: int
-    """Stretches in which an alarm began."""
+    """Intervals in which an alarm began."""
     delay: float
-    """Median samples from the beginning of a found stretch to its first alarm."""
+    """Median number of samples from the beginning of such an interval to its first alarm."""
     false: int
-    """Alarms that began outside all stretches, also those that were still on when the next one began."""
+    """Alarms that began outside all intervals, even if they were still on when the next interval began."""
     normal: int
-    """Samples outside all stretches that were judged."""
+    """Judged samples outside all intervals."""
 
 
 @dataclass(frozen=True)
 class Alarms(Printed):
-    """What `Track.detect` returns; printing it shows a table.
+    """The result of `Track.detect`; printing it shows a table.
 
     Attributes
     ----------
     rule : AlarmRule
         What is compared with which limits; `Live.detect` takes it, and `Track.detect` of other runs.
     active : (T,) bool
-        An alarm is on.
+        Whether an alarm is on.
     onsets : (k,) int
-        Samples at which one begins.
+        Samples at which an alarm begins.
     statistic : (T, c)
-        What is compared; NaN where there is nothing to judge.
+        The statistics that are compared; NaN where there is nothing to judge.
     start : int
-        First sample that is judged; what comes before is the start of the run, or the reference.
+        First sample that is judged; the samples before it are the start of the run, or the reference.
     p : number
-        Chance of an extreme like the largest here without a fault; NaN where nothing was judged.
+        Probability of an extreme like the largest here without a fault; NaN if nothing was judged.
     """
 
     rule: AlarmRule
@@ -111,12 +111,12 @@ class Alarms(Printed):
 
     @property
     def limits(self) -> Array:
-        """What the columns are compared with, (c,)."""
+        """The limits of the columns, (c,)."""
         return np.array(self.rule.limits)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the columns are: parameters, "power" and "mean" of the innovations, or "probability"."""
+        """Names of the columns: parameters, "power" and "mean" of the innovations, or "probability"."""
         return self.rule.names
 
     def cause(self, t: int) -> str:
@@ -189,39 +189,39 @@ def detect(
 
     Parameters
     ----------
-    run : Track
-        What is watched.
+        The run to be watched.
     kind : "band", "innovation" or "probability", or an AlarmRule
-        See the module. A rule, ``said.rule`` of another run, brings limits and settings with it.
+        See the module. A rule, ``alarms.rule`` of another run, contains its limits and settings.
     every : number
         Samples in which one false alarm may begin.
     reference : mapping from names to (low, high), a number of samples, or (from, to)
-        For "band": where the parameters belong; or a stretch of the record, whose range after the start of the run is
-        the band. For "innovation": a stretch that is normal. A stretch is so many first samples, or from one time up to
-        but not including another: dates where the record has them, numbers as in ``run.time`` (without times:
-        samples). It is not judged, nor is what comes before it.
+        For "band": the normal range of the parameters, or a segment of the record, whose range after the start of the
+        run is the band. For "innovation": a segment that is normal. A segment is a number of first samples, or an
+        interval of time without its end: dates if the record has them, otherwise numbers as in ``run.time`` (without
+        times: samples). Neither the segment nor what comes before it is judged.
     window : int
         Samples in the sums of "innovation", at least 4.
     hold : int
-        An alarm stays on for so many samples after what caused it.
+        Number of samples for which an alarm stays on after its cause.
     calibrate : bool
         Find the limits by simulation from the run instead of from theory ("probability" always does).
     at : int
-        The sample whose parameters are true in that simulation.
+        The sample whose parameters are the true ones in that simulation.
     seed : int
-        Of that simulation.
+        Seed of that simulation.
     start : int or None
+        With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
         With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
 
     Warns
     -----
     UserWarning
-        For "innovation" of a tracker that finds its own drift (`AdaptiveKalman`), which follows a fault away.
+        For "innovation" with a tracker that estimates its own drift (`AdaptiveKalman`) and therefore follows a fault.
 
     Raises
     ------
     ValueError
-        For a kind that is unknown, a reference that does not fit, or a tracker that has not what the kind needs.
+        For an unknown kind, a reference that does not fit, or a tracker that does not support the kind.
     """
     if not isinstance(run, Track):
         raise TypeError(f"detect: the run comes first, as in detect(run, 'band'); got {run!r}.")
@@ -261,13 +261,13 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
 
 
 def _highest(statistic: Array, start: int) -> Array:
-    """The largest value of each column, (c,), over the samples that are judged; -inf where there is none."""
+    """The largest value of each column, (c,), over the judged samples; -inf if there is none."""
     part = statistic[start:]
     return np.asarray(np.max(np.where(np.isfinite(part), part, -np.inf), axis=0, initial=-np.inf))
 
 
 def _warn_of_following(run: Track) -> None:
-    """Say that the innovations of a tracker that adapts are normal again soon after a fault."""
+    """Warn that the innovations of a tracker that adapts are normal again soon after a fault."""
     warnings.warn(
         f"detect: {type(run.tracker).__name__} estimates its own drift and noise, so it follows a fault: its "
         "innovations are soon normal again, and a slow fault is hardly visible in them. Watch the parameters with "

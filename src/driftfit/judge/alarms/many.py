@@ -1,21 +1,18 @@
-"""Alarms of many runs at once: a fleet, or the outputs of one record; see `driftfit.judge.alarms.detect` for those of
-one.
+"""Alarms of many runs at once: a fleet, or the outputs of one record; `driftfit.judge.alarms.detect` treats one run.
 
-N series side by side, each with one false alarm in ``every`` samples, ring N times in that time. Here ``every`` is of
-all of them together: each gets one in N every samples. Rates add up whatever the series have in common, so that this
-needs no independence.
+N series, each with one false alarm in ``every`` samples, together give N alarms in that time. Here ``every`` refers to
+all of them together: each gets one alarm in N every samples. Rates add up whether or not the series are independent.
 
-An alarm says when. Which series had something at all is a question of its own, answered once the records are over:
-every series has the chance p that a record without a fault gets as extreme as it did (`Alarms.p`), and
+An alarm says when. Which series had a fault is a separate question for the complete records: `Alarms.p` is the
+probability that a record without a fault is as extreme as this one, and
 
     q_(k) = min over j >= k of  p_(j) N / j         (p in ascending order)
 
-is below ``level`` for the series in ``faulty``, of which at most that share is without a fault on average, for series
-that are independent or positively dependent. A series can have an alarm and not be among them, and the other way
-round.
+is below ``level`` for the series in ``faulty``. On average at most that share of them has no fault, if the series are
+independent or positively dependent. A series can have an alarm and not be among them, and vice versa.
 
-Source: Benjamini and Hochberg (1995). Cost: that of `detect` for each run; limits by simulation take as many records as
-N every asks for, N times.
+Source: Benjamini and Hochberg (1995). Cost: that of `detect` for each run; limits by simulation need records for
+N every samples, N times.
 """
 
 from __future__ import annotations
@@ -41,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Watch:
-    """One series among many: its alarms, its q-value, and whether it is said to have had something."""
+    """One series among many: its alarms, its q-value, and whether it is reported as faulty."""
 
     key: Hashable
     alarms: Alarms
@@ -50,7 +47,7 @@ class Watch:
 
     @property
     def first(self) -> str:
-        """The beginning of its first alarm, and the cause; empty without one."""
+        """The beginning of its first alarm and the cause; empty if there is none."""
         if not len(self.alarms.onsets):
             return ""
         t = int(self.alarms.onsets[0])
@@ -59,18 +56,18 @@ class Watch:
 
 @dataclass(frozen=True)
 class ManyAlarms(Printed):
-    """What `detect` of a fleet returns; printing it shows the twenty most extreme series.
+    """The result of `detect` for a fleet; printing it shows the twenty most extreme series.
 
     Attributes
     ----------
     rows : tuple of Watch
-        The most extreme first; those with nothing judged last.
+        Sorted by how extreme they are; series without judged samples come last.
     every : float
         Samples in which one false alarm may begin, in all series together.
     level : float
         False discovery rate.
     failed : dict
-        Why some could not be judged.
+        Reasons why some could not be judged.
     """
 
     rows: tuple[Watch, ...]
@@ -90,7 +87,7 @@ class ManyAlarms(Printed):
 
     @property
     def faulty(self) -> tuple[Hashable, ...]:
-        """Keys of the series that had something."""
+        """Keys of the series with a fault."""
         return tuple(row.key for row in self.rows if row.faulty)
 
     @property
@@ -100,12 +97,12 @@ class ManyAlarms(Printed):
 
     @property
     def expected(self) -> float:
-        """False alarms expected in all series together, were none faulty."""
+        """Expected number of false alarms in all series together, if none had a fault."""
         return float(sum((len(row.alarms.active) - row.alarms.start) / row.alarms.every for row in self.rows))
 
     @property
     def table(self) -> Any:
-        """One row an alarm, as a polars table."""
+        """One row per alarm, as a polars table."""
         import polars
 
         columns: dict[str, list[Any]] = {name: [] for name in ("key", "from", "to", "cause", "p", "q", "faulty")}
@@ -141,7 +138,7 @@ class ManyAlarms(Printed):
 def alarms(
     runs: Mapping[Hashable, Track], kind: str, *, every: float, level: float, reference: Any, **settings: Any
 ) -> ManyAlarms:
-    """Watch runs by key; ``reference`` is one for all, or a mapping from every key to its own."""
+    """Watch runs by key; ``reference`` is the same for all, or a mapping from every key to its own."""
     from driftfit.run.fleet import cores
 
     if not runs:

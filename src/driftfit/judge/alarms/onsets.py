@@ -1,7 +1,7 @@
-"""Limits of windowed sums for a rate of false alarms that is exact, and how often something begins.
+"""Limits of windowed sums for an exact rate of false alarms, counted by onsets.
 
-A sum over the last W samples of g_t^2 (or of g_t), g_t ~ N(0, 1) and independent, begins to exceed a limit c where it
-was below a sample before. Of the two sums W - 1 terms are the same, X, and one is exchanged, so that
+A sum over the last W samples of g_t^2 (or of g_t), g_t ~ N(0, 1) and independent, begins to exceed a limit c if it
+was below c one sample before. The two sums share W - 1 terms, X, and differ in one, so that
 
     P(begins) = E [ P(X + old <= c) P(X + new > c) ],     X ~ chi2(W - 1), old and new ~ chi2(1)
 
@@ -12,11 +12,11 @@ The same for one Gaussian sequence z with variance 1 and correlation rho from on
 
     P(begins) = P(z_(t-1) <= c, z_t > c) = E [ 1(x <= c) P(rho x + sqrt(1 - rho^2) w > c) ],    x, w ~ N(0, 1)
 
-The chance that J samples exceed c at all is that the first does or something begins in one of the others,
+The probability that any of J samples exceeds c is that the first does, or that an onset occurs later,
 
     1 - P(z_1 <= c) exp(-J P(begins)),
 
-or less, as onsets over a limit come in clusters (sums of 20 squares: 15 % where 10 % of the records do).
+or less, because onsets over a limit occur in clusters (for sums of 20 squares: 15 % instead of 10 % of the records).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Rate = Callable[[float], float]
 
 @lru_cache
 def power_rate(W: int) -> tuple[Rate, float, float]:
-    """(P(begins), where limits start, where they end) of the sum of W squares, W at least 4."""
+    """(P(begins), lower end, upper end of the limits) for the sum of W squares, W at least 4."""
     top = W + 20.0 * np.sqrt(2.0 * W) + 60.0
     grid = np.linspace(0.0, top, NODES)
     weight = np.exp(special.xlogy(0.5 * (W - 1) - 1.0, grid / W) - 0.5 * (grid - W))
@@ -53,7 +53,7 @@ def power_rate(W: int) -> tuple[Rate, float, float]:
 
 @lru_cache
 def mean_rate(W: int) -> tuple[Rate, float, float]:
-    """The same of the absolute sum of W terms, W at least 2."""
+    """The same for the absolute sum of W terms, W at least 2."""
     units = np.linspace(-10.0, 10.0, NODES)
     grid, weight = units * np.sqrt(W - 1), np.exp(-0.5 * units**2)
     weight /= weight.sum()
@@ -66,12 +66,12 @@ def mean_rate(W: int) -> tuple[Rate, float, float]:
 
 
 def normal_rate(rho: float) -> tuple[Rate, float, float]:
-    """The same of z of variance 1 whose neighbours have the correlation ``rho``, 0 <= rho < 1."""
+    """The same for z of variance 1 whose neighbours have the correlation ``rho``, 0 <= rho < 1."""
     rho = min(rho, 1.0 - 1e-9)
     spread = np.sqrt(1.0 - rho * rho)
 
     def begins(c: float) -> float:
-        # most of what is about to exceed the limit is within a few spreads of it
+        # most values that are about to exceed the limit are within a few standard deviations of it
         x = np.unique(np.concatenate([np.linspace(-9.0, c, NODES), c - spread * np.linspace(0.0, 9.0, NODES)]))
         inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * special.ndtr((rho * x - c) / spread)
         return float(np.trapezoid(inside, x))
@@ -97,7 +97,7 @@ def normal_limit(rho: float, every: float) -> float:
 
 
 def chance(rate: tuple[Rate, float, float], highest: float, beyond: float, J: int) -> float:
-    """Chance that the highest of J samples is ``highest`` or more; one sample is with the chance ``beyond``."""
+    """Probability that the highest of J samples is ``highest`` or more; ``beyond`` is that of one sample."""
     begins, start, _ = rate
     return float(1.0 - (1.0 - beyond) * np.exp(-J * begins(max(highest, start))))
 
@@ -113,13 +113,13 @@ def _solve(begins: Rate, start: float, high: float, every: float) -> float:
 
 
 def onsets(active: Array) -> Array:
-    """Samples at which something begins, given whether it holds (T,)."""
+    """Samples at which an alarm begins, from whether it is on (T,)."""
     before = np.concatenate([[False], active[:-1]])
     return np.flatnonzero(active & ~before)
 
 
 def held(active: Array, hold: int) -> Array:
-    """Alarms that stay on for ``hold`` samples after what caused them."""
+    """Keep alarms on for ``hold`` samples after their cause."""
     if hold == 0:
         return active
     last = np.maximum.accumulate(np.where(active, np.arange(len(active)), -hold - 1))

@@ -1,4 +1,4 @@
-"""The stretch of a record that is normal: given as a number of first samples, or from one time to another."""
+"""The reference of an alarm, a normal segment of a record: a number of first samples, or an interval of time."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 LEAST = 20
-"""Samples that a reference must have after the start of the run."""
+"""Smallest number of samples of a reference after the start of the run."""
 
 
 def burn(run: Track) -> int:
-    """Samples at the beginning of a run that judge nothing: an estimate that has just begun is no alarm."""
+    """Number of samples at the beginning of a run that are not judged, because its estimate has just started."""
     return burn_in(run.model.n)
 
 
 def in_samples(run: Track, reference: Any) -> Any:
-    """A reference from one time to another as one in samples; any other as it is."""
+    """A reference given as an interval of time, converted to samples; any other is returned unchanged."""
     if isinstance(reference, tuple | list) and len(reference) == 2:
         return tuple(_place(run, one) for one in reference)
     return reference
 
 
 def stretch(run: Track, reference: Any) -> tuple[int, int]:
-    """(first, end) of the samples that are normal, without the start of the run; ValueError where they are too few.
+    """(first, end) of the normal samples, without the start of the run; ValueError if there are too few.
 
-    ``reference`` is a number of first samples, or (from, to) in samples, up to but not including the last.
+    ``reference`` is a number of first samples, or (from, to) in samples, without the last.
     """
     if isinstance(reference, tuple) and len(reference) == 2:
         first, end = reference
@@ -54,7 +54,7 @@ def stretch(run: Track, reference: Any) -> tuple[int, int]:
 
 
 def _place(run: Track, given: Any) -> int:
-    """The first sample that is not before a time, or a sample number."""
+    """The first sample at or after a time, or a sample number."""
     time = run.time
     if time.dtype.kind != "M":
         if isinstance(given, str | datetime | np.datetime64):
@@ -66,7 +66,7 @@ def _place(run: Track, given: Any) -> int:
 
 
 def as_date(given: Any, zone: str | None) -> np.datetime64:
-    """A date as the time of a record: one without a time zone is in that of the table that the record came from."""
+    """A date as a time of the record; one without a time zone is in that of the table that the record came from."""
     try:
         date = given if isinstance(given, np.datetime64) else datetime.fromisoformat(str(given))
     except ValueError:

@@ -1,5 +1,5 @@
-"""What the alarms of `driftfit.judge.alarms.detect` look at in a run, the limits that theory gives, and the chance of
-an extreme.
+"""The statistics of the alarms of `driftfit.judge.alarms.detect` for a run, their limits by theory, and the probability
+of an extreme.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from driftfit.trackers.bank.results.results import Hypotheses
 Reference = Mapping[str, tuple[float, float]] | tuple[Any, Any] | int | None
 
 Chance = Callable[[Array, int], float]
-"""Chance that a record without a fault reaches these highest values (c,) in so many samples."""
+"""Probability that a record without a fault reaches these highest values (c,) in a given number of samples."""
 
 
 def rule_of(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
@@ -38,7 +38,7 @@ def rule_of(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRul
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
-    """Bands that were given, or the range of the parameters in the reference."""
+    """The given bands, or the range of the parameters in the reference."""
     if isinstance(reference, Mapping):
         names, (low, high), known, start = tuple(reference), _edges(reference), slice(burn(run), None), burn(run)
     else:
@@ -75,7 +75,7 @@ def _alike(run: Track, rule: AlarmRule, part: slice) -> Array:
 
 
 def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
-    """What is normal: standard normal, or as the innovations of the reference are distributed."""
+    """The normal distribution of innovations: standard normal, or that of the reference."""
     rule, start = replace(rule, names=("power", "mean")), burn(run)
     check_fits(rule, run.tracker, run.names)
     if isinstance(reference, Mapping):
@@ -92,14 +92,14 @@ def _innovation(run: Track, rule: AlarmRule, reference: Reference) -> tuple[Alar
 
 
 def _probability(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
-    """No theory gives a limit: it is found by simulation."""
+    """No theory gives a limit, so it is found by simulation."""
     rule = replace(rule, names=("probability",), limits=(1.0,))
     check_fits(rule, run.tracker, run.names)
     return rule, burn(run)
 
 
 def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
-    """What the rule compares, (T, c), NaN where there is nothing to judge."""
+    """The statistics that the rule compares, (T, c), NaN where there is nothing to judge."""
     if rule.kind == "band":
         columns = rule.columns(run.names)
         return rule.outside(run.theta[:, columns], run.std[:, columns])
@@ -115,13 +115,13 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
 
 
 def _carried(statistic: Array) -> Array:
-    """The last statistic, where there is no new sample."""
+    """Repeat the last statistic where there is no new sample."""
     place = np.maximum.accumulate(np.where(np.isfinite(statistic[:, 0]), np.arange(len(statistic)), -1))
     return np.where((place >= 0)[:, None], statistic[place], np.nan)
 
 
 def chance_of(run: Track, rule: AlarmRule) -> Chance:
-    """The chance of an extreme by theory; of probabilities and simulated limits there is none, and it is NaN."""
+    """The probability of an extreme by theory; NaN for probabilities and simulated limits, which have no theory."""
     if rule.simulated or rule.kind == "probability":
         return lambda highest, J: float("nan")
     if rule.kind == "band":

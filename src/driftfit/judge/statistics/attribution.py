@@ -1,16 +1,16 @@
-"""Which parameters move, once it is known that some do: steps are explained one after the other.
+"""Which parameters move, if some do: changes are explained by steps, one at a time.
 
-    1. of the parameters whose own path rejects constancy (Holm's correction), take the one of which a step near the
-       furthest point of its path explains most of y, outliers held
-    2. give it that step: one more regressor, phi_i from that sample on
-    3. test again; until no parameter rejects, or MOST steps are there
+    1. among the parameters whose own path rejects constancy (Holm's correction), choose the one for which a step near
+       the extreme point of its path explains most of y, with outliers limited
+    2. add that step: one more regressor, phi_i from that sample on
+    3. test again, until no parameter rejects or MOST steps are found
 
-A large move of one parameter changes the regressors of an ARX model and its residuals, and makes the paths of others
-look moved too; once the step is in the regression those are still again. A slow drift takes several steps of the same
-parameter, a passing fault two that go back. What is reported is the value before the first step, the one that is
-furthest from it in units of its standard error, and the last. A parameter whose furthest value is within the error of
-the first is not named, whatever its path says. Bai and Perron (1998) estimate several breaks in all parameters that
-way, one after the other; here each step belongs to one parameter.
+A large change of one parameter alters the regressors of an ARX model and its residuals, so the paths of other
+parameters seem to change too; once the step is in the regression they no longer do. A slow drift takes several steps of
+the same parameter, a temporary fault two steps that return. The result contains the value before the first step, the
+value furthest from it in units of its standard error, and the last value. A parameter whose furthest value is within
+the error of the first is not named. Bai and Perron (1998) estimate several breaks in all parameters in this sequential
+way; here each step belongs to one parameter.
 """
 
 from __future__ import annotations
@@ -21,47 +21,58 @@ import numpy as np
 from scipy import special
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.statistics.constancy import Constancy, constancy
+from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.statistics.constancy import Constancy, constancy, shortest
 from driftfit.judge.statistics.noise import Noise, whitened
 from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
 ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters are told apart by nothing."""
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
 AROUND = 0.03
-"""Share of the record on each side of the furthest point of a path where the date of a step is looked for."""
+"""Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
 """Steps of one parameter within this share of the record are the same step."""
 
 
 class Step(NamedTuple):
-    """A parameter of the n, and the sample (of the N) from which on it is another."""
+    """A parameter (of the n), and the sample (of the N) from which its value is different."""
 
     parameter: int
     at: int
 
 
+LEVEL = 0.95
+"""Share of the likelihood in the interval of a date."""
+
+
 class Attribution(NamedTuple):
-    """What moves."""
+    """The parameters that move, and their steps."""
 
     p: Array
-    """(n,): p-value of each parameter when it was named, or at the end where it was not."""
+    """(n,): p-value of each parameter when it was named, or at the end if it was not."""
     steps: tuple[Step, ...]
     """In the order in which they were found."""
+    spans: tuple[tuple[int, int], ...]
+    """First and last sample where each may have been: 95 % of the likelihood of its date between its neighbours."""
     before: Array
-    """(n,): value before its first step; constant value of those that have none."""
+    """(n,): value before the first step; the constant value if there is none."""
     after: Array
-    """(n,): the value furthest from it."""
+    """(n,): the value furthest from that."""
     std: Array
     """(n,): standard error of the difference."""
     last: Array
     """(n,): value after its last step."""
     moves: Array
-    """(n,): whether it has steps, and a difference that is none of chance."""
+    """(n,): whether it has steps, and a significant difference."""
 
     def first(self, i: int) -> int | None:
-        """The date of the step of parameter i that was found first; None where it has none."""
+        """The date of the step of parameter i that was found first; None if it has none."""
         return next((step.at for step in self.steps if step.parameter == i), None)
+
+    def span(self, i: int) -> tuple[int, int] | None:
+        """The interval of that date."""
+        return next((span for step, span in zip(self.steps, self.spans, strict=True) if step.parameter == i), None)
 
 
 def holm(p: Array, level: float) -> Array:
@@ -74,7 +85,7 @@ def holm(p: Array, level: float) -> Array:
 
 
 def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | None = None) -> Attribution:
-    """Explain the moves in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
+    """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
     steps: list[Step] = []
     p, now = test.p_own.copy(), test
@@ -93,11 +104,26 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
     far = np.abs(after - before) > special.ndtri(1.0 - 0.5 * level) * std
-    return Attribution(p, tuple(steps), before, after, std, last, far & [i in named for i in range(n)])
+    spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
+    return Attribution(p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)])
+
+
+def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
+    """The interval of the date of a step, by the likelihood of every date between the steps beside it."""
+    N, n = phi.shape
+    others = [other.at for other in steps if abs(other.at - step.at) > NEAR * N]
+    a, b = max((at for at in others if at < step.at), default=0), min((at for at in others if at > step.at), default=N)
+    edge = max(shortest(n) // 2, len(noise.ar) + 1 if noise is not None else 0)
+    if noise is None or b - a < 4 * edge:
+        return a, b
+    c = noise.level[a:b] * noise.white
+    loglik = date_loglik(phi[a:b] / c[:, None], noise.held[a:b] / c, noise.ar, edge, b - a - edge)
+    first, last = smallest(loglik, LEVEL)
+    return a + edge + first, a + edge + last
 
 
 def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
-    """The step, of a parameter that is rejected and near the furthest point of its path, that explains most."""
+    """The step of a rejected parameter, near the extreme point of its path, that explains most."""
     rejected = np.flatnonzero(holm(test.p_own[:n], level))
     if not len(rejected) or test.noise is None:
         return None
@@ -110,7 +136,7 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
 
 
 def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
-    """The date of the one step that explains most of y, and the parameters of which a step does so about as well."""
+    """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
     N, n = phi.shape
     if test.noise is None:
         return 0, ()
@@ -127,7 +153,7 @@ def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
 
 
 def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, float]:
-    """The place from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
+    """The position from first to last where a step of x explains most of e, orthogonal to Q, and how much."""
     N = len(x)
     places = np.arange(max(1, first), min(N - 1, last) + 1)
     later = np.cumsum((x * e)[::-1])[::-1][places]
@@ -139,7 +165,7 @@ def _dated(Q: Array, x: Array, e: Array, first: int, last: int) -> tuple[int, fl
 
 
 def _with(phi: Array, steps: list[Step]) -> Array:
-    """The regressors with one more column a step."""
+    """The regressors with one more column per step."""
     later = [phi[:, step.parameter] * (np.arange(len(phi)) >= step.at) for step in steps]
     return np.column_stack([phi, *later])
 

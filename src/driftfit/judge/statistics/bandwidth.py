@@ -1,15 +1,15 @@
-"""How many lags of correlation a test of constancy has to allow for, from the record itself.
+"""How many lags of correlation a test of constancy must allow for, estimated from the record.
 
     w_t      scores phi_t psi(e_t), whitened: sum w_t w_t' = N I
     G        sum w_t w_(t-1)' / N                      correlation of neighbours
-    rho^2    square of the largest eigenvalue of (G + G') / 2, less (2 / n) sum |w_t|^2 |w_(t-1)|^2 / N^2, which is what
-             it is by chance: 2 n / N where the noise is steady
+    rho^2    square of the largest eigenvalue of (G + G') / 2, minus its expectation without correlation,
+             (2 / n) sum |w_t|^2 |w_(t-1)|^2 / N^2, which is 2 n / N for constant noise
     lags     1.1447 (4 rho^2 / (1 - rho^2)^2 N)^(1/3)      best for a Bartlett window and an autoregression
 
 rho belongs to the most correlated of all combinations of the scores, however the regressors are scaled or combined.
 
 Source: Andrews (1991), equations 5.3 and 6.4. Newey and West (1994) for the rule of thumb, 4 (N / 100)^(2/9).
-Departures: one direction instead of weights, and the chance.
+Departures: one direction instead of weights, and the subtraction of the expectation.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""When was a break? The likelihood of every date between its neighbours, coefficients and all.
+"""The date of a break: the likelihood of every date between its neighbours, with the coefficients integrated out.
 
     x_t, y_t            rows divided by the level of the noise, which is an autoregression a of order p
-    left and right      x_t 1(t < d), x_t 1(t >= d): 2 n columns, made white together with y, so that the p rows after d
-                        hold both
+    left and right      x_t 1(t < d), x_t 1(t >= d): 2 n columns, whitened together with y, so that the p rows after d
+                        contain both
     log L(d)            -RSS(d) / 2 - log |X'X| / 2        coefficients integrated out under a flat prior
 
 For a given size of the change the likelihood is a random walk on either side of the date, whatever the date is, so an
-interval with 95 % of sum exp log L holds the date in at least 95 % of records (more where one sample decides). That
-coefficients are not known is in the determinant. Where the change is large this is the interval of Bai (1997); where it
-is small that one is too short, as its scale is estimated.
+interval with 95 % of sum exp log L contains the date in at least 95 % of records (more if one sample decides). The
+determinant accounts for the unknown coefficients. If the change is large this is the interval of Bai (1997); if it is
+small, Bai's is too short, because its scale is estimated.
 
 Source: Yao (1987), Bai (1997); Pitman's interval for a location. Cost: O(rows n^3).
 """
@@ -23,7 +23,7 @@ from driftfit.judge.statistics.robust import cholesky
 
 @shared
 def _row(X: Array, y: Array, ar: Array, t: int, d: int, row: Array) -> None:
-    """White row t of [left, right, y] for a break at d; rows before the first are not used."""
+    """Whiten row t of [left, right, y] for a break at d; rows before the first are not used."""
     n = X.shape[1]
     row[:] = 0.0
     for k in range(ar.shape[0] + 1):
@@ -75,7 +75,7 @@ def date_loglik(X: Array, y: Array, ar: Array, first: int, last: int) -> Array:
 
 
 def smallest(loglik: Array, level: float) -> tuple[int, int]:
-    """First and last place of the fewest places that hold ``level`` of the likelihood."""
+    """First and last position of the smallest set of positions with ``level`` of the likelihood."""
     weight = np.exp(loglik - loglik.max())
     order = np.argsort(-weight, kind="stable")
     count = int(np.searchsorted(np.cumsum(weight[order]), level * weight.sum())) + 1

@@ -1,4 +1,4 @@
-"""Are the coefficients of a regression constant? Score tests with the null of the record itself.
+"""Are the coefficients of a regression constant? Score tests whose null distribution comes from the record itself.
 
     theta    the constant that solves sum phi_t psi(e_t) = 0,  e_t = y_t - phi_t' theta
     psi(e)   = e clipped at 1.5 scales of the noise
@@ -11,23 +11,24 @@ If theta is constant, S_t = F_t - A_t A_T^-1 F_T, where F has independent increm
 
     Cov(S_t, S_s) = V_min(t,s) - V_t A^-1 A_s - A_t A^-1 V_s + A_t A^-1 V_T A^-1 A_s
 
-and L is a weighted sum of chi-squares whose weights are the eigenvalues of that covariance; its tail is inverted
-numerically. Where noise and regressors are stationary this is the table of Hansen (1992). Where the noise variance or
-the excitation change, that table is wrong and this is not: the null follows the variance profile of the record.
-Zero drift lies on the boundary of "q >= 0", which spoils likelihood-ratio tests; a score test has no such trouble.
+and L is a weighted sum of chi-squares whose weights are the eigenvalues of that covariance; its tail probability is
+computed numerically. If noise and regressors are stationary, this is the table of Hansen (1992). If the noise variance
+or the excitation changes, that table is wrong, but the null distribution used here follows the variance profile of the
+record. Zero drift lies on the boundary of "q >= 0", which invalidates likelihood-ratio tests, but not a score test.
 
-L averages over the record, and sees a slow drift best. Beside it stand the suprema over one break and over a stretch
-(`driftfit.judge.statistics.supremum`), which see a sudden or a passing move best. The three become one p-value by the
-Cauchy combination of Liu and Xie (2020), so that the error rate is that of all together.
+L averages over the record and is most powerful against slow drift. The suprema over one break and over an interval
+(`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. The Cauchy combination of
+Liu and Xie (2020) turns the three into one p-value, so that the error rate is that of all together.
 
-The noise is that of the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which are
-those of constants where the record is not divided. Residuals of constants would count a large change as noise, and the
-test would be the weaker the larger the change. Where the noise is an autoregression, the rows of the regression are
-made white first. What correlation the scores have left is allowed for by the Bartlett estimate of V, up to 4 (N /
-100)^(2/9) lags, the rule of thumb (`driftfit.judge.statistics.bandwidth`).
+The noise is estimated under the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which
+are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
+test would lose power as the change grows. If the noise is an autoregression, the rows of the regression are whitened
+first. The Bartlett estimate of V allows for the remaining correlation of the scores, with up to 4 (N / 100)^(2/9) lags,
+the rule of thumb (`driftfit.judge.statistics.bandwidth`).
 
-Which parameter moves is asked of A_T^-1 S_t, the path of the estimates: a move of one parameter shows in the scores of
-all whose regressors are correlated with its own, but there only in its own row.
+To find out which parameter moves, the test uses A_T^-1 S_t, the path of the estimates. A change of one parameter
+appears in the scores of all parameters whose regressors are correlated with its own, but in this path only in its own
+row.
 
 Departures: bounded scores (Huber 1964), so that outliers do not hide a drift; the null from the record (the idea of
 Hansen 2000, with the distribution inverted instead of simulated). Cost: O(T n^2), and an eigenvalue problem of at most
@@ -49,41 +50,41 @@ from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_f
 from driftfit.judge.statistics.supremum import suprema, together
 
 POINTS = 48
-"""At most so many points of the path enter the suprema and their null; every second of them enters the mean squares."""
+"""Largest number of points of the path for the suprema and their null; the mean squares use every second point."""
 ROWS = 200
-"""At most about so many rows of the covariance of the joint path."""
+"""The covariance of the joint path has at most about this many rows."""
 CELLS = 200
-"""At most so many places for breaks, where the noise is looked for."""
+"""Largest number of positions for breaks when the noise is estimated."""
 MOST_LAGS = 3
-"""At most so many lags of all regressors are taken in where these are not independent of the noise."""
+"""Largest number of lags of all regressors that are added if the regressors are not independent of the noise."""
 EDGE = 0.05
-"""Share of a record at each end where no date is looked for."""
+"""Share of a record at each end in which no date is searched."""
 
 
 class Constancy(NamedTuple):
-    """Tests of constancy; NaN where the record determines nothing."""
+    """Tests of constancy; NaN if the record determines nothing."""
 
     L: Array
     """(n,): Nyblom's statistic of each parameter."""
     p: Array
-    """(n,): its p-value, for the scores as Hansen has them."""
+    """(n,): its p-value, for the scores as in Hansen."""
     p_own: Array
-    """(n,): p-value of the path of the estimate, all tests together, which tells correlated parameters apart."""
+    """(n,): p-value of the path of the estimate, all tests together; it distinguishes correlated parameters."""
     joint: float
     """Nyblom's statistic of all parameters together."""
     p_joint: float
-    """All tests of all parameters together."""
+    """p-value of all tests of all parameters together."""
     p_each: tuple[float, float, float]
-    """Those of all parameters: of the mean square, of one break, of a stretch."""
+    """p-values of all parameters: of the mean square, of one break, of an interval."""
     at: Array
-    """(n,): the sample (of the N) from which on each parameter most likely is another."""
+    """(n,): the sample (of the N) at which each parameter most likely changed."""
     path: Array
-    """(N, n): standardised path of each estimate; about +-3 is far."""
+    """(N, n): standardised path of each estimate; values beyond about +-3 are unusual."""
     fit: Fit
-    """Constants."""
+    """The fit with constant coefficients."""
     noise: Noise | None
     lags: int
-    """Order of the autoregression, and lags beyond it, that were allowed for."""
+    """Order of the autoregression plus the further lags that were allowed for."""
 
 
 def least_rows(n: int) -> int:
@@ -92,14 +93,14 @@ def least_rows(n: int) -> int:
 
 
 def shortest(n: int) -> int:
-    """Rows in the shortest segment or stretch that is looked for."""
+    """Rows in the shortest segment or interval that is searched."""
     return max(10, 4 * n)
 
 
 def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
     """Test whether y (N,) on phi (N, n) has constant coefficients.
 
-    ``lags``: order of the autoregression of the noise; None finds it, and 0 takes the scores to be white.
+    ``lags``: order of the autoregression of the noise; None estimates it, and 0 assumes white scores.
     """
     N, n = phi.shape
     size: Array = np.sqrt(np.mean(phi * phi, axis=0)) if N else np.zeros(n)
@@ -154,11 +155,10 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
 def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     """Lags of the regressors X (N, n) that are not in ``rows``, the white rows: (N, q), Q' Q = N I.
 
-    Where regressors hold lags of y, as in ARX, correlated noise is not independent of them, and least squares leaves
-    noise that no autoregression makes white. The regression with one more lag of everything has white noise where that
-    of the first was an autoregression of order one; further lags come in as long as they gain by the criterion of
-    Hannan and Quinn (1979). Their coefficients are not tested: beside other regressors they cost a degree of freedom
-    each.
+    If the regressors contain lags of y, as in ARX, correlated noise is not independent of them, and least squares
+    leaves noise that no autoregression whitens. If the noise is an autoregression of order one, the regression with one
+    more lag of all variables has white noise. Further lags are added as long as they improve the criterion of Hannan
+    and Quinn (1979). Their coefficients are not tested; each costs one degree of freedom.
     """
     N, n = X.shape
     w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
@@ -182,7 +182,8 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
 def _alternative(found: Noise, still: Fit, beside: Array) -> Array:
     """Bounded residuals of the segments, on the rows of the test, without what regressors ``beside`` explain.
 
-    Each is that of a fit without it: a short segment fits its own rows too well (MacKinnon and White, 1985).
+    Each is the residual of a fit without its row, because a short segment fits its own rows too well (MacKinnon and
+    White, 1985).
     """
     if not len(found.breaks):
         return still.psi
@@ -249,7 +250,7 @@ def _weights(cov: Array) -> Array:
 
 
 def _each(S: Array, cov: Array, var: Array) -> tuple[Array, Array]:
-    """Statistic and p-value of each parameter by itself."""
+    """Statistic and p-value of each parameter separately."""
     m, n = S.shape
     L = np.mean(S * S, axis=0) / var
     p = [tail(_weights(cov[:, i, :, i]) / (m * var[i]), L[i]) for i in range(n)]
@@ -267,7 +268,7 @@ def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
 
 
 def _dates(path: Array, std: Array) -> tuple[Array, Array]:
-    """Where each standardised path is furthest from zero, edges left out."""
+    """The positions at which each standardised path is furthest from zero, without the edges."""
     N = len(path)
     z = path / np.where(std > 0.0, std, np.inf)
     low, high = int(EDGE * N), max(int((1.0 - EDGE) * N), int(EDGE * N) + 1)

@@ -1,24 +1,24 @@
-"""What the noise of a regression is like while its coefficients may change: its level over time and its correlation.
+"""The noise of a regression whose coefficients may change: its level over time and its correlation.
 
     v_t = y_t - phi_t' theta_(segment of t)          residuals of coefficients that are constant within segments
     c_t                                              level of v around t: 1.4826 median |v| in windows, interpolated
     v_t / c_t = sum_k a_k v_(t-k) / c_(t-k) + w_t    an autoregression, w white
 
-Residuals of constants would take a large change for noise, for a changing level of it and for its correlation. So the
-three are found from segments, and the segments in turn need the three:
+In the residuals of constants, a large change looks like noise with a changing level and with correlation. Level and
+correlation are therefore estimated from segments, and the segments in turn need level and correlation:
 
-    1. windows of the record are fitted each by itself; level and partial autocorrelations are medians over windows, of
-       which a few contain a break
-    2. y is held within three levels of the fit, so that an outlier is no segment; rows are divided by the level and
-       made white, y_t - sum a_k y_(t-k) on phi_t - sum a_k phi_(t-k); `driftfit.judge.statistics.partition` finds the
-       segments
-    3. level and correlation anew from their residuals; from 2, until the segments stay
+    1. Each window of the record is fitted separately; level and partial autocorrelations are medians over windows,
+       of which a few contain a break.
+    2. y is limited to three levels around the fit, so that an outlier does not become a segment. Rows are divided by
+       the level and whitened, y_t - sum a_k y_(t-k) on phi_t - sum a_k phi_(t-k), and
+       `driftfit.judge.statistics.partition` finds the segments.
+    3. Level and correlation are estimated again from their residuals; repeat from 2 until the segments do not change.
 
-The order of the autoregression is that of least BIC. Where what it leaves is correlated at one longer lag s (a day, a
-season), the noise is (1 - a(B)) (1 - b B^s) v = w; s is one of many and must gain 2 log(count) more than BIC asks. A
-fit takes correlation away from its residuals: the first autocorrelation r of N residuals is too small by
-(2 r + sum_i (g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are the autocorrelations of the regressors (for a mean
-alone (1 + 3 r) / N), which is given back.
+The order of the autoregression minimises BIC. If its residuals are correlated at one longer lag s (a day, a season),
+the noise is (1 - a(B)) (1 - b B^s) v = w. Because s is one of many, it must gain 2 log(count) more than BIC requires. A
+fit reduces the correlation of its residuals: the first autocorrelation r of N residuals is too small by (2 r + sum_i
+(g_i - r)(1 + g_i r) / (1 - g_i r)) / N, where g_i are the autocorrelations of the regressors (for a mean alone (1 + 3
+r) / N); this bias is corrected.
 
 Source: Chakar, Lebarbier, Levy-Leduc and Robin (2017) for whitening before the segments; Box and Jenkins (1970) for the
 seasonal factor; Marriott and Pope (1954) for the bias of a mean. Cost: O(T n^2), and that of the partition.
@@ -37,44 +37,44 @@ from driftfit.judge.statistics.partition import partition
 from driftfit.judge.statistics.robust import cholesky, huber
 
 HELD = 3.0
-"""Levels of the noise within which y is held around the fit."""
+"""y is limited to this many noise levels around the fit."""
 ORDER = 8
 """Highest order of the autoregression."""
 SEASON = 200
-"""Longest lag of a seasonal factor, which also is at most an eighth of the record."""
+"""Longest lag of a seasonal factor; it is also at most an eighth of the record."""
 LARGEST = 0.97
 ROUNDS = 6
 QUIET = 0.01
-"""Chance that a record of constant coefficients is divided."""
+"""Probability that a record with constant coefficients is divided."""
 WINDOW = 50
 
 
 class Noise(NamedTuple):
-    """What was found, on N rows."""
+    """The estimated noise of N rows."""
 
     breaks: Array
     """(K,): first rows of the segments after the first."""
     residual: Array
-    """(N,): v, not bounded."""
+    """(N,): v, without limits."""
     level: Array
     """(N,): c_t, standard deviation of v."""
     ar: Array
     """(p,): a."""
     held: Array
-    """(N,): y within three levels of the fit of its segment, or of the nearest one beside a break."""
+    """(N,): y within three levels of the fit of its segment, or of the nearest one next to a break."""
     near: Array
-    """(N,): v, or that of the neighbouring segment beside a break where it is smaller."""
+    """(N,): v, or next to a break that of the neighbouring segment if it is smaller."""
     leverage: Array
     """(N,): diagonal of the projector on the white rows of each segment."""
     white: float
     """Standard deviation of w, in units of the level."""
     penalty: float
-    """What a break had to gain, in units of w's variance."""
+    """The gain required for a break, in units of w's variance."""
 
 
 @shared
 def lagged(v: Array, limit: float, k: int) -> float:
-    """sum v_t v_(t-k) of v held within +-limit."""
+    """sum v_t v_(t-k), with v limited to +-limit."""
     total = 0.0
     for t in range(k, v.shape[0]):
         total += min(max(v[t], -limit), limit) * min(max(v[t - k], -limit), limit)
@@ -162,8 +162,8 @@ _lags = Driver(_pooled)
 def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, quiet: float = QUIET) -> Noise:
     """The noise of y (N,) on Q (N, n), Q' Q = N I.
 
-    ``cells``: breaks may lie at so many places, evenly spaced, at the most; ``least``: rows in a segment; ``order`` of
-    the autoregression, None finds it; ``quiet``: chance that constants are divided.
+    ``cells``: largest number of positions for breaks, evenly spaced; ``least``: rows in a segment; ``order`` of the
+    autoregression, None estimates it; ``quiet``: probability that constants are divided.
     """
     N, n = Q.shape
     spans = _spans(N, n)
@@ -186,7 +186,7 @@ def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, 
 
 
 class _Search(NamedTuple):
-    """What segments are looked for in; y is the residual of constants."""
+    """The data of a search for segments; y is the residual of constants."""
 
     Q: Array
     y: Array
@@ -200,7 +200,7 @@ class _Search(NamedTuple):
     penalty: float
 
     def settle(self, ar: Array, local: Array, near: Array) -> tuple[float, Noise]:
-        """Segments and noise that agree, from a first autoregression, that of ``near``; -2 log-likelihood first.
+        """-2 log-likelihood, and segments and noise that agree, starting from ``ar``, the autoregression of ``near``.
 
         ``local``: residuals of windows, for outliers.
         """
@@ -235,7 +235,7 @@ class _Search(NamedTuple):
         )
 
     def price(self, ar: Array) -> float:
-        """The penalty, dearer by the standard error of the logarithm of the noise's long-run variance."""
+        """The penalty, raised by the standard error of the logarithm of the noise's long-run variance."""
         total = max(float(ar.sum()), 0.0)
         return self.penalty * (1.0 + (2.0 * np.sqrt((1.0 + total) / (1.0 - total) / len(self.y)) if len(ar) else 0.0))
 
@@ -250,7 +250,7 @@ class _Search(NamedTuple):
         return ar if self.order is not None else self.seasonal(v, ar, breaks)
 
     def seasonal(self, v: Array, ar: Array, breaks: Array) -> Array:
-        """The autoregression with one more factor, where what it leaves of v is correlated at a longer lag."""
+        """The autoregression, with one more factor if its residuals of v are correlated at a longer lag."""
         N = len(v)
         longest = min(SEASON, N // 8)
         if longest <= self.P:
@@ -267,14 +267,14 @@ class _Search(NamedTuple):
         return -np.convolve(np.append(1.0, -ar), season)[1:]
 
     def size(self, v: Array, ar: Array) -> float:
-        """Standard deviation of the white noise, outliers held."""
+        """Standard deviation of the white noise, with outliers limited."""
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
         limit = HELD * 1.4826 * np.median(np.abs(w))
         return float(np.sqrt(np.mean(np.clip(w, -limit, limit) ** 2))) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
-    """Rows less a times the rows before; nothing in the first p."""
+    """Rows minus a times the rows before; the first p rows are left out."""
     p = len(ar)
     if p == 0:
         return X, y
@@ -288,10 +288,10 @@ def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
 
 @lru_cache(4096)
 def penalty(N: int, n: int, least: int, quiet: float) -> float:
-    """Least fall of the sum of squares for a break.
+    """Smallest decrease of the sum of squares that justifies a break.
 
-    The chance of one break by mistake, and half of that of a pair, in white Gaussian noise are about ``quiet``: the
-    supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
+    In white Gaussian noise the probability of one false break, and half of that of a pair, are about ``quiet``. This
+    follows from the supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
     """
     span = np.log(max(N / least - 1.0, np.e))
     one = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
@@ -331,7 +331,7 @@ def _partial(r: Array, g: Array, N: float) -> Array:
 
 
 def _levinson(r: Array, g: Array, N: float, found: Array) -> None:
-    """The recursion of Durbin and Levinson, and what the fit took from the first autocorrelation."""
+    """The recursion of Durbin and Levinson, with the bias of the first autocorrelation corrected."""
     W, P = found.shape
     a, turned = np.zeros(P), np.zeros(P)
     for w in range(W):

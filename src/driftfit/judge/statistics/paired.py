@@ -3,7 +3,7 @@
     d_t = e_rival,t^2 - e_t^2,     t = mean(d) / sqrt(v / N),     v = Bartlett sum of autocovariances
 
 The lags are floor(4 (N / 100)^(2/9)). The p-value is one-sided, for the claim that the run is better. Where parameters
-are constant a tracker is a little worse than constant least squares, so that the test claims too seldom.
+are constant a tracker is a little worse than constant least squares, so that the test rejects too seldom.
 
 Source: Diebold and Mariano (1995); the variance is that of Newey and West (1987).
 """
@@ -18,11 +18,11 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 LEAST = 10
-"""Fewest errors that are compared."""
+"""Smallest number of errors that are compared."""
 
 
 class Paired(NamedTuple):
-    """A rival beside the run: its root mean square error, the t statistic and p-value of being worse than the run."""
+    """A rival of the run: its root mean square error, the t statistic and p-value of being worse than the run."""
 
     name: str
     rms: float

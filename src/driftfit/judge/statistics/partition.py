@@ -1,14 +1,15 @@
-"""The cheapest partition of a record into segments with coefficients of their own, exactly, by dynamic programming.
+"""The optimal partition of a record into segments with different coefficients, exactly, by dynamic programming.
 
     F(t) = min over s of  F(s) + C(s, t) + penalty,     C(s, t) = least sum of squares of the rows s .. t
 
 C comes from a Cholesky factor of [phi, y]' [phi, y], summed block by block from s on, without differences of large
-sums. Rows that were made white by an autoregression of order p belong to two segments for p rows after a break: these
-count as one each, whatever they are.
+sums. For p rows after a break, rows whitened by an autoregression of order p belong to two segments; each of these rows
+counts as one, whatever its value is.
 
 A start s with F(s) + C(s, t) - p >= F(t) can never be the last break of a longer record and is dropped (as soon as
-segments from t on are long enough to be allowed), so that the cost is O(T) where breaks keep coming, and O(T^2) blocks
-where there are none. Breaks may lie between blocks only. Source: Killick, Fearnhead and Eckley (2012), PELT.
+segments from t on are long enough to be allowed), so that the cost is O(T) if breaks occur regularly, and O(T^2) in the
+number of blocks if there are none. Breaks may lie between blocks only. Source: Killick, Fearnhead and Eckley (2012),
+PELT.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from driftfit.judge.statistics.robust import cholesky
 def _sum(phi: Array, y: Array, ends: Array, p: Array, G: Array) -> None:
     """[phi, y]' [phi, y] of the blocks of rows that end at ``ends`` (m,), lower triangles: G (2, m, n + 1, n + 1).
 
-    In G[0] of all rows, in G[1] of those after the first p.
+    G[0] is the sum over all rows, G[1] that over the rows after the first p.
     """
     n = phi.shape[1]
     start = 0

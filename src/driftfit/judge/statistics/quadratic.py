@@ -3,7 +3,7 @@
     Q = sum_j w_j x_j^2,  x_j ~ N(0, 1)        phi(v) = prod_j (1 - 2 i v w_j)^(-1/2)
     P(Q > x) = 1/2 + sum_k Im(phi(v_k) e^(-i v_k x)) / (pi (k + 1/2)),   v_k = (k + 1/2) D
 
-The step D is small enough that nothing of the distribution lies beyond x + 2 pi / D; the sum stops where phi has
+The step D is so small that no part of the distribution lies beyond x + 2 pi / D; the sum stops where phi has
 vanished. Limits of score tests are such sums: a Cramer-von Mises statistic has w_j = 1 / (j pi)^2.
 
 Source: Davies (1980), algorithm AS 155, without its error control. Error below 1e-6 for five weights and more.
@@ -16,7 +16,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 
 TERMS = 65536
-"""Terms of the sum at the most."""
+"""Largest number of terms of the sum."""
 SMALL = 1e-3
 """Weights below this share of the largest are replaced by their mean."""
 

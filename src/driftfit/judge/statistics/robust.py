@@ -2,9 +2,10 @@
 
     theta solves sum phi_t psi(e_t) = 0,    e_t = y_t - phi_t' theta,    psi(e) = e clipped at 1.5 scales of the noise
 
-by iterated weights. The scale is 1.4826 times the median of the absolute residuals. Normal equations are solved in an
-orthonormal basis of the regressors, so that their conditioning is that of what changes within the record; a direction
-that a part of it does not excite stays at zero there. Source: Huber (1964). Cost: O(N n^2) a round, ten as a rule.
+solved by iteratively reweighted least squares. The scale is 1.4826 times the median of the absolute residuals. Normal
+equations are solved in an orthonormal basis of the regressors, so that their conditioning is that of what changes
+within the record; a direction that a part of the record does not excite stays at zero there. Source: Huber (1964).
+Cost: O(N n^2) per iteration, usually ten.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from driftfit.engine.kernel import Array, Driver, shared
 CLIP = 1.5
 ROUNDS = 30
 FLAT = 1e-10
-"""A pivot below this share of its diagonal entry is taken for zero."""
+"""A pivot below this share of its diagonal entry counts as zero."""
 
 
 class Fit(NamedTuple):
@@ -38,7 +39,7 @@ class Fit(NamedTuple):
 
 @shared
 def cholesky(M: Array, n: int) -> float:
-    """Lower factor of the leading n columns of M (k, k), in place; the last diagonal entry that is left, M[k-1, k-1].
+    """Lower factor of the leading n columns of M (k, k), in place; returns the remaining last entry, M[k-1, k-1].
 
     With n = k - 1 and M = [phi, y]' [phi, y] that entry is the sum of squared residuals.
     """
@@ -63,7 +64,7 @@ def cholesky(M: Array, n: int) -> float:
 
 @shared
 def solved(M: Array, theta: Array) -> None:
-    """theta (n,) from what `cholesky` made of M (n + 1, n + 1)."""
+    """theta (n,) from M (n + 1, n + 1) after `cholesky`."""
     n = theta.shape[0]
     for i in range(n - 1, -1, -1):
         total = M[n, i]
@@ -118,7 +119,7 @@ _run = Driver(_fit)
 
 
 def orthonormal(phi: Array) -> tuple[Array, Array]:
-    """(Q, R): phi (N, n) = Q R, Q' Q = N I, of columns that are independent."""
+    """(Q, R): phi (N, n) = Q R, Q' Q = N I, for linearly independent columns."""
     Q, R = np.linalg.qr(phi)
     root = np.sqrt(len(phi))
     return np.ascontiguousarray(Q * root), R / root
@@ -134,6 +135,6 @@ def robust_fit(phi: Array, y: Array) -> Fit:
 
 
 def clipped(theta: Array, residual: Array, scale: float) -> Fit:
-    """A fit with its bounded residuals."""
+    """A fit together with its clipped residuals."""
     psi = np.clip(residual, -CLIP * scale, CLIP * scale)
     return Fit(theta, residual, scale, psi, (np.abs(residual) <= CLIP * scale).astype(float))

@@ -1,4 +1,4 @@
-"""How large values are when their outliers are left aside."""
+"""The mean square of values without their outliers."""
 
 from __future__ import annotations
 

@@ -1,18 +1,18 @@
-"""Is there a date, or a stretch, at which a score path moved too far? Suprema of Wald-type statistics.
+"""Tests for a date, or an interval, at which a score path changed too much: suprema of Wald-type statistics.
 
     Q(a, b) = (S_b - S_a)' Var(S_b - S_a)^-1 (S_b - S_a)          chi-square with n degrees of freedom for constants
     one break      c = max over b of Q(0, b)                      the path is tied at both ends: before b against after
-    a stretch      c = max over a < b of Q(a, b)                  within against outside
+    an interval    c = max over a < b of Q(a, b)                  within against outside
 
     P(max Q > c) = P(chi2_n > c) sum kappa_b,  or  sum kappa_a kappa_b,      kappa = x nu(sqrt(2 x)),  x = c (1 - rho)
 
-rho is the correlation of Q's Gaussian vector with that of the next place, from the covariance of the path, so that the
-null is that of the record. nu is what is lost between places: kappa is 1 where neighbours are independent, which is
-Bonferroni's bound, and less where they are alike. Where the mean square of a path (Nyblom and Hansen) averages a short
-move away, the supremum keeps it: it grows with the square of its size.
+rho is the correlation of Q's Gaussian vector with that of the next position, from the covariance of the path, so the
+null distribution is that of the record. nu corrects for the distance between positions: kappa is 1 if neighbours are
+independent, which is Bonferroni's bound, and less if they are correlated. The mean square of a path (Nyblom and Hansen)
+averages a short change away; the supremum does not, and grows with the square of its size.
 
 Source: Andrews (1993) for the supremum; Siegmund (1985), Yao (1993) for its tail on a grid. Departures: covariances
-of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m places.
+of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m positions.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from driftfit.judge.statistics.robust import cholesky
 
 
 def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
-    """Q, and 1 - rho when a or b moves by one place; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n)."""
+    """Q, and 1 - rho if a or b moves by one position; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n)."""
     m, n = S.shape[0] - 1, S.shape[1]
     M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
     for a in range(m):
@@ -45,7 +45,7 @@ def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
                 y = x + 1
                 share = 0.0
                 for j in range(n):
-                    # column j of the factor's inverse times the variance of the place that is gained or lost
+                    # column j of the factor's inverse times the variance of the position that is added or removed
                     for i in range(n):
                         z[i] = cov[y, i, y, j] + cov[x, i, x, j] - cov[x, i, y, j] - cov[y, i, x, j]
                     for i in range(n):
@@ -67,7 +67,7 @@ _run = Driver(_scan)
 
 
 def scanned(S: Array, cov: Array) -> tuple[Array, Array, Array]:
-    """Q, and 1 - rho when a or b moves by one place, (m + 1, m + 1) each, of a path S (m, n)."""
+    """Q, and 1 - rho if a or b moves by one position, (m + 1, m + 1) each, of a path S (m, n)."""
     m, n = S.shape
     path, full = np.zeros((m + 1, n)), np.zeros((m + 1, n, m + 1, n))
     path[1:], full[1:, :, 1:] = S, cov
@@ -77,12 +77,12 @@ def scanned(S: Array, cov: Array) -> tuple[Array, Array, Array]:
 
 
 def suprema(S: Array, cov: Array, rows: Array, least: int, apart: bool) -> tuple[float, float]:
-    """p-values of one break, and of a stretch, for the path S (m, n) with covariance (m, n, m, n).
+    """p-values of one break, and of an interval, for the path S (m, n) with covariance (m, n, m, n).
 
-    ``rows`` (m,): rows up to each place, the last of them all; ``least``: rows on each side, in a stretch and outside.
-    ``apart``: the covariance is that of other residuals than those of the path. Then Q of a stretch of k rows is
-    Hotelling's T^2, which is far from chi-square where k is small, and (k - (n + 3) / 2) log(1 + Q / k) is taken
-    (Bartlett, 1938). Of the same residuals Q is at most k.
+    ``rows`` (m,): rows up to each position, the last being all rows; ``least``: rows on each side, and in an interval
+    and outside it. ``apart``: the covariance belongs to other residuals than those of the path. Then Q of an interval
+    of k rows is Hotelling's T^2, which is far from chi-square for small k, and (k - (n + 3) / 2) log(1 + Q / k) is used
+    (Bartlett, 1938). For the same residuals Q is at most k.
     """
     m, n = S.shape
     Q, left, right = scanned(S, cov)
@@ -100,7 +100,7 @@ def suprema(S: Array, cov: Array, rows: Array, least: int, apart: bool) -> tuple
 
 
 def _tail(Q: Array, n: int, *moved: Array) -> float:
-    """P(max Q > its largest) for chi-squares that have 1 - rho = moved to their neighbours."""
+    """P(max Q > its largest) for chi-squares with 1 - rho = moved between neighbours."""
     if not Q.size:
         return float("nan")
     c = float(Q.max())
@@ -121,10 +121,10 @@ def _kappa(x: Array) -> Array:
 
 
 def together(mean: float, *suprema: float) -> float:
-    """One p-value of tests of one record, however they depend on each other: Liu and Xie (2020).
+    """Combine tests of one record into one p-value, however they depend on each other: Liu and Xie (2020).
 
-    The mean square has half of the weight, the suprema share the rest. p-values above one half count as one half: those
-    of suprema are bounds, and say no more there.
+    The mean square has half of the weight, and the suprema share the rest. p-values above one half count as one half:
+    those of suprema are bounds without meaning there.
     """
     p = np.array([mean, *suprema])
     weight = np.array([0.5, *[0.5 / len(suprema)] * len(suprema)])
@@ -132,6 +132,6 @@ def together(mean: float, *suprema: float) -> float:
     if not known.any():
         return float("nan")
     p, weight = np.clip(p[known], 1e-12, 0.5), weight[known] / weight[known].sum()
-    # tan loses the small ones
+    # tan loses the small p-values
     total = float(np.sum(weight * np.where(p < 1e-6, 1.0 / (p * np.pi), np.tan((0.5 - p) * np.pi))))
     return 1.0 / (total * np.pi) if total > 1e6 else float(0.5 - np.arctan(total) / np.pi)

@@ -1,9 +1,9 @@
-"""Is a sequence white? Autocorrelations whose limits do not need a constant variance.
+"""Whiteness of a sequence: autocorrelations whose limits do not require a constant variance.
 
     r_k = sum z_t z_(t-k) / sum z_t^2,   se_k^2 = sum z_t^2 z_(t-k)^2 / (sum z_t^2)^2,   Q = sum_k (r_k / se_k)^2
 
-Q is chi-square with K degrees of freedom for martingale differences, whatever their variance does. Values are clipped
-at three robust standard deviations first, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
+Q is chi-square with K degrees of freedom for martingale differences, whatever their variance. Values are first clipped
+at three robust standard deviations, so that a pair of outliers does not decide. Source: Lo and MacKinlay (1989).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Whiteness(NamedTuple):
 
 
 def clipped(z: Array) -> Array:
-    """z within three robust standard deviations, missing values as 0."""
+    """z limited to three robust standard deviations, with missing values as 0."""
     z = np.where(np.isfinite(z), z, 0.0)
     used = np.abs(z[z != 0.0])
     limit = 3.0 * 1.4826 * float(np.median(used)) if used.size else 0.0
@@ -34,7 +34,7 @@ def clipped(z: Array) -> Array:
 
 
 def whiteness(z: Array, lags: int | None = None) -> Whiteness:
-    """Test z (N,), in the order of time, NaN where there is nothing; 20 lags unless N is below 100."""
+    """Test z (N,), in order of time, NaN for missing values; 20 lags unless N is below 100."""
     z = clipped(z)
     K = min(20, len(z) // 5) if lags is None else lags
     return _correlation(z, z, range(1, K + 1))

@@ -1,1 +1,1 @@
-"""Which structure: orders, delays and regressors, selected or averaged."""
+"""Model structure: orders, delays and regressors, selected or averaged."""

@@ -1,12 +1,12 @@
-"""Dynamic model averaging: one prediction from several structures, with weights that move in time.
+"""Dynamic model averaging: one prediction from several structures, with weights that change over time.
 
     w_k(t | t-1)  proportional to  w_k(t-1)^a                        forgetting: structures may change, a just below 1
-    w_k(t)        proportional to  w_k(t | t-1) p_k(y_t)              what structure k made of the sample
+    w_k(t)        proportional to  w_k(t | t-1) p_k(y_t)              the density of the sample under structure k
 
-so that log w_k(t) = a log w_k(t-1) + log p_k(y_t) up to a constant that all share: an exponentially weighted sum of
-log-likelihoods. The averaged prediction is the mean of the mixture, its variance that of the mixture. A sample that one
-structure cannot predict moves no weights: nothing is learned, and nothing forgotten. The
-weight of a regressor is that of all structures that have it.
+so that log w_k(t) = a log w_k(t-1) + log p_k(y_t) up to a constant that is common to all: an exponentially weighted sum
+of log-likelihoods. The averaged prediction is the mean of the mixture, and its variance that of the mixture. A sample
+that one structure cannot predict changes no weights: nothing is learned, and nothing forgotten. The weight of a
+regressor is that of all structures that contain it.
 
 Source: Raftery, Karny and Ettler (2010), Technometrics 52(1), equations 15 to 17. Cost: O(T K).
 """
@@ -28,19 +28,19 @@ class Average(NamedTuple):
     """The average of K structures over T samples."""
 
     y_hat: Array
-    """(T,): NaN where a structure has no prediction."""
+    """(T,): NaN if a structure has no prediction."""
     std: Array
-    """(T,): standard deviation of its error."""
+    """(T,): standard deviation of the prediction error."""
     weights: Array
     """(T, K): before each sample; they add up to 1."""
     names: tuple[str, ...]
     """(K,): the structures."""
     inclusion: Array
-    """(T, N): weight of the structures that have a regressor."""
+    """(T, N): weight of the structures that contain a regressor."""
     regressors: tuple[str, ...]
-    """(N,): the regressors; empty where structures are not made of the same ones."""
+    """(N,): the regressors; empty if structures are not made of the same regressors."""
     loglik: float
-    """Of the mixture, on the scored samples."""
+    """Log-likelihood of the mixture, on the scored samples."""
     rms: float
     """Root mean square error on the scored samples."""
 

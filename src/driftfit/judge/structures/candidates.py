@@ -1,10 +1,10 @@
-"""Structures as columns of one regression: the union of what several ARX or Regression models use.
+"""Structures as columns of one regression: the union of the regressors of several ARX or Regression models.
 
     phi_t of a structure = its columns of the union's phi_t
 
-The union is run once to collect its regressors (lags that are missing are filled by constant least squares on all of
-them), so all structures see the same rows. Structures with as many columns have states of the same shape and run side
-by side, in fleets of up to 32.
+The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
+them), so all structures use the same rows. Structures with equally many columns have states of the same shape and run
+in parallel, in fleets of up to 32.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ class Structure(NamedTuple):
 
 
 def unscored(T: int, n: int) -> int:
-    """Samples at the beginning that score no structure, of at most n parameters: 100, or half of a short record."""
+    """Number of first samples that are not scored: with at most n parameters 100, or half of a short record."""
     return max(burn_in(n), min(100, T // 2))
 
 
 def price(n: int, start: int) -> float:
-    """What n parameters cost in the log-likelihood of the first ``start`` samples, which is not scored."""
+    """The cost of n parameters in the log-likelihood of the first ``start`` samples, which are not scored."""
     return 0.5 * n * float(np.log(start))
 
 
 class Predicted(NamedTuple):
-    """What a structure said of every sample before its output was seen; NaN where it said nothing."""
+    """The predictions of a structure before each output was observed; NaN where it has none."""
 
     y_hat: Array
     s: Array
@@ -75,7 +75,7 @@ class Pool:
         return self.record.y
 
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
-        """Run structures and return what they predicted."""
+        """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
         sizes = sorted({s.n for s in structures if s.columns is not None})
         for n in sizes:
@@ -133,7 +133,7 @@ def pool_of(models: Sequence[Model], names: Sequence[str], record: Record) -> tu
 
 
 def _terms(model: Model) -> list[Term] | None:
-    """What the columns of a model are; None for a model that is no ARX or Regression with one output."""
+    """The terms of the columns of a model; None for a model other than ARX or Regression with one output."""
     one: list[Term] = [("1", 0, 0)] if model.intercept else []
     if len(model.outputs) > 1 or model.implicit:
         return None
@@ -146,7 +146,7 @@ def _terms(model: Model) -> list[Term] | None:
 
 
 def _union(models: Sequence[Model]) -> Model:
-    """The smallest model that has the regressors of all."""
+    """The smallest model that contains the regressors of all."""
     terms = {term for model in models for term in _terms(model) or ()}
     constant = ("1", 0, 0) in terms
     if all(isinstance(model, Regression) for model in models):

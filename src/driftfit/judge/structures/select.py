@@ -1,26 +1,27 @@
-"""Select: orders, delays and regressors by how well each structure predicted, and averages over structures in time.
+"""Select: orders, delays and regressors by how well each structure predicted; and averages over structures.
 
     loglik of a structure = sum over t > m of log p(y_t | past) - (n / 2) log m
 
-Every term is a prediction made before the output was seen, so a structure with useless parameters pays for them without
-a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the contest. log p is the
-tracker's predictive density, a mixture where it has several modes. All structures are scored on the same samples: those
-after the first m that every one could predict, m = max(50, 5 n of the largest, min(100, T / 2)). What learning n
-parameters costs in the first m samples, which are nobody's, is (n / 2) log m (Rissanen, 1986).
+Every term is a prediction made before the output was observed, so a structure with superfluous parameters pays for them
+without a penalty term (Dawid's prequential principle), and the drift of the parameters is part of the comparison. log p
+is the tracker's predictive density, a mixture if it has several modes. All structures are scored on the same samples:
+those after the first m that all of them could predict, m = max(50, 5 n of the largest, min(100, T / 2)). The term
+(n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
-  columns of one regression, the union of their regressors: it is built once, its rows are shared, and structures with
-  as many columns run side by side as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run one by
-  one; a model whose regressors hold the present output brings its Jacobian (``log_jacobian``).
-* `select(model, y, u)` with one model looks for the best subset of its regressors: all subsets up to 5 of them, and
-  from there to 30 a search that adds the best and drops the worst, p runs a round instead of 2^p.
+  columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures with
+  equally many columns run in parallel as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run
+  one by one; a model whose regressors contain the present output supplies its Jacobian (``log_jacobian``).
+* `select(model, y, u)` with one model searches for the best subset of its regressors: all subsets of up to 5
+  regressors, and from there to 30 a search that adds the best and drops the worst, with p runs per round instead of
+  2^p in all.
 
 The table gives for each structure the loglik, its distance from the best with a standard error (Newey and West), and
-the root mean square error. ``best`` has the highest; ``simplest`` has the fewest parameters of those that are within
-one standard error of it. `Selection.average` is dynamic model averaging: see there.
+the root mean square error. ``best`` has the highest loglik; ``simplest`` has the fewest parameters of those within one
+standard error of it. `Selection.average` is dynamic model averaging.
 
 Source: Dawid (1984); Rissanen (1986); Raftery, Karny and Ettler (2010). Departures: the search instead of all 2^p; the
-recursion of the weights in closed form. Cost: one run a structure.
+recursion of the weights in closed form. Cost: one run per structure.
 """
 
 from __future__ import annotations
@@ -57,12 +58,12 @@ if TYPE_CHECKING:
     from driftfit.judge.structures.average import Average
 
 MOST = 30
-"""At most so many regressors are searched."""
+"""Largest number of regressors that can be searched."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One structure: its loglik, how far below the best with a standard error, and its root mean square error."""
+    """One structure: its loglik, its distance from the best with a standard error, and its root mean square error."""
 
     name: str
     n: int
@@ -74,7 +75,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Selection(Printed):
-    """What `select` returns; printing it shows the table.
+    """The result of `select`; printing it shows the table.
 
     Attributes
     ----------
@@ -105,7 +106,7 @@ class Selection(Printed):
         return min(within, key=lambda row: (row.n, row.below)).name
 
     def model(self, name: str | None = None) -> Model:
-        """The model of a structure, the best by default; ValueError for a subset, which is no model by itself."""
+        """The model of a structure, the best by default; ValueError for a subset, which is not a model by itself."""
         found = self._structure(name).model
         if found is None:
             raise ValueError(
@@ -129,7 +130,7 @@ class Selection(Printed):
         raise ValueError(f"select: there is no structure {wanted!r}; the table has {len(self.rows)}.")
 
     def average(self, forgetting: float = 0.99) -> Average:
-        """Average all structures in time; ``forgetting`` in (0, 1] is how fast a structure's past counts less."""
+        """Average all structures; ``forgetting`` in (0, 1] determines how fast past predictions lose weight."""
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"average: forgetting must be in (0, 1]; got {forgetting!r}.")
         from driftfit.judge.structures.average import averaged
@@ -160,7 +161,7 @@ class Selection(Printed):
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
     def plot(self, most: int = 20) -> Figure:
-        """How far structures are below the best, with standard errors, and where in time they lost it."""
+        """Distances from the best structure, with standard errors, and where in time the structures lost."""
         rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
         terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
         below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
@@ -170,8 +171,8 @@ class Selection(Printed):
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
     """Every combination of settings: ``grid(ARX, na=[1, 2], nb=[1, 2], intercept=True)`` is four models.
 
-    A list is a choice; anything else, a tuple too, is one value for all. Combinations that the model refuses are left
-    out; ValueError where none is left.
+    A list is a choice; anything else, including a tuple, is one value for all. Combinations that the model does not
+    accept are left out; ValueError if none remains.
     """
     if not (isinstance(kind, type) and issubclass(kind, Model)):
         raise TypeError(f"grid: give the class of the models, as in grid(ARX, na=[1, 2]); got {kind!r}.")
@@ -209,22 +210,22 @@ def select(
     Parameters
     ----------
     models : sequence of models, or one model
-        Candidates; or the model whose regressors are to be chosen, at most 30.
+        Candidates; or one model whose regressors are to be selected, at most 30.
     y, u, data, time, dt, weights, drift, limits, exclude
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
     tracker : Tracker
-        How their parameters are followed; AdaptiveKalman() by default. Its settings must fit every number of
-        parameters: one q, not a vector.
+        Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
+        q, not a vector.
     keep : names
-        Regressors that every subset has, such as ("intercept",).
+        Regressors that every subset contains, such as ("intercept",).
     most : int or None
-        Most regressors in a subset.
+        Largest number of regressors in a subset.
 
     Raises
     ------
     ValueError
-        No candidate, a tracker without a variance, more than 30 regressors, names that are not there, or what `track`
-        refuses.
+        If there is no candidate, for a tracker without a variance, more than 30 regressors or unknown names, and for
+        everything that `track` does not accept.
     """
     tracker = AdaptiveKalman() if tracker is None else tracker
     candidates = list(models) if isinstance(models, Iterable) else [models]
@@ -258,7 +259,7 @@ def select(
 
 
 def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
-    """A candidate for these inputs; an ARX of a grid with nb = 0 has none in it, and is not told about them."""
+    """A candidate for these inputs; an ARX model of a grid with nb = 0 has no inputs."""
     m = inputs if isinstance(inputs, int) else len(inputs)
     if isinstance(model, ARX) and model.inputs == 0 and m > 0:
         model = replace(model, inputs=m)

@@ -1,7 +1,8 @@
-"""The best subset of the regressors of one model: all subsets of a few, a search among many.
+"""The best subset of the regressors of one model: all subsets of a few regressors, a search among many.
 
-The search adds the regressor that helps most and drops what no longer helps, until neither raises the log-likelihood
-less its price: p runs a round instead of 2^p. Every subset is run once, and subsets of one size run side by side.
+The search adds the regressor that helps most and drops regressors that no longer help, until neither raises the
+log-likelihood minus its penalty: p runs per round instead of 2^p in all. Every subset is run once, and subsets of equal
+size run in parallel.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pri
 from driftfit.trackers.base import Tracker
 
 ALL = 5
-"""Up to so many regressors all subsets are tried."""
+"""Up to this many regressors, all subsets are tried."""
 
 
 def subsets(
@@ -68,7 +69,7 @@ class Tried:
 
 
 def _search(tried: Tried, kept: frozenset[int], free: Sequence[int], largest: int) -> None:
-    """Add what helps most, drop what no longer helps, until neither raises the loglik."""
+    """Add the regressor that helps most, drop those that no longer help, until neither raises the loglik."""
     chosen = kept
     best = float(tried([chosen])[0]) if chosen else -np.inf
     while True:

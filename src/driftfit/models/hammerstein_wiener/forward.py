@@ -1,9 +1,9 @@
-"""A Hammerstein-Wiener model run forward: many systems side by side, outputs fed back as their own predictions.
+"""A Hammerstein-Wiener model run forward: many systems in parallel, with predicted outputs fed back.
 
     F(y_t; d) = sum_j sum_k (b_j c_k) f_k(u_(t-nk-j+1)) - sum_i sum_k (a_i d_k) g_k(y_(t-i)) - l - v_t
 
-with the products as they stand in theta, so that nothing needs to be separated. F is inverted on a grid over a span of
-outputs, widened by a fifth; where it does not increase its monotone envelope is inverted. Cost per sample and system:
+with the products as they are in theta, so that nothing needs to be separated. F is inverted on a grid over a span of
+outputs, widened by a fifth; if it does not increase, its monotone envelope is inverted. Cost per sample and system:
 O(n + 64).
 """
 
@@ -21,7 +21,7 @@ GRID = 64
 WIDER = 0.2
 NEWTON = 3
 INSIDE = 0.97
-"""Share of u_max within which the thresholds of a dead zone are held."""
+"""Limit of the thresholds of a dead zone, as a share of u_max."""
 
 
 class Blocks(Protocol):

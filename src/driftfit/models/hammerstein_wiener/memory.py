@@ -1,20 +1,20 @@
 """The memory of a Hammerstein-Wiener model's compiled steps: numbers and arrays one after the other in one field.
 
-The field ``blocks`` (size, L) begins with the numbers named below. `places_of` says the orders and where the arrays
-begin. The machines behind the steps get the address of ``blocks`` for one lane, element i of which stands L numbers
-after element i - 1; the places are constants to them, so that their loops unroll.
+The field ``blocks`` (size, L) begins with the numbers named below. `places_of` returns the orders and where the arrays
+begin. The compiled routines of the steps get the address of ``blocks`` for one lane, in which element i is stored L
+numbers after element i - 1. The places are constants of these routines, so that their loops can be unrolled.
 
-    now, next (n)             regressors of this sample but those of its output, and those of the next
+    now, next (n)             regressors of this sample except those of its output, and of the next
     f_past  (nb + nk, n_in)   functions of the inputs t, t - 1, .., of a dead zone with the thresholds known then;
                               one array after the other where there are several inputs
     g_past  (1 + na, n_out)   functions of the outputs t, t - 1, ..; their slopes in h_past
     d_now   (n_out)           coefficients (1, d_2 ..) before the sample
-    trial, trial_bend         functions and slopes at a y that is tried; spare, slopes that nobody needs
+    trial, trial_bend         functions and slopes at a trial y; spare, slopes that are not used
     into, out                 the numbers of the bases, those of all inputs first
     curve (n_out, ROW)        functions of the output block on the grid, and one level beyond all; bend, their slopes
     coarse (n_out, EIGHT)     the same functions at every eighth point of the grid
     level (GRID)              an envelope of the levels
-    d_seen, reach (n_out)     coefficients for which the grid was found to rise, and how far it is safe to be from them
+    d_seen, reach (n_out)     coefficients for which the grid increases, and the safe distance from them
     us (inputs)               the inputs of this sample
 """
 
@@ -28,17 +28,17 @@ from driftfit.models.hammerstein_wiener.products import Structure
 GRID = 64
 """Points of the grid on which the output block is inverted."""
 EIGHT = 8
-"""Levels that are compared at once: GRID is its square."""
+"""Number of levels that are compared at once; GRID is its square."""
 ROW = GRID + 1
 
 (
     LOW, STEP, LOWEST, HIGHEST, BOTTOM, TOP, RISING, PREDICTED, STARTED, MINIMAL, GIVEN, RAW, VARIANCE, BEFORE, EARLIER,
     FIRM_LOW, FIRM_HIGH, MOVED, LATE, CELL, Y, DT, SEEN, OK, FACTOR, HEAD,
 ) = range(26)  # fmt: skip
-"""Numbers: the grid, the range of outputs believed, where the output block is defined, results, whether all lags are
-there, whether theta is xi, the noise factor given, the output as it came, sigma^2 or 0, the two outputs before, the
-range of medians of three, whether the range moved, whether a level stands where the prediction
-will, the cell of the grid that holds it, and what steps tell the machine and hear from it; HEAD is how many there are.
+"""Numbers: the grid, the range of accepted outputs, where the output block is defined, results, whether all lags are
+known, whether theta is xi, the given noise factor, the output as given, sigma^2 or 0, the two previous outputs, the
+range of medians of three, whether the range changed, whether a level is stored in place of the
+prediction, its cell of the grid, and what steps and compiled routine exchange; HEAD is their number.
 """
 
 (
@@ -46,17 +46,17 @@ will, the cell of the grid that holds it, and what steps tell the machine and he
     TRIAL_BEND, INTO, OUT, CURVE, BEND, COARSE, LEVEL, D_SEEN, REACH, US, INPUTS, OWN,
 ) = range(28)  # fmt: skip
 """Places: orders, whether the output block is the identity and an input basis depends on its own coefficients, where
-the arrays begin, and how many inputs there are. NB is the number of all b, NK the least delay; N_IN, F_PAST and INTO
+the arrays begin, and how many inputs there are. NB is the number of all b, NK the smallest delay; N_IN, F_PAST and INTO
 are those of the first input.
 """
 OWN_NB, OWN_N_IN, OWN_NK, OWN_F, OWN_INTO, OWN_ADAPTIVE, OWN_END, EACH = range(8)
-"""From OWN on, EACH numbers for each input: its orders, where its functions and the numbers of its basis begin, whether
-that depends on its own coefficients, and where its numbers end.
+"""From OWN on there are EACH numbers for every input: its orders, where its functions and the numbers of its basis
+begin, whether the basis depends on its own coefficients, and where its numbers end.
 """
 
 
 Places = Array
-"""Whole numbers (28 + 7 a input,), a constant to the compiler."""
+"""Whole numbers (28 + 7 per input,), a constant for the compiler."""
 
 
 def _arrays(structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array) -> dict[int, Array]:
@@ -79,7 +79,7 @@ def places_of(
     structure: Structure, nk: tuple[int, ...], into: tuple[Array, ...], out: Array, identity: bool,
     adaptive: tuple[bool, ...],
 ) -> tuple[int, ...]:  # fmt: skip
-    """Orders and beginnings; ``into`` and ``out`` are the numbers of the bases."""
+    """Orders, and where the arrays begin; ``into`` and ``out`` are the numbers of the bases."""
     na, nb, n_in, n_out, _ = structure
     arrays = _arrays(structure, nk, into, out)
     begins = np.cumsum([HEAD, *(array.size for array in arrays.values())])[:-1].tolist()

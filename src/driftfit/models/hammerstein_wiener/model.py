@@ -4,33 +4,34 @@
     w_t = -sum_{i=1..na} a_i w_{t-i} + sum_{j=1..nb} b_j v_{t-nk-j+1}  linear block
     sum_k d_k g_k(y_t) = w_t,  d_1 = 1                                inverse of the output block, increasing
 
-With several inputs each has a curve v_i and coefficients b_i of its own, and their sum drives the linear block. With
-several outputs each has a linear block and an output block of its own: a regression on its own lags and on the inputs,
-in a lane of its own. That is no restriction without noise, since every row of a transfer matrix has a denominator
-in common, of at most the order of the whole. Where the input blocks are the same for all outputs,
+With several inputs each has its own curve v_i and coefficients b_i, and their sum drives the linear block. With several
+outputs each has its own linear block and output block: a regression on its own lags and on the inputs, in a separate
+lane. Without noise this is not a restriction, since the entries of every row of a transfer matrix have a common
+denominator, of at most the order of the whole. If the input blocks are the same for all outputs,
 `driftfit.models.hammerstein_wiener.results.shared_curves` separates them together.
 
-In terms of what is measured this is a regression on products of the parameters
+In the measured signals this is a regression on products of the parameters
 (`driftfit.models.hammerstein_wiener.products`):
 
     z_t = -g_1(y_t) = phi_t' theta_t
     phi_t = [g_1(y_{t-i}) .., -f_1(u_{t-nk-j+1}) .., g_2(y_t) .. g_q(y_t), -f_k(u_{t-nk-j+1}) .., g_k(y_{t-i}) .., (1)]
 
-Any tracker follows theta (stage one); `driftfit.models.hammerstein_wiener.results` separates a, b, c, d from it. The
-regression is exact only with products of the time of each factor; products of one time leave an error of second order
-in the drift.
+Any tracker estimates theta (stage one); `driftfit.models.hammerstein_wiener.results` separates a, b, c, d from it. The
+regression is exact only if each product uses every factor at its own time; products at one time leave an error of
+second order in the drift.
 
 The prediction of a run is of y, through the inverted output block; innovation, innovation_std and loglik are of the
-equation error, with the Jacobian F'(y_t) in the likelihood, since phi_t holds y_t. Nothing is filled: a missing output
-makes the samples t .. t + na unusable, a missing input t + nk .. t + nk + nb - 1.
+equation error, with the Jacobian F'(y_t) in the likelihood, since phi_t contains y_t. Nothing is filled in: a missing
+output makes the samples t .. t + na unusable, a missing input t + nk .. t + nk + nb - 1.
 
-The signs of a are those of polynomials A(z) = 1 + a_1 z^-1 + ..; `ARX` has the opposite. Use it where both curves or
-one of them matter; a linear system is an `ARX`. Least squares is consistent for data without measurement noise only:
-phi holds y. ``output_noise`` weighs samples by what noise of that standard deviation does to the equation, which lowers
-the variance and not the bias; `driftfit.models.hammerstein_wiener.trackers.output_error` has neither.
+The signs of a are those of polynomials A(z) = 1 + a_1 z^-1 + ..; `ARX` has the opposite signs. Use this model if one or
+both curves matter; for a linear system use `ARX`. Least squares is consistent only for data without measurement noise,
+because phi contains y. ``output_noise`` weights samples by the effect of noise of that standard deviation on the
+equation, which lowers the variance but not the bias; `driftfit.models.hammerstein_wiener.trackers.output_error` has
+neither problem.
 
 Source: Feng and Hong (2021), Int. J. Systems Science 52(16); Bai (1998), Automatica 34(3). Departures: all columns of
-the input carry a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
+the input have a minus sign, without which the regression gives -b. Cost per sample: O(n + 64 n_out).
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from driftfit.models.hammerstein_wiener.values import DIGITS
 
 IDENTITY = Polynomial(1)
 FLATTEST = 1e-3
-"""The least slope of the output block that the likelihood takes for real."""
+"""Smallest slope of the output block that the likelihood accepts."""
 UNIT = 10.0
 """Root mean square beyond which, or below whose inverse, data are far from unit size for raw powers."""
 
@@ -89,10 +90,10 @@ class HammersteinWiener(Model):
         Delay of the input in samples; 0 uses the present input.
     input, output : Basis or None
         Functions of the input block, and of the inverse of the output block. None is the identity, so that
-        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model. A list of bases makes a model with so many
-        inputs, each with a curve of its own; ``nb`` and ``nk`` then may be lists as well.
+        ``output=None`` is a Hammerstein and ``input=None`` a Wiener model. A list of bases makes a model with that many
+        inputs, each with its own curve; ``nb`` and ``nk`` may then be lists as well.
     intercept : bool
-        Add one constant; those of the two blocks cannot be told apart.
+        Add one constant; those of the two blocks cannot be distinguished.
     output_noise : number, one for each output, or None
         Standard deviation of white noise on y. The noise variance of the equation then is r times
         sigma^2 sum_{i=0..na} a_i^2 F'(y_{t-i})^2 + 1e-4, from the estimates before each sample; use r = 1.
@@ -100,12 +101,12 @@ class HammersteinWiener(Model):
         Name of the input, or of each.
     ny : int or names
         Outputs, columns of y. With several, ``output`` and ``output_noise`` may be lists with one entry for each; the
-        bases of all outputs are of one kind and size, with ranges and knots of their own.
+        bases of all outputs are of one kind and size, with separate ranges and knots.
 
     Raises
     ------
     ValueError
-        For orders that are not whole, lists of different lengths, a dead zone or saturation in the output block, or
+        For orders that are not integers, lists of different lengths, a dead zone or saturation in the output block, or
         output bases of different kinds.
     """
 
@@ -202,7 +203,7 @@ class HammersteinWiener(Model):
 
     @property
     def into(self) -> Basis:
-        """Functions of the input block; ValueError where there are several inputs."""
+        """Functions of the input block; ValueError if there are several inputs."""
         if self.m > 1:
             raise ValueError("HammersteinWiener: this method needs a model with one input.")
         return self.bases[0]
@@ -219,7 +220,7 @@ class HammersteinWiener(Model):
 
     @property
     def out(self) -> Basis:
-        """Functions of the inverse of the output block, of the first output where there are several."""
+        """Functions of the inverse of the output block, of the first output if there are several."""
         return self.outs[0]
 
     def alone(self, output: str) -> HammersteinWiener:
@@ -229,7 +230,7 @@ class HammersteinWiener(Model):
 
     @property
     def structure(self) -> Structure:
-        """The orders, and where the parameters stand in theta."""
+        """The orders, and the positions of the parameters in theta."""
         return Structure(self.na, self._each(self.nb), tuple(b.n for b in self.bases), self.out.n, self.intercept)
 
     @property
@@ -257,7 +258,7 @@ class HammersteinWiener(Model):
 
     @property
     def places(self) -> tuple[int, ...]:
-        """Where everything stands in the memory of the steps."""
+        """The positions of all numbers in the memory of the steps."""
         return _places(self)
 
     @property
@@ -278,7 +279,7 @@ class HammersteinWiener(Model):
         return play(self, theta, y, u, noise, span)
 
     def touched(self, t: int, signal: str) -> range:
-        """The samples that cannot be used when "y" or "u" is missing at t."""
+        """The samples that cannot be used if "y" or "u" is missing at t."""
         if signal == "y":
             return range(t, t + self.na + 1)
         ends = [nb + nk for nb, nk in zip(self.structure.nb, self.delays, strict=True)]

@@ -1,17 +1,17 @@
 """The inverse of an output block on a grid: the y at which sum_k d_k g_k(y) has a given level.
 
-The grid is laid over the outputs believed so far, widened by a fifth, and laid anew when an output leaves it. An output
-far beyond all others (three times the range of medians of three) is believed in no further than that, so that one
-absurd number does not make the grid coarse for ever.
+The grid covers the range of accepted outputs so far, widened by a fifth, and is computed again when an output leaves
+it. An output far beyond all others (three times the range of medians of three) widens the range only up to that limit,
+so that one absurd number does not make the grid coarse for ever.
 
-Where the levels rise along the grid, the cell is found by bisection and y in it by the monotone cubic through levels
-and slopes at its ends, finished by Newton's method. That they rise is not looked at for every sample: with d' the
-coefficients at which all differences D_i of levels were found positive, they stay positive while
+If the levels increase along the grid, the cell is found by bisection, and y in the cell by the monotone cubic through
+levels and slopes at its ends, refined by Newton's method. Whether the levels increase is not checked at every sample.
+Let d' be coefficients for which all differences D_i of levels were positive; they remain positive as long as
 
     sum_k |d_k - d'_k| max_i |D_ik / D_i| < 1,       D_ik the differences of g_k
 
-Where they do not rise, the monotone envelope (running maximum from the middle outwards, running minimum inwards) is
-inverted instead and ``RISING`` is 0. Source of the cubic: Fritsch and Carlson (1980). Cost: O(log GRID n_out).
+If the levels do not increase, the monotone envelope (running maximum from the middle outwards, running minimum inwards)
+is inverted instead and ``RISING`` is 0. Source of the cubic: Fritsch and Carlson (1980). Cost: O(log GRID n_out).
 """
 
 from __future__ import annotations
@@ -57,21 +57,21 @@ from driftfit.models.hammerstein_wiener.memory import (
 from driftfit.models.hammerstein_wiener.values import Kind, level_of
 
 WIDER = 0.2
-"""Share of the range of the outputs by which the grid goes beyond it, at both ends."""
+"""Share of the range of the outputs by which the grid extends beyond it at both ends."""
 FAR = 3.0
-"""Times the range of medians of three, beyond it: an output farther away is believed in no further."""
+"""Limit beyond the range of medians of three, in units of that range; outputs farther away count only up to it."""
 SAFE = 0.99
-"""The bound on the change of d, less what rounding may take."""
+"""The bound on the change of d, reduced for rounding."""
 FINE = 1e-8
-"""Share of a cell: a Newton step that leaves an error below it is the last."""
+"""Share of a cell; the Newton iteration stops when its error is below it."""
 STEPS = 8
 WIDE = 10.0
-"""Times as wide as needed: a grid that was laid for an absurd first output is laid anew."""
+"""A grid that is this many times wider than needed, because of an absurd first output, is computed again."""
 
 
 @part
 def believe(m: Array, y: float) -> None:
-    """Take an output into the range of those seen."""
+    """Include an output in the range of accepted outputs."""
     one, other = m[BEFORE, 0], m[EARLIER, 0]
     m[EARLIER, 0], m[BEFORE, 0] = one, y
     if other == other:
@@ -99,7 +99,7 @@ def level(m: Array, p: Places, at: int, i: int) -> Any:
 
 @part
 def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
-    """How many of the eight levels from a place on are not above ``right``; rows are so many numbers long."""
+    """How many of the eight levels from ``at`` on are not above ``right``; ``row`` is the length of a row."""
     d = p[D_NOW]
     one, other = load_four(m, at, 0), load_four(m, at + 4, 0)
     for k in range(1, p[N_OUT]):
@@ -112,7 +112,7 @@ def beneath(m: Array, p: Places, at: int, row: int, right: float) -> int:
 
 @part
 def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int:
-    """The same where the numbers of a lane do not stand side by side."""
+    """The same if the numbers of a lane are not contiguous."""
     d, count = p[D_NOW], 0
     for i in range(EIGHT):
         place = at + i
@@ -125,7 +125,7 @@ def beneath_in_lane(m: Array, p: Places, at: int, row: int, right: float) -> int
 
 @shared
 def look(m: Array, p: Places) -> None:
-    """Whether the levels rise along the grid, and how far d may go before that is looked at again; else an envelope."""
+    """Check whether the levels increase, and how far d may change until the next check; if not, make the envelope."""
     n_out, d, seen, reach, at = p[N_OUT], p[D_NOW], p[D_SEEN], p[REACH], p[CURVE]
     levels = p[LEVEL]
     for i in range(GRID):
@@ -151,7 +151,7 @@ def look(m: Array, p: Places) -> None:
 
 @shared
 def on_envelope(m: Array, p: Places, right: float) -> float:
-    """The y at which the envelope has a level; the end of the grid for a level beyond it."""
+    """The y at which the envelope has the level ``right``; the end of the grid for a level beyond it."""
     levels = p[LEVEL]
     if right < m[levels, 0]:
         return float(m[LOW, 0])
@@ -182,7 +182,7 @@ def rises(m: Array, p: Places) -> bool:
 
 @part
 def cubic(share: float, mean: float, first: float, last: float) -> float:
-    """Where in a cell, 0 to 1, a share of its rise is reached: mean slope, and slopes at both ends."""
+    """Where in a cell, 0 to 1, a share of its rise is reached, from the mean slope and those at both ends."""
     one = min(mean / first, 3.0) if first > 0.0 else 3.0
     other = min(mean / last, 3.0) if last > 0.0 else 3.0
     rest = 1.0 - share
@@ -191,7 +191,7 @@ def cubic(share: float, mean: float, first: float, last: float) -> float:
 
 @lru_cache
 def locating(lanes: bool = False) -> Any:
-    """A part (m, p, right) that finds the cell of the grid for a level; returns it, or the y where none holds it."""
+    """A part (m, p, right) that finds the cell of the grid for a level; returns it, or the y if there is none."""
     count = beneath_in_lane if lanes else beneath
 
     def locate(m: Array, p: Places, right: float) -> Any:
@@ -211,7 +211,7 @@ def locating(lanes: bool = False) -> Any:
 
 @lru_cache
 def refining(level_at: Any) -> Any:
-    """A part (m, p, right) that solves in the cell that was found, given what says level and slope at a y."""
+    """A part (m, p, right) that solves in the cell that was found; ``level_at`` returns level and slope at a y."""
 
     def refine(m: Array, p: Places, right: float) -> Any:
         step, start, at, bends, below = m[STEP, 0], m[LOW, 0], p[CURVE], p[BEND], int(m[CELL, 0])
@@ -239,7 +239,7 @@ def refining(level_at: Any) -> Any:
 
 @lru_cache
 def inverse_of(level_at: Any, lanes: bool = False) -> Any:
-    """A part (m, p, right) that inverts the output block, from one that says level and slope at a y."""
+    """A part (m, p, right) that inverts the output block; ``level_at`` returns level and slope at a y."""
     locate, refine = locating(lanes), refining(level_at)
 
     def invert(m: Array, p: Places, right: float) -> Any:
@@ -251,20 +251,20 @@ def inverse_of(level_at: Any, lanes: bool = False) -> Any:
 
 @lru_cache
 def inverting(out: Kind) -> Any:
-    """The same as a core, for any lane and for where it is seldom needed."""
+    """The same as a core, for any lane, where it is seldom needed."""
     return shared(inverse_of(level_of(out), lanes=True).py_func)
 
 
 @lru_cache
 def laying(values: Any) -> Any:
-    """A core (m, p) that lays the grid anew where the outputs believed need another."""
+    """A core (m, p) that computes the grid again if the accepted outputs need another."""
 
     def lay(m: Array, p: Places) -> None:
         m[MOVED, 0] = 0.0
         low, high = m[LOWEST, 0], m[HIGHEST, 0]
         start, end = m[LOW, 0], m[LOW, 0] + (GRID - 1) * m[STEP, 0]
         wide = high - low
-        margin = WIDER * (wide if wide > 0.0 else max(abs(high), 1.0))
+        margin = WIDER * (wide if wide > 0.0 else abs(high) if high != 0.0 else 1.0)
         short = (low < start and start > m[BOTTOM, 0]) or (high > end and end < m[TOP, 0])
         if low <= high and (m[STEP, 0] == 0.0 or short or end - start > WIDE * (wide + 2.0 * margin)):
             start, end = max(low - margin, m[BOTTOM, 0]), min(high + margin, m[TOP, 0])

@@ -1,12 +1,12 @@
-"""Where the parameters of the blocks of a Hammerstein-Wiener model stand in its regression.
+"""The positions of the block parameters of a Hammerstein-Wiener model in its regression.
 
     theta = [a_1 .. a_na, b_1 .. b_nb, d_2 .. d_q, b_1 c_2 .. b_nb c_2, b_1 c_3 .., a_1 d_2 .. a_na d_2, .., (l)]
     xi    = [a_1 .. a_na, b_1 .. b_nb, c_2 .. c_p, d_2 .. d_q, (l)]
     theta = g(xi),  J = dg/dxi:   d(b_j c_k) = c_k db_j + b_j dc_k,   d(a_i d_k) = d_k da_i + a_i dd_k
 
 with c_1 = d_1 = 1, p = n_in and q = n_out functions in the input and in the output block, and l the intercept. The lag
-runs fastest. With several inputs each has its own nb and n_in, and b, c and the products b c are those of the first
-input, then those of the second, and so on. theta has n entries, xi the n_x that are free.
+is the fastest index. With several inputs each has its own nb and n_in, and b, c and the products b c are those of the
+first input, then those of the second, and so on. theta has n entries, xi the n_x free ones.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Structure(NamedTuple):
 
     @property
     def starts(self) -> tuple[int, int, int]:
-        """Where d, the products b c and the products a d begin in theta."""
+        """The positions of d, the products b c and the products a d in theta."""
         d = self.na + sum(self.nb)
         bc = d + self.n_out - 1
         return d, bc, bc + self.products_in
@@ -57,7 +57,7 @@ class Structure(NamedTuple):
 
     @property
     def tags(self) -> tuple[str, ...]:
-        """What tells the coefficients of several inputs apart in their names."""
+        """The labels that distinguish the coefficients of several inputs in their names."""
         return tuple(f"[u{i + 1}]" for i in range(len(self.nb))) if len(self.nb) > 1 else ("",)
 
     def lags(self, tag: int) -> list[str]:
@@ -86,7 +86,7 @@ class Structure(NamedTuple):
 
     @property
     def leads(self) -> Array:
-        """Where the first coefficient of each input stands in c."""
+        """The position of the first coefficient of each input in c."""
         return np.cumsum([0, *self.n_in[:-1]])
 
     @property
@@ -114,7 +114,7 @@ class Structure(NamedTuple):
 
     @property
     def alone(self) -> Array:
-        """(entry of theta, entry of xi) of the parameters that stand in theta by themselves, (k, 2)."""
+        """(entry of theta, entry of xi) of the parameters that appear in theta alone, (k, 2)."""
         at_d, at_l = self.starts[0], self.n - 1
         x_d = self.n_x - self.intercept - self.n_out + 1
         d = [(at_d + k, x_d + k) for k in range(self.n_out - 1)]

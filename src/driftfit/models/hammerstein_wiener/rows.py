@@ -1,8 +1,8 @@
-"""Rows of regressors in the memory of a Hammerstein-Wiener model: laid out from the lags, and times the estimate.
+"""Rows of regressors in the memory of a Hammerstein-Wiener model: filled from the lags, and multiplied by the estimate.
 
-The rows of this sample and of the next are two: that of the next is laid out as soon as its lags are known, which is at
-the sample before, and copied when its time comes. A row of single numbers that is read in vectors right after it was
-written makes the processor wait for all that it has begun.
+There are two rows, one for this sample and one for the next. The next row is filled as soon as its lags are known, at
+the previous sample, and is copied when it is needed. If a row were written in single numbers and read in SIMD vectors
+directly afterwards, the processor would have to wait until all writes are finished.
 """
 
 from __future__ import annotations
@@ -34,19 +34,19 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 
 FLOOR = 1e-4
-"""Least variance of the equation error under measurement noise."""
+"""Smallest variance of the equation error under measurement noise."""
 
 
 @part
 def shift(m: Array, at: int, width: int, rows: int) -> None:
-    """Every row of an array to the place of the next."""
+    """Move every row of an array to the place of the next one."""
     for i in range(at + width * rows - 1, at + width - 1, -1):
         m[i, 0] = m[i - width, 0]
 
 
 @part
 def past(m: Array, p: Places, theta: Array) -> float:
-    """-(phi' theta) without the columns of the present output; also fills d_now."""
+    """Return -(phi' theta) without the columns of the present output; also fills d_now."""
     at_d, n, others, d, now = p[NA] + p[NB], p[N], p[N_OUT] - 1, p[D_NOW], p[NOW]
     for k in range(others):
         m[d + 1 + k, 0] = theta[at_d + k, 0]
@@ -65,7 +65,7 @@ def past(m: Array, p: Places, theta: Array) -> float:
 
 @shared
 def minimal_past(m: Array, p: Places, theta: Array) -> float:
-    """The same where theta is xi."""
+    """The same if theta is xi."""
     na, more_out, now, at = p[NA], p[N_OUT] - 1, p[NOW], p[NA] + p[NB] + p[N_OUT] - 1
     b, c, total = na, na + p[NB], 0.0
     for i in range(p[INPUTS]):
@@ -105,14 +105,14 @@ def noise_factor(m: Array, p: Places, theta: Array) -> float:
 
 @shared
 def forget(m: Array, p: Places) -> None:
-    """All lags are missing."""
+    """Mark all lags as missing."""
     for i in range(p[F_PAST], p[SPARE]):
         m[i, 0] = np.nan
 
 
 @part
 def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
-    """phi but for the columns of the present output, from the lags as they stood ``ago`` samples before it."""
+    """Fill phi without the columns of the present output, from the lags ``ago`` samples before it."""
     na, n_out, g = p[NA], p[N_OUT], p[G_PAST] + (1 - ago) * p[N_OUT]
     first, at = to + na, to + na + p[NB] + n_out - 1
     for i in range(p[INPUTS]):
@@ -136,7 +136,7 @@ def fill(m: Array, p: Places, to: int, ago: int, seen: bool) -> None:
 
 @shared
 def complete(m: Array, p: Places) -> bool:
-    """Whether all lags are there."""
+    """Whether all lags are known."""
     at_d = p[NA] + p[NB]
     missing = 0
     for i in range(p[N]):

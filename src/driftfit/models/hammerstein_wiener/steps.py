@@ -1,14 +1,14 @@
 """The compiled steps of `driftfit.models.hammerstein_wiener.model`.
 
-The record keeps the functions of the last inputs and outputs, so that each is evaluated once; a basis that depends on
-its own coefficients is evaluated with those known before the sample of the input. The output is predicted from theta
-before the sample, by solving
+The state keeps the functions of the last inputs and outputs, so that each is evaluated once. A basis that depends on
+its own coefficients is evaluated with those estimated before the sample of the input. The output is predicted from
+theta before the sample, by solving
 
     g_1(y) + sum_k d_k g_k(y) = -(phi' theta over all columns but those of the present output)
 
-with `driftfit.models.hammerstein_wiener.output_curve`. The steps that drivers are compiled with only hand a lane over
-to two machines, which are compiled once for all trackers: a call of a machine that knows its orders is as fast as code
-in the midst of a driver. With orders at run time one machine would do for all models, but took twice as long a sample.
+with `driftfit.models.hammerstein_wiener.output_curve`. The steps in a driver only pass a lane to two compiled routines,
+which are compiled once for all trackers. A call of a routine that is compiled for its orders is as fast as code inside
+of the driver. One routine with orders at run time would serve all models, but took twice as long per sample.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ from driftfit.models.hammerstein_wiener.rows import complete, fill, forget, mini
 from driftfit.models.hammerstein_wiener.values import Kind, input_values, level_of, output_values, usable
 
 INSIDE = 0.97
-"""Share of u_max within which the thresholds of a dead zone are held."""
+"""Limit of the thresholds of a dead zone, as a share of u_max."""
 
 
 @shared
 def thresholds(m: Array, p: Places, theta: Array) -> None:
-    """The coefficients of a dead zone, fed back: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
+    """Feed back the coefficients of a dead zone: sum_j b_j (b_j c_k) / sum_j b_j^2, or the mean of (b_j c_k) / b_j."""
     at_b, at_bc, x_c = p[NA], p[NA] + p[NB] + p[N_OUT] - 1, p[NA] + p[NB]
     for i in range(p[INPUTS]):
         own = OWN + EACH * i
@@ -90,7 +90,7 @@ def thresholds(m: Array, p: Places, theta: Array) -> None:
 
 @lru_cache
 def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
-    """A part (m, p) that takes the inputs of this sample, from input i on, into their lags, or replaces the newest."""
+    """A part (m, p) that adds the inputs of this sample, from input i on, to their lags, or replaces the newest."""
     input_at, own = input_values(into[i], i), OWN + EACH * i
 
     def one(m: Array, p: Places) -> None:
@@ -114,13 +114,13 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
 
 @lru_cache
 def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
-    """What ``regress`` does, for the functions of all bases."""
+    """The computation of ``regress``, for the functions of all bases."""
     enter, output_at, bare_output_at = _entering(into), output_values(out), output_values(out, bends=False)
     lay, locate, invert = laying(output_at), locating(lanes), inverting(out)
 
     def regress_work(m: Array, p: Places, theta: Array) -> None:
         n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
-        if not m[SEEN, 0] > 0.0:  # the sample before
+        if not m[SEEN, 0] > 0.0:  # the previous sample
             for k in range(n_out):
                 m[g + k, 0] = np.nan
         shift(m, g, n_out, rows)
@@ -169,11 +169,11 @@ def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
 
 @lru_cache
 def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
-    """The machine of ``regress``."""
+    """The compiled routine of ``regress``."""
     work, orders = _regress_work(into, out, lanes), np.array(p)
 
     def machine_regress(blocks: int, theta: int, L: int) -> None:
-        stride = L if lanes else 1  # which the compiler knows
+        stride = L if lanes else 1  # known to the compiler
         work(floats(blocks, 1, stride), orders, floats(theta, 1, stride))
 
     return machine(machine_regress)
@@ -181,7 +181,7 @@ def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool)
 
 @lru_cache
 def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
-    """The machine of ``push``: the prediction, where nothing waited for it."""
+    """The compiled routine of ``push``: it predicts if no other step needed the prediction before."""
     refine, orders = refining(level_of(out)), np.array(p)
 
     def machine_push(blocks: int, L: int) -> None:
@@ -194,7 +194,7 @@ def _push(out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
 
 @lru_cache
 def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
-    """The steps for the machines of the bases of the inputs and of the output."""
+    """The steps for the compiled bases of the inputs and of the output."""
     regress_one, regress_lane = _regress(into, out, p, False), _regress(into, out, p, True)
     push_one, push_lane = _push(out, p, False), _push(out, p, True)
     curved = not p[IDENTITY]
@@ -247,7 +247,7 @@ def build(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...]) -> ModelSteps:
 
 @lru_cache
 def applying(into: tuple[Kind, ...], p: tuple[int, ...]) -> Step:
-    """The step that takes inputs after their sample: their functions, and the row of the next sample laid out again."""
+    """The step that takes inputs after their sample: it evaluates their functions and fills the next row again."""
     place, orders = _entering(into, moves=False), np.array(p)
     now, following, n, us, inputs = p[NOW], p[NEXT], p[N], p[US], p[INPUTS]
 

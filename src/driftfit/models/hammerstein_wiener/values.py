@@ -1,7 +1,7 @@
-"""The functions of a block at a number, into the memory of a Hammerstein-Wiener model.
+"""Evaluate the functions of a block at a number and store them in the memory of a Hammerstein-Wiener model.
 
-Any basis is evaluated by its machine (`driftfit.models.hammerstein_wiener.curves.kernels`), called by symbol. Raw
-powers and Legendre polynomials, the most usual, are computed on the spot, with the same operations.
+Every basis is evaluated by its compiled routine (`driftfit.models.hammerstein_wiener.curves.kernels`), called by
+symbol. Raw powers and Legendre polynomials, the most common ones, are computed inline with the same operations.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from driftfit.models.hammerstein_wiener.memory import (
 )
 
 DIGITS = 1e13
-"""Largest ratio of the functions of a reading to the first of them, or to 1: of sixteen digits, what an absurd reading
-leaves of ordinary ones in the same columns."""
+"""Largest ratio of the functions of a reading to the first of them, or to 1. Beyond it an absurd reading would leave
+too few of sixteen digits for ordinary readings in the same columns."""
 CURVED = 1e19
-"""Largest function of a reading where there are several, which far out are nearly proportional: products of two stay
-below LARGEST."""
+"""Largest function of a reading if there are several functions, which are nearly proportional for large readings. The
+product of two stays below LARGEST."""
 
 Kind = tuple[Any, int]
-"""The machine of a basis, and its code."""
+"""The compiled routine of a basis, and its code."""
 
 
 @part
 def usable(m: Array, at: int, count: int) -> bool:
-    """Whether the functions of a reading, from a place on, are numbers of comparable size."""
+    """Whether the functions of a reading, stored from ``at`` on, are numbers of comparable size."""
     top = min(DIGITS * max(abs(m[at, 0]), 1.0), CURVED) if count > 1 else LARGEST
     beyond = 0
     for k in range(count):
@@ -52,7 +52,7 @@ def usable(m: Array, at: int, count: int) -> bool:
 def values_of(kind: Kind, numbers: int, following: int, count: int, bends: bool = True) -> Any:
     """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes.
 
-    Without ``bends`` nobody needs the slopes, and they may be left alone.
+    Without ``bends`` the slopes are not needed and may be left as they are.
     """
     evaluate, code = kind
 
@@ -86,19 +86,19 @@ def values_of(kind: Kind, numbers: int, following: int, count: int, bends: bool 
 
 
 def input_values(kind: Kind, i: int) -> Any:
-    """Those of the curve of input i, whose slopes nobody needs."""
+    """The values of the curve of input i, whose slopes are not needed."""
     own = OWN + EACH * i
     return values_of(kind, own + OWN_INTO, own + OWN_END, own + OWN_N_IN, bends=False)
 
 
 def output_values(kind: Kind, bends: bool = True) -> Any:
-    """Those of the output block."""
+    """The values of the output block."""
     return values_of(kind, OUT, CURVE, N_OUT, bends)
 
 
 @lru_cache
 def level_of(kind: Kind) -> Any:
-    """A part (m, p, y) that says the level of the output block at y, and its slope; it may fill trial, trial_bend."""
+    """A part (m, p, y) that returns the level of the output block at y and its slope; it may fill trial, trial_bend."""
     fill_trial = output_values(kind)
 
     def at_output(m: Array, p: Places, y: float) -> tuple[float, float]:

@@ -1,6 +1,6 @@
-"""Alarms on a stream: the rule of a reference run, one sample at a time, bit for bit as `Track.detect` over the record.
+"""Alarms on a stream: the rule of a reference run, applied sample by sample, bit-equal to `Track.detect` on the record.
 
-Memory is that of the window. Cost: some ten microseconds a sample beside the update.
+It needs the memory of the window. Cost: some ten microseconds per sample in addition to the update.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from driftfit.run.live.rule import AlarmRule, change_probability, check_fits, la
 from driftfit.trackers.base import Tracker
 
 KEPT = 256
-"""Onsets that are kept until they are asked for."""
+"""Number of onsets that are kept until `onsets` is called."""
 
 
 class Onset(NamedTuple):
     """Where an alarm began."""
 
     sample: int
-    """Number of the sample, 0 being the first after the rule was given to the stream."""
+    """Index of the sample, 0 being the first after the rule was given to the stream."""
     time: Any
-    """Its time, where the stream was told."""
+    """Its time, if the stream has times."""
     cause: str
     """The column that is furthest beyond its limit."""
     statistic: float
@@ -34,20 +34,20 @@ class Onset(NamedTuple):
 
 
 class LiveAlarm:
-    """A rule at work in a stream; `Live.detect` makes it.
+    """A rule that watches a stream; `Live.detect` makes it.
 
     Attributes
     ----------
     rule : AlarmRule
         What is compared with which limits.
     active : bool
-        The alarm is on.
+        Whether the alarm is on.
     begun : bool
-        It began at the last sample.
+        Whether it began at the last sample.
     statistic : (c,)
-        What is compared, by ``rule.names``; NaN where there is nothing to judge.
+        The statistics, in the order of ``rule.names``; NaN where there is nothing to judge.
     samples : int
-        Samples that it has seen, those that were not judged included.
+        Number of samples so far, including those that were not judged.
     """
 
     def __init__(self, rule: AlarmRule, tracker: Tracker, names: Sequence[str], wait: int = 0) -> None:
@@ -66,17 +66,17 @@ class LiveAlarm:
 
     @property
     def cause(self) -> str:
-        """The column that is furthest beyond its limit now."""
+        """The column that is now furthest beyond its limit."""
         return self.rule.names[self.rule.cause(self.statistic)]
 
     def onsets(self) -> list[Onset]:
-        """The alarms that began since this was asked last; at most the last 256."""
+        """The alarms that began since the last call; at most the last 256."""
         found = list(self._onsets)
         self._onsets.clear()
         return found
 
     def take(self, tile: Array, lane: int, e: float, s: float, time: Any = None) -> None:
-        """Judge the sample that a lane of the tile has just seen; e is its innovation, s the variance of that."""
+        """Judge the sample that a lane of the tile has just processed; e is its innovation, with variance s."""
         before, judged = self.active, self._wait == 0
         if judged:
             self._compare(tile, lane, e, s)
@@ -92,7 +92,7 @@ class LiveAlarm:
         self.samples += 1
 
     def _compare(self, tile: Array, lane: int, e: float, s: float) -> None:
-        """The statistic after a sample; without a new one the last stays."""
+        """The statistic after a sample; without a new one the last is kept."""
         rule = self.rule
         if rule.kind == "band":
             theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
@@ -127,7 +127,7 @@ class LiveAlarm:
 
 
 def check_rule(rule: Any) -> AlarmRule:
-    """Refuse what is no rule, with the way to one."""
+    """Raise an error for anything that is not a rule."""
     if not isinstance(rule, AlarmRule):
         raise TypeError(
             "Live.detect: pass the rule of a reference run, as in run.detect('innovation', reference=500).rule; "

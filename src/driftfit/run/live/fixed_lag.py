@@ -1,10 +1,10 @@
-"""Fixed-lag smoothing: what a stream says of the last few samples, past and future together, in constant memory.
+"""Fixed-lag smoothing: estimates of the last few samples of a stream from past and future, in constant memory.
 
-A window holds the last ``lag`` + 1 samples; a filter of square-root information
-(`driftfit.trackers.parts.information`) holds what all samples before the window say of theta. Smoothing the window
+A window contains the last ``lag`` + 1 samples. A square-root information filter
+(`driftfit.trackers.parts.information`) holds the information of all samples before the window. Smoothing the window
 from there is exact: row 0 equals the smoother of the whole record that ends now.
 
-Cost: one step of the filter a sample, O(n^3); one exact smoothing of the window, O(lag n^3), when it is asked for.
+Cost: one step of the filter per sample, O(n^3), and one exact smoothing of the window, O(lag n^3), per call.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class FixedLag(NamedTuple):
     """The samples of the window, oldest first."""
 
     theta: Array
-    """(k, n), k = lag + 1 once that many samples have been seen."""
+    """(k, n), k = lag + 1 once that many samples have been observed."""
     std: Array
-    """(k, n): inf for what has not been seen yet."""
+    """(k, n): inf for parameters that are not determined yet."""
 
 
 class Window:
-    """The last ``lag`` + 1 samples of a stream, and what is known from before them."""
+    """The last ``lag`` + 1 samples of a stream, and the information from earlier samples."""
 
     def __init__(self, model: Model, tracker: Tracker, lag: int) -> None:
         if model.noise_varies:
@@ -59,7 +59,7 @@ class Window:
             self._filter(0, begin.rows, begin.values)
 
     def _filter(self, count: int, rows: Array, values: Array) -> None:
-        """Move what is known from before the window over its first ``count`` samples."""
+        """Update the earlier information by the first ``count`` samples of the window."""
         walk = self._first(count)
         drift = np.sqrt(np.append(walk.drift, 0.0))
         filters, _ = two_filters.compiled()
@@ -69,12 +69,12 @@ class Window:
         filters(self.before, walk.phi, walk.y, np.sqrt(walk.weight), drift, *changes, rows, values, scratch)
 
     def _first(self, count: int) -> Walk:
-        """The first ``count`` samples of the window as a problem."""
+        """The smoothing problem of the first ``count`` samples of the window."""
         walk = self.walk._replace(**{name: getattr(self.walk, name)[:count] for name in SAMPLES})
         return slopes.expanded(walk) if len(self.walk.trend) else walk
 
     def push(self, tile: Array, known: tuple[float, float, float], lane: int = 0) -> None:
-        """Take in the sample that a lane of the tile has just seen; ``known`` as the lane was given it."""
+        """Add the sample that a lane of the tile has just processed; ``known`` are its known factors."""
         s, walk = tile[0], self.walk
         if self.count == len(walk.y):
             self._filter(1, np.zeros((0, len(self.G))), np.zeros(0))
@@ -93,14 +93,14 @@ class Window:
         self.count += 1
 
     def smooth(self, tile: Array, lane: int = 0) -> FixedLag:
-        """Smooth the window; a lane of the tile says which directions have been seen, and the noise variance."""
+        """Smooth the window; a lane of the tile gives the directions that are determined, and the noise variance."""
         N, walk = len(self.G), self._first(self.count)
         rows, values = self.before["S"][0, ..., 0], self.before["d"][0, :, 0]
         hidden = np.zeros(N, bool)
         if tile["rank"][0, lane] < N:
             vectors = np.triu(tile["R"][0, ..., lane])[:, np.diagonal(tile["S"][0, ..., lane]) == 0.0]
             tau = float(tile["tau"][0, lane]) if len(walk.trend) else 0.0
-            if len(walk.trend):  # the vectors are of now, and theta0 of the first sample
+            if len(walk.trend):  # the vectors refer to now, and theta0 to the first sample
                 vectors[: N // 2] -= tau * vectors[N // 2 :]
             unseen = two_filters.unspanned(vectors, np.ones(N))
             values = np.append(values, unseen @ walk.theta0)

@@ -1,6 +1,6 @@
 """Inputs that come after the output of their sample, as in a control loop: y_t is read, then u_t is chosen and applied.
 
-What the model remembers is as if u_t had stood beside y_t in a record (`driftfit.models.base.Model.apply`).
+The model stores the same as if u_t and y_t had come in one row of a record (`driftfit.models.base.Model.apply`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from driftfit.trackers.base import Tracker
 
 
 class _Later:
-    """Stands for an input that was left out, unlike None, which is one that is not known."""
+    """Represents an input that was left out, as opposed to None, which is a missing input."""
 
     def __repr__(self) -> str:
         return "LATER"
@@ -24,11 +24,11 @@ class _Later:
 LATER: Any = _Later()
 
 NOTHING, INPUT, IGNORED = 0, 1, 2
-"""What `Live.apply` is expected to bring: nothing, the input of the last sample, or that of one that was ignored."""
+"""What `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored sample."""
 
 
 def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
-    """``apply(tile, u)`` for the tiles of this type; ValueError where outputs need the input of their own sample."""
+    """``apply(tile, u)`` for the tiles of this type; ValueError if outputs need the input of their own sample."""
     step = tracker.apply_for(model)
     if step is None:
         raise ValueError(
@@ -53,7 +53,7 @@ def _compiled(step: Step) -> Driver:
 
 
 def check_applied(expected: int) -> None:
-    """Refuse the next sample while the input of the last one is outstanding."""
+    """Raise an error for a next sample while the input of the last one is outstanding."""
     if expected != NOTHING:
         raise ValueError(
             "Live.update: the input of the last sample has not been given yet: apply(u) after update(y), or "
@@ -62,7 +62,7 @@ def check_applied(expected: int) -> None:
 
 
 def check_expected(expected: int) -> None:
-    """Refuse an input that no sample waits for."""
+    """Raise an error for an input for which no sample is waiting."""
     if expected == NOTHING:
         raise ValueError(
             "Live.apply: no sample is waiting for its input. The order is update(y) without u, then apply(u), once per "

@@ -1,10 +1,10 @@
-"""Live: one sample at a time, the same compiled step as a record, bit for bit.
+"""Live: one sample at a time, with the same compiled step as a record, bit for bit.
 
-In a control loop the input u_t is chosen after y_t has been read. With nk of at least 1 it is not needed before:
+In a control loop the input u_t is chosen after y_t has been read. With nk of at least 1 it is not needed before that:
 
     step = live.update(y_t)      u_t = control law(live.theta, live.cov, ...)      live.apply(u_t)
 
-is, bit for bit, the record in which u_t stands beside y_t.
+gives the same bits as the record with u_t and y_t in one row.
 """
 
 from __future__ import annotations
@@ -47,20 +47,21 @@ _FLOAT = np.dtype(np.float64)
 class Live(Operated, Plain, Kept):
     """Track a stream.
 
-    A stream can be copied, pickled and sent to another process, as it is saved: it goes on as if never stopped.
+    A stream can be copied, pickled and sent to another process, as well as saved: it continues as if never stopped.
 
     Parameters
     ----------
     model, tracker : Model, Tracker
-        As for `track`. A model with several inputs must say so: ``ARX(2, [1, 1])``, ``inputs=["pressure", "flow"]``.
+        As for `track`. A model with several inputs must declare them: ``ARX(2, [1, 1])``, ``inputs=["pressure",
+        "flow"]``.
     dt : number, duration, step of the calendar or "label"
-        Nominal interval between samples, as for `track`; with datetimes it must be given.
+        Nominal interval between samples, as for `track`; with datetimes it is required.
     lag : int
         Keep the last ``lag`` samples for `smooth`; 0 keeps none.
     warm_start : Track, Live or None
-        Begin where that run ended.
+        Continue where that run ended.
     limits : mapping from signals to (low, high)
-        Valid ranges as for `track`: a number outside is missing, and counted in ``outside``.
+        Valid ranges as for `track`: a number outside its range is missing, and counted in ``outside``.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
@@ -105,7 +106,7 @@ class Live(Operated, Plain, Kept):
         self._open(self.program.tile(*carried(warm_start, [self.program])))
 
     def _open(self, tile: Array) -> None:
-        """Take a state and compile the step for it."""
+        """Set a state and compile the step for it."""
         self._tile = tile
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
@@ -120,7 +121,7 @@ class Live(Operated, Plain, Kept):
         self._be_careful()
 
     def _be_careful(self) -> None:
-        """Whether a sample is more than a call of the compiled step."""
+        """Whether a sample needs more than a call of the compiled step."""
         more = self._window, self._gate
         self._careful = more != (None, None) or bool(self._alarms) or self._awaits != NOTHING
 
@@ -138,15 +139,15 @@ class Live(Operated, Plain, Kept):
         drift: Any = 1.0,
         prob: Any = None,
     ) -> Step:
-        """Take one sample in and return (y_hat, e, s, ok).
+        """Process one sample and return (y_hat, e, s, ok).
 
-        ``y`` is a number; None, NaN or inf when it is missing. ``u`` is a number for one input, a sequence of m
-        otherwise, or a mapping from the names of the inputs; None where it is not known. Left out it comes with
+        ``y`` is a number; None, NaN or inf if it is missing. ``u`` is a number for one input, a sequence of m
+        otherwise, or a mapping from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
         `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
         the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
-        and leaves the state alone. ``weight`` divides the noise variance of this sample (0: do not use it), ``drift``
-        multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change (`Bank`).
-        A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
+        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it),
+        ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change
+        (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
@@ -158,13 +159,13 @@ class Live(Operated, Plain, Kept):
             return self._update_one(self._tile, y, u)  # type: ignore[no-any-return]
         if u is LATER and self._m:
             return self._update_later(y)
-        # the compiled step reads m floats wherever it is pointed, so they must be there
+        # the compiled step reads m floats from any address, so they must exist
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
         return self._update(self._tile, y, u)  # type: ignore[no-any-return]
 
     def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
-        """One sample of which more is known than interval, noise and drift."""
+        """A sample with more known factors than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
             self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
@@ -206,14 +207,14 @@ class Live(Operated, Plain, Kept):
         return step
 
     def _update_later(self, y: float) -> Step:
-        """One sample of which nothing more is known, and whose input comes with `apply`."""
+        """A sample without known factors, whose input comes with `apply`."""
         self._placing()
         step: Step = self._update(self._tile, y, self._unknown)
         self._expect(INPUT)
         return step
 
     def _placing(self) -> Any:
-        """What puts an input in its place; ValueError for a model that needs it at once."""
+        """The routine that stores an input; ValueError for a model that needs it at once."""
         if self._place is None:
             self._place = applier(self.model, self.tracker, self._tile)
         return self._place
@@ -225,19 +226,19 @@ class Live(Operated, Plain, Kept):
     def apply(self, u: Any) -> None:
         """Give the input of the last sample, once it has been chosen: ``update(y)`` without u, then ``apply(u)``.
 
-        Together they leave the state that ``update(y, u)`` leaves. In between, `predict` and `forecast` say what an
-        input would do; saving and copying keep what is outstanding. For models whose inputs act after one sample or
+        Together they leave the state that ``update(y, u)`` leaves. In between, `predict` and `forecast` show the effect
+        of an input; saving and copying keep the outstanding input. For models whose inputs act after one sample or
         more (nk of at least 1).
 
         Parameters
         ----------
         u : number, sequence of m, or None
-            None: not known. After a sample that was ignored for its time the input is ignored too.
+            None: missing. After a sample that was ignored for its time the input is ignored too.
 
         Raises
         ------
         ValueError
-            If no sample waits for its input, or u has not m numbers.
+            If no sample is waiting for its input, or u does not have m numbers.
         """
         check_expected(self._awaits)
         given = self._inputs(u)
@@ -249,15 +250,15 @@ class Live(Operated, Plain, Kept):
 
     @property
     def awaits(self) -> bool:
-        """Whether the input of the last sample is outstanding: it comes with `apply`."""
+        """Whether the input of the last sample is outstanding; it comes with `apply`."""
         return self._awaits != NOTHING
 
     def predict(self, u: Any = None) -> tuple[float, float]:
-        """(y_hat, s): what the next output is expected to be if its input is ``u``; the state stays as it is.
+        """(y_hat, s): the prediction of the next output if its input is ``u``; the state stays unchanged.
 
-        While `apply` is outstanding ``u`` stands for what it would bring, so that candidates can be compared.
+        While `apply` is outstanding ``u`` is the input that it would receive, so that candidates can be compared.
         """
-        self._scratch_bytes[:] = self._bytes  # a record copied field by field takes ten times as long
+        self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         if self._awaits == INPUT:
             self._placing()(self._scratch, inputs)
@@ -265,9 +266,9 @@ class Live(Operated, Plain, Kept):
         return y_hat, s
 
     def smooth(self) -> FixedLag:
-        """The last ``lag`` + 1 samples, oldest first, each from all samples so far: theta and std, (lag + 1, n).
+        """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
 
-        Row 0 is what `Track.smooth` would say of that sample of a record that ends now.
+        Row 0 is what `Track.smooth` would give for that sample of a record that ends now.
         """
         if self._window is None:
             raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
@@ -276,21 +277,21 @@ class Live(Operated, Plain, Kept):
     def detect(self, rule: AlarmRule, wait: int | None = None) -> LiveAlarm:
         """Watch the stream from the next sample on by the rule of a reference run, ``run.detect(...).rule``.
 
-        The alarm says after every update whether it is on, has just begun, and for what cause (`LiveAlarm`). It is
-        saved with the state; `alarms` gives all of them. Over the same samples it says what ``Track.detect(rule,
-        start=...)`` says of the record, bit for bit.
+        After every update the alarm shows whether it is on, whether it has just begun, and its cause (`LiveAlarm`). It
+        is saved with the state; `alarms` returns all of them. Over the same samples it gives the alarms of
+        ``Track.detect(rule, start=...)`` on the record, bit for bit.
 
         Parameters
         ----------
         rule : AlarmRule
             Limits and settings. The tracker should be that of the reference run.
         wait : int or None
-            Samples that are not judged. None: those of a start from nothing, max(50, 5 n); 0 after a warm start.
+            Number of samples that are not judged. None: those of the start, max(50, 5 n); 0 after a warm start.
 
         Raises
         ------
         ValueError
-            For a tracker or model that has not what the rule compares.
+            If the tracker or model does not support the rule.
         """
         start = burn_in(self.model.n) if self._cold else 0
         wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
@@ -309,7 +310,7 @@ class Live(Operated, Plain, Kept):
         return state_of(self._tile)
 
     def end(self) -> End:
-        """Where the stream stands, for a run to begin (`warm_start`)."""
+        """The present state of the stream, from which another run can continue (`warm_start`)."""
         state = {name: np.array(value) for name, value in self.lane().items()}
         return End((self.program,), (state,), self._last, self._awaits)
 
@@ -345,7 +346,7 @@ class Live(Operated, Plain, Kept):
 
     @property
     def std(self) -> Array:
-        """Their standard deviations, (n,): inf for what has not been seen yet, NaN without a covariance."""
+        """Their standard deviations, (n,): inf for parameters that are not determined yet, NaN without a covariance."""
         std: Array = np.sqrt(np.diag(self.cov))
         return std
 
@@ -356,12 +357,12 @@ class Live(Operated, Plain, Kept):
 
     @property
     def learning(self) -> Array:
-        """Which parameters are being learned now, (n,) bool: False where the recent inputs were too dull to tell."""
+        """Which parameters are being learned now, (n,) bool: False if recent inputs had too little excitation."""
         return self.tracker.learning(self.lane())
 
     @property
     def ignored(self) -> int:
-        """Samples that came with a time not after the last."""
+        """Number of samples whose time was not after the last."""
         return self._ignored
 
     @property
@@ -370,7 +371,7 @@ class Live(Operated, Plain, Kept):
         return {} if self._gate is None else self._gate.counts
 
     def _plain(self) -> dict[str, Any]:
-        """The state beside the fields of the record, as plain data."""
+        """The state besides the fields of the record, as plain data."""
         return {
             "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
             "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,

@@ -15,7 +15,7 @@ from driftfit.trackers.base import Tracker
 
 KNOWN = ("interval", "noise", "drift")
 ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
-"""What is known of a sample of which nothing is said, and of one while the stream is held."""
+"""Known factors of a sample by default, and of one while the stream is held."""
 
 
 class Operated(ABC):
@@ -35,9 +35,9 @@ class Operated(ABC):
         """The fields of the record, as views."""
 
     def hold(self, on: bool = True) -> None:
-        """Stop learning, or (``hold(False)``) take it up again: for work on the plant, a test, a sensor being cleaned.
+        """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, a sensor being cleaned.
 
-        While held, samples move the lags and are predicted, but are not used (``ok`` is False), and no time passes
+        While held, samples enter the lags and are predicted, but are not used (``ok`` is False), and no time passes
         for the parameters and their covariance. Being held is part of the state that `save` writes.
         """
         self._rest(HELD if on else ORDINARY)
@@ -48,22 +48,22 @@ class Operated(ABC):
         return bool(self._tile["noise"][0, 0] == np.inf)
 
     def reset(self, which: str | int | Sequence[str | int] | None = None, p: Any = None, theta: Any = None) -> None:
-        """Tell the tracker what an operator knows: these parameters may have moved, or stand at other values now.
+        """Tell the tracker what an operator knows: these parameters may have changed, or have new values.
 
         Parameters
         ----------
         which : name, index, several of them, or None
             The parameters; None is all.
         p : number or one per parameter
-            Variance of the move, in squared units of theta; it is added to what is uncertain already. After maintenance
+            Variance of the change, in squared units of theta; it is added to the present variance. After maintenance
             a large value lets the next samples decide.
         theta : number or one per parameter
-            Where they stand now, if that is known.
+            Their new values, if they are known.
 
         Raises
         ------
         ValueError
-            A parameter that is not there, a negative or infinite p, a tracker without a covariance to widen.
+            For an unknown parameter, a negative or infinite p, or a tracker without a covariance to widen.
         """
         chosen = self._chosen(which)
         if p is None and theta is None:
@@ -93,6 +93,6 @@ class Operated(ABC):
         return chosen
 
     def _rest(self, known: tuple[float, float, float]) -> None:
-        """Set what holds for every sample that says nothing else."""
+        """Set the known factors of every sample that gives none."""
         for name, value in zip(KNOWN, known, strict=True):
             self._tile[name] = value

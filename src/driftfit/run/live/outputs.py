@@ -38,8 +38,8 @@ class LiveOutputs(Plain, storage.Kept):
     """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
 
     ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
-    mapping from the name of each output to its own. Times and drifts are those of `Live`, weights too, or one for each
-    output; ``warm_start`` is a record or a stream of the same outputs.
+    mapping from the name of each output to its tracker. Times and drifts are those of `Live`; so are weights, or there
+    is one for each output. ``warm_start`` is a record or a stream of the same outputs.
     """
 
     _kind: ClassVar[str] = "outputs"
@@ -78,10 +78,10 @@ class LiveOutputs(Plain, storage.Kept):
         return tuple(one.tracker for one in self.programs)
 
     def update(self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
-        """Take one sample in: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
+        """Process one sample: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
 
-        u is None where it is not known; left out it comes with `apply`, as in `Live.update`. y may map the names of the
-        outputs, and u those of the inputs of a model that has them, to numbers.
+        u is None if it is not known; if it is left out, it comes with `apply`, as in `Live.update`. y may map the names
+        of the outputs to numbers, and u those of the inputs if the model has names for them.
         """
         ny = len(self.model.outputs)
         check_applied(self._awaits)
@@ -141,12 +141,12 @@ class LiveOutputs(Plain, storage.Kept):
         self._awaits = NOTHING
 
     def _apply(self, tile: Array, inputs: Array) -> None:
-        """What is outstanding, put in its place in a tile."""
+        """Write the inputs that were outstanding into a tile."""
         if self._awaits == INPUT:
             self._placing()(tile, inputs)
 
     def _placing(self) -> Any:
-        """What puts inputs in their places; ValueError for a model that needs them at once."""
+        """The routine that writes late inputs into the state; ValueError for a model that needs them at once."""
         if self._place is None:
             self._place = applier(self.model, self.trackers[0], self._tile)
         return self._place
@@ -157,7 +157,7 @@ class LiveOutputs(Plain, storage.Kept):
         return self._awaits != NOTHING
 
     def _known(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
-        """What the driver is told of one sample, (k, ny)."""
+        """What the driver knows of one sample, (k, ny)."""
         ny = len(self.model.outputs)
         each = np.ndim(drift) == 1
         known = np.ones((3, ny))
@@ -183,8 +183,8 @@ class LiveOutputs(Plain, storage.Kept):
     def detect(self, rules: Mapping[str, AlarmRule], wait: int | None = None) -> dict[str, LiveAlarm]:
         """Watch outputs by the rules of reference runs, by name: ``{"flow": run["flow"].detect(...).rule}``.
 
-        One rule an output; ``wait`` and the alarms are those of `Live.detect`. ValueError where the outputs share one
-        theta, or for a name that is not there.
+        One rule per output; ``wait`` and the alarms are those of `Live.detect`. ValueError where the outputs share one
+        theta, or for an unknown name.
         """
         start = burn_in(self._rows.n) if self._cold else 0
         wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
@@ -232,12 +232,12 @@ class LiveOutputs(Plain, storage.Kept):
             window.push(tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
 
     def _rest(self, tile: Array) -> None:
-        """What was known of one sample holds for no other."""
+        """Reset what was known of one sample, because it does not hold for the next."""
         if "each" in storage.fields(tile):
             tile["each"] = 1.0
 
     def _said(self) -> Steps:
-        """What the driver wrote, a number for each lane."""
+        """What the driver wrote, one number per lane."""
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
 
@@ -295,7 +295,7 @@ class LiveOutputs(Plain, storage.Kept):
 
     @property
     def ignored(self) -> int:
-        """Samples that came with a time not after the last."""
+        """Number of samples whose time was not after the last."""
         return self._ignored
 
     @property
@@ -304,7 +304,7 @@ class LiveOutputs(Plain, storage.Kept):
         return {} if self._gate is None else self._gate.counts
 
     def end(self) -> End:
-        """Where the stream stands, for a run to begin (`warm_start`)."""
+        """The present state of the stream, from which another run can continue (`warm_start`)."""
         lanes = range(len(self.programs))
         states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
         return End(self.programs, states, self._last, self._awaits)

@@ -2,10 +2,10 @@
 
     band          z_ti = max(theta_ti - high_i, low_i - theta_ti) / std_ti
     innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
-                  score among innovations that were normal
+                  score among normal innovations
     probability   the probability of a change in the tracker's window
 
-A record and a stream do the same operations in the same order, so that they agree bit for bit.
+A record and a stream use the same operations in the same order, so their results agree bit for bit.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from driftfit.trackers.base import Tracker
 KINDS = ("band", "innovation", "probability")
 
 CHANGE, REPORT = "window", "report"
-"""Where the probability of a change is: a field that a tracker stores, or in the report of a `Bank`."""
+"""Where the probability of a change is stored: in a field of the tracker, or in the report of a `Bank`."""
 
 
 @dataclass(frozen=True)
 class AlarmRule(Settings):
-    """What `Track.detect` found in its reference: `Alarms.rule`. Frozen, equal by value, saved as plain data.
+    """What `Track.detect` estimated from its reference: `Alarms.rule`. Frozen, equal by value, saved as plain data.
 
     Attributes
     ----------
@@ -37,15 +37,15 @@ class AlarmRule(Settings):
     every : number
         Samples in which one false alarm may begin.
     names, limits : (c,)
-        What is compared (parameters; "power" and "mean" of the innovations; "probability"), and with what.
+        Names of the statistics (parameters; "power" and "mean" of the innovations; "probability"), and their limits.
     hold : int
-        An alarm stays on for so many samples after what caused it.
+        Number of samples for which an alarm stays on after its cause.
     window : int
         Samples in the sums of "innovation".
     low, high : (c,)
         Bands of the parameters, for "band".
     normal : (k,)
-        Absolute standardised innovations that are normal, ascending, for "innovation" with a reference; else empty.
+        Normal absolute standardised innovations, ascending, for "innovation" with a reference; otherwise empty.
     simulated : bool
         Whether the limits were found by simulation.
     """
@@ -67,15 +67,15 @@ class AlarmRule(Settings):
 
     @property
     def slack(self) -> float:
-        """By what limits are wider because what is normal is itself an estimate."""
+        """How much wider the limits are because the reference is itself an estimate."""
         return float(np.sqrt(1.0 + self.window / len(self.normal))) if self.normal else 1.0
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Places of the watched parameters among those of a run; ValueError where one is not there."""
+        """Indices of the watched parameters among those of a run; ValueError if one does not exist."""
         return [names.index(name) for name in self.names] if self.kind == "band" else []
 
     def outside(self, theta: Array, std: Array) -> Array:
-        """How many standard deviations parameters (.., c) are outside their bands; NaN where nothing is known."""
+        """How many standard deviations parameters (.., c) are outside their bands; NaN if they are not determined."""
         with np.errstate(invalid="ignore", divide="ignore"):
             beyond = np.maximum(theta - np.array(self.high), np.array(self.low) - theta) / std
         return np.where(np.isfinite(std), beyond, np.nan)
@@ -98,17 +98,17 @@ class AlarmRule(Settings):
         return int(np.argmax(ratio))
 
     def limit_text(self, column: int) -> str:
-        """The limit of a column as it is written; a probability near 1 as its distance from it."""
+        """The limit of a column as text; a probability near 1 as its distance from 1."""
         return value_text(self.kind, self.limits[column])
 
 
 def value_text(kind: str, value: float) -> str:
-    """A statistic or a limit as it is written; a probability near 1 as its distance from it."""
+    """A statistic or a limit as text; a probability near 1 as its distance from 1."""
     return f"1 - {1.0 - value:.2g}" if kind == "probability" and 0.999 < value < 1.0 else f"{value:.4g}"
 
 
 def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
-    """Refuse what a tracker cannot be watched for."""
+    """Raise an error if a tracker does not support the alarm."""
     kind = type(tracker).__name__
     absent = [name for name in rule.names if name not in names] if rule.kind == "band" else []
     if absent:
@@ -133,7 +133,7 @@ def normal_scores(g: Array, known: Array) -> Array:
 
 
 def moving_sums(values: Array, window: int) -> Array:
-    """Sums (.., T - window + 1) of neighbours on the last axis, added from the oldest on, as a stream adds them."""
+    """Sums (.., T - window + 1) of neighbours on the last axis, added from the oldest on, as in a stream."""
     count = max(values.shape[-1] - window + 1, 0)
     total = np.zeros((*values.shape[:-1], count))
     for k in range(window if count else 0):

@@ -1,1 +1,1 @@
-"""What tables and pictures of all results share; it knows runs, and no verb."""
+"""What the tables and pictures of all results share; it uses runs only, and no function that analyses them."""

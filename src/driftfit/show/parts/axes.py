@@ -19,7 +19,7 @@ BLUE, RED, GREY = "#1f5fa8", "#c23b22", "#8a8a8a"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure that belongs to no window, so that it needs no display and is freed like any object."""
+    """An empty figure without a window, so that it needs no display and is freed like any object."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -28,12 +28,12 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def named(name: str, unit: str) -> str:
-    """A name with its unit, where it has one."""
+    """A name with its unit, if it has one."""
     return f"{name} ({unit})" if unit else name
 
 
 def time_label(run: Track) -> str:
-    """What stands under the axis of time."""
+    """The label of the time axis."""
     if not run.timed:
         return "sample"
     name = run.labels.time or "time"
@@ -41,7 +41,7 @@ def time_label(run: Track) -> str:
 
 
 def date_axis(axis: Axes, run: Track) -> None:
-    """Ticks at round dates, in the time zone of the table, each part of the date written once."""
+    """Ticks at round dates in the time zone of the table; each part of the date is written once."""
     if run.time.dtype.kind != "M":
         return
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -53,9 +53,9 @@ def date_axis(axis: Axes, run: Track) -> None:
 
 
 def draw_prediction(axis: Axes, run: Track) -> None:
-    """The output, and what was predicted one step before it was seen."""
+    """The output, and its prediction one step ahead."""
     axis.plot(run.time, run.y, color=GREY, ls="", marker=".", ms=3.0, label="output")
-    # without knowledge the prediction is theta0's, which says nothing
+    # the first predictions come from theta0 alone and mean nothing
     known = np.where(np.isinf(run.innovation_std), np.nan, run.prediction)
     axis.plot(run.time, known, color=BLUE, lw=0.9, label="one-step prediction")
     frame(axis, np.concatenate([run.y, run.prediction[settled(run)]]))

@@ -20,8 +20,7 @@ WIDTH = 96
 def printed(*parts: Any) -> str:
     """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
 
-    Left to itself rich hands what is printed to the display of a notebook, and takes colours and widths from the
-    environment.
+    By default rich sends output to the display of a notebook, and takes colours and widths from the environment.
     """
     text = StringIO()
     console = Console(
@@ -33,14 +32,14 @@ def printed(*parts: Any) -> str:
 
 
 class Printed(JupyterMixin):
-    """A result that rich draws: ``str`` gives it as plain text, and a notebook shows it as the value of a cell."""
+    """A result that rich draws: ``str`` returns it as plain text, and a notebook shows it as the value of a cell."""
 
     def __str__(self) -> str:
         return printed(self)
 
 
 def key_text(key: Hashable) -> str:
-    """The key of a series as text; that of several columns without brackets."""
+    """The key of a series as text; a key of several columns has no brackets."""
     return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
 
 
@@ -50,12 +49,12 @@ def counts(dropped: Mapping[str, int]) -> str:
 
 
 def shortened(text: str) -> str:
-    """Numbers of more than six digits in six."""
+    """Round numbers of more than six digits to six."""
     return re.sub(r"\d\.\d{6,}(e-?\d+)?", lambda found: f"{float(found[0]):.6g}", text)
 
 
 def facts(*pairs: tuple[str, str]) -> Table:
-    """Names and what they are, side by side; text as it stands, since b1[flow] is not markup."""
+    """Names and values side by side, as plain text, since b1[flow] is not markup."""
     table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, value in pairs:
         table.add_row(Text(name, "bold"), Text(value))
@@ -63,11 +62,11 @@ def facts(*pairs: tuple[str, str]) -> Table:
 
 
 SHORT = 10
-"""Cells of at most so many signs stand on one line: numbers, and p-values such as < 0.0001."""
+"""A cell of at most this many characters stays on one line: numbers, and p-values such as < 0.0001."""
 
 
 class Numbers(Table):
-    """A table no wider than `WIDTH` or the terminal, in which nothing is cut: what is too wide is broken at blanks."""
+    """A table no wider than `WIDTH` or the terminal, in which nothing is cut off: long text is wrapped at blanks."""
 
     def add_row(self, *cells: Any, **options: Any) -> None:
         """Add a row; every column is at least as wide as its longest word."""
@@ -85,7 +84,7 @@ def _widen(column: Column, text: str) -> None:
 
 
 def table_of(title: str, *heads: str, names: int = 1) -> Table:
-    """A table of numbers over the full width: the first ``names`` columns to the left, numbers to the right."""
+    """A table of numbers over the full width; the first ``names`` columns are left-aligned, numbers right-aligned."""
     table = Numbers(
         title=f"\n {title}", title_justify="left", title_style="bold", box=SIMPLE_HEAD, show_edge=False, expand=True
     )

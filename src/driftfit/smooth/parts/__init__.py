@@ -1,1 +1,1 @@
-"""The exact smoother inside: the problem, elimination, two filters that meet, rank."""
+"""Parts of the exact smoother: the problem, elimination, two filters that meet, rank."""

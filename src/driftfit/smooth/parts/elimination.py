@@ -10,11 +10,11 @@ variance g = q_i drift_t each_ti^2, and leaves
 between which the sample adds w phi phi' to U and w phi y to z. This is the recursion of flexible least squares,
 theta_t = e_t + M_t theta_{t+1}, with M_t as a product of n steps, so O(n^2) for means and no matrix to invert.
 
-Refinement: the same a with the residuals of the path in the place of y and its increments x as known shifts,
-z_i + x_i / g in the place of z_i, give the correction delta, whose size tells the error of the path before it.
+Refinement: the same a, with the residuals of the path instead of y and its increments x as known shifts (z_i + x_i / g
+instead of z_i), gives the correction delta, whose size estimates the error of the path before it.
 
-The result is accepted when delta is small, no step cancelled more than six digits (f), and no sample has a leverage so
-near to 1 that its leave-one-out residual is lost. Otherwise `driftfit.smooth.parts.two_filters` solves the problem:
+The result is accepted if delta is small, no step cancelled more than six digits (f), and no sample has a leverage so
+close to 1 that its leave-one-out residual is lost. Otherwise `driftfit.smooth.parts.two_filters` solves the problem;
 drift far above the noise and collinear regressors fail the test.
 
 Sources: Kalaba and Tesfatsion (1989); Wilkinson (1963) for refinement. Cost: O(T n^3), mostly means at O(T n^2).
@@ -33,14 +33,14 @@ CORRECTION = 1e-10
 """Largest correction, relative to the largest value of the parameter."""
 
 CANCELLED = 1e-6
-"""Least f: below it U has lost more than six digits in one step."""
+"""Smallest f: below it U has lost more than six digits in one step."""
 
 LEVERAGE = 1e-5
-"""Least 1 - h: below it 1 - h has lost more than five digits."""
+"""Smallest 1 - h: below it 1 - h has lost more than five digits."""
 
 
 def smooth(walk: Walk) -> Path | None:
-    """Solve a problem with a diagonal q and a diffuse start of full rank; None where the result is not good enough."""
+    """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough."""
     T, n = walk.phi.shape
     work = workspace(n).copy()
     a, b = np.empty((T, n, n)), np.empty((T, n))
@@ -65,7 +65,7 @@ def smooth(walk: Walk) -> Path | None:
 
 
 def inverse(U: Array) -> Array | None:
-    """U^-1 after scaling its diagonal to 1; None where U is singular to the machine."""
+    """U^-1 after scaling its diagonal to 1; None if U is numerically singular."""
     size = np.sqrt(np.diag(U))
     if not (size > 0.0).all():
         return None
@@ -79,7 +79,7 @@ def inverse(U: Array) -> Array | None:
 
 @lru_cache
 def workspace(n: int) -> Array:
-    """Scratch space, to be copied; a record so that the compiler knows n."""
+    """Scratch space, to be copied; it is a record so that the compiler knows n."""
     square, vector = (np.float64, (n, n)), (np.float64, (n,))
     vectors = ("z", "theta", "v", "correction", "size")
     return np.zeros(1, np.dtype([("U", *square), ("C", *square), *((name, *vector) for name in vectors)]))
@@ -89,7 +89,7 @@ def workspace(n: int) -> Array:
 def forwards(
     work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array
 ) -> float:
-    """Eliminate every increment; leaves the last U and z in the work space and returns the least f."""
+    """Eliminate every increment; leaves the last U and z in the scratch space and returns the smallest f."""
     s = work[0]
     n = s.z.shape[0]
     many = 1 if each.shape[0] > 1 else 0
@@ -129,7 +129,7 @@ def backwards(
     work: Array, phi: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
     theta: Array, var: Array, left: Array,
 ) -> None:  # fmt: skip
-    """theta, variances and 1 - leverage, from the last theta and C in the work space."""
+    """theta, variances and 1 - leverage, from the last theta and C in the scratch space."""
     s = work[0]
     n = s.z.shape[0]
     many = 1 if each.shape[0] > 1 else 0
@@ -195,7 +195,7 @@ def residuals(
 
 @Driver
 def correct(work: Array, a: Array, b: Array, theta: Array) -> None:
-    """The backward pass of the refinement: adds the correction to theta and notes its size and theta's."""
+    """The backward pass of the refinement: adds the correction to theta and stores the sizes of both."""
     s = work[0]
     n = s.z.shape[0]
     for i in range(n):

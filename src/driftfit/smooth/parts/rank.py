@@ -1,4 +1,4 @@
-"""Rank of the regressors of a record: decided on the rows that are used, their columns scaled to unit rms."""
+"""Rank of the regressors of a record, decided on the used rows with columns scaled to unit rms."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def column_scale(phi: Array, weight: Array) -> Array:
 
 
 def ranks(phi: Array, weight: Array, scale: Array) -> tuple[Array, Array]:
-    """Rank of the scaled regressors up to each sample, (T,), and vectors that none of them sees, (n, n - rank)."""
+    """Rank of the scaled regressors up to each sample, (T,), and a basis of their null space, (n, n - rank)."""
     n = len(scale)
     rank = np.empty(len(phi), np.int64)
     S, R = np.zeros((n, n)), np.eye(n)

@@ -1,4 +1,4 @@
-"""Second differences: the exact smoother of parameters whose slope walks at random.
+"""Second differences: the exact smoother of parameters whose slope is a random walk.
 
     minimise  sum_t weight_t (y_t - phi_t' theta_t)^2 + sum_t |G^-1 E_t^-1 (slope_t - slope_{t-1})|^2 / drift_t
     slope_t = (theta_t - theta_{t-1}) / trend_t
@@ -10,13 +10,13 @@ theta_t - 2 theta_{t-1} + theta_{t-2}. As a problem of 2 n parameters x_t = (the
 
 which the two filters of `driftfit.smooth.parts.two_filters` solve, with a shear of the triangle for F_t.
 
-A straight line costs nothing. So 2 n directions must be determined, by regressors (phi_t, tau_t phi_t) of x at the
-first sample, tau_t the time since then: two samples for each direction of theta. What they never span takes theta0 and
-a slope of zero at the first sample.
+A straight line costs nothing, so 2 n directions must be determined. The regressors of x at the first sample are
+(phi_t, tau_t phi_t), with tau_t the time since then: two samples are needed for each direction of theta. Directions
+that they never span take theta0 and a slope of zero at the first sample.
 
 Use it for parameters that move smoothly, and for forecasts that follow a trend; jumps are smeared more than by first
 differences. Source: Whittaker (1923) for the penalty; Young (2011), chapter 4, for the integrated random walk. Cost:
-O(T n^3), eight times that of first differences on the safe path.
+O(T n^3), eight times that of first differences with the safe method.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def smooth(walk: Walk, keep: str = "std") -> Path:
 
 
 def expanded(walk: Walk) -> Walk:
-    """The problem in level and slope."""
+    """The problem in terms of level and slope."""
     each = walk.each if len(walk.each) else np.ones(walk.phi.shape)
     return walk._replace(
         phi=np.hstack([walk.phi, np.zeros_like(walk.phi)]),
@@ -58,12 +58,12 @@ def expanded(walk: Walk) -> Walk:
 
 
 def root(g: Array) -> Array:
-    """The triangle by which both level and slope take in the noise of the slope, before ``each`` scales its rows."""
+    """The triangle through which level and slope receive the noise of the slope, before ``each`` scales its rows."""
     return np.block([[np.zeros_like(g), g], [np.zeros_like(g), g]])
 
 
 def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
-    """Rank up to each sample, and what is known before the first one."""
+    """Rank up to each sample, and the information before the first one."""
     span = max(float(time[-1]), 1.0)
     at_first = np.hstack([walk.phi, walk.phi * (time / span)[:, None]])
     rank, unseen = ranks(at_first, walk.weight, double)
@@ -78,14 +78,14 @@ def start(walk: Walk, double: Array, time: Array) -> tuple[Array, Start]:
 
 
 def moved(rows: Array, time: float) -> Array:
-    """Rows on x at the first sample as rows on x ``time`` later, had nothing drifted."""
+    """Rows on x at the first sample expressed as rows on x ``time`` later, without drift."""
     n = rows.shape[1] // 2
     later: Array = np.hstack([rows[:, :n], rows[:, n:] - time * rows[:, :n]])
     return later
 
 
 def undetermined(natural: Array, time: Array) -> Array:
-    """Which levels and slopes have a share in unseen directions, (T, 2 n): the level moves along the slope."""
+    """Which levels and slopes have a component in undetermined directions, (T, 2 n); the level follows the slope."""
     n = natural.shape[1] // 2
     first, second = natural[:, :n], natural[:, n:]
     level = np.linalg.norm(first + time[:, None, None] * second, axis=1) / np.hypot(1.0, time)[:, None]

@@ -1,19 +1,19 @@
-"""Two filters of square-root information that meet at every sample: the safe path of the exact smoother.
+"""Two square-root information filters that meet at every sample: the safe method of the exact smoother.
 
-    forwards    (S-, d-)_t   what the prior and the samples before t say of theta_t
-    backwards   (S+, d+)_t   what the samples after t say of theta_t
+    forwards    (S-, d-)_t   information on theta_t from the prior and the samples before t
+    backwards   (S+, d+)_t   information on theta_t from the samples after t
     T_t         = (S-, d-) with the rows of (S+, d+) rotated in: theta_t without sample t
     theta_t, C_t              from T_t with the row of sample t rotated in: theta_t = T^-1 d, C_t = T^-1 T^-T
 
-The last rotation leaves rho and the product c of the cosines, which give without cancellation
+The last rotation yields rho and the product c of the cosines, which give without cancellation
 
     leverage h_t            1 - h_t = c^2
     residual                y_t - phi_t' theta_t = rho c / sqrt(weight_t)
     with t left out         y_t - phi_t' theta_t(without t) = rho / (c sqrt(weight_t))
 
-It serves every ratio of drift to noise, any prior, zero and singular q, a drift of its own for every parameter and
+It handles every ratio of drift to noise, any prior, zero and singular q, a separate drift for every parameter and
 sample (rows of G scaled by ``each``), slopes (a shear of S by ``trend``), collinear and badly scaled regressors. Both
-filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), 8 (n + 1) (n + 2) bytes a sample.
+filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), 8 (n + 1) (n + 2) bytes per sample.
 
 Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the rotations
 (`driftfit.trackers.parts.information`). Departure: leverage and leave-one-out residuals from the cosines.
@@ -32,13 +32,13 @@ from driftfit.smooth.parts.walk import Path, Walk
 from driftfit.trackers.parts import information
 
 KNOWN_EXACTLY = 1e8
-"""How much more is known of what the prior fixes than all samples together could say; its square is beyond rounding."""
+"""Information on directions that the prior fixes, relative to that of all samples; its square exceeds the precision."""
 STANDS_STILL = 1e-60
-"""The drift of a direction that does not move, in scaled units: its weight is the square of the inverse."""
+"""The drift of a direction that does not move, in scaled units; its weight is the square of the inverse."""
 
 
 class Start(NamedTuple):
-    """What is known before the first sample, ``rows theta_1 = values``, and which parameters stay undetermined."""
+    """The information before the first sample, ``rows theta_1 = values``, and which parameters stay undetermined."""
 
     rows: Array
     values: Array
@@ -47,7 +47,7 @@ class Start(NamedTuple):
 
 
 def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") -> Path:
-    """Solve the problem with columns divided by ``scale``; G is the root of q in these units."""
+    """Solve the problem with columns divided by ``scale``; G is the square root of q in these units."""
     cross, hidden = np.outer(scale, scale), begin.hidden
     scaled = walk._replace(phi=walk.phi / scale)
     found, blocks = meeting(scaled, G, begin.rows, begin.values, keep)
@@ -60,7 +60,7 @@ def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") 
 
 
 def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
-    """Let the two filters run and meet, from ``rows theta_1 = values`` and G G' = q; also what they knew on the way."""
+    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return what they know."""
     T, n = walk.phi.shape
     root, drift = np.sqrt(walk.weight), np.sqrt(np.append(walk.drift, 0.0))
     blocks = np.zeros(-(-T // WIDTH), block_type(n))
@@ -76,16 +76,16 @@ def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std")
 
 
 def changes(walk: Walk) -> tuple[Array, Array]:
-    """``each`` and ``trend`` with an entry after the last sample, where nothing happens any more."""
+    """``each`` and ``trend`` with an entry after the last sample, where nothing changes."""
     each, trend = walk.each, walk.trend.ravel()
     each = np.vstack([each, np.ones((1, each.shape[1]))]) if len(each) else each
     return each, np.append(trend, 0.0) if len(trend) else trend
 
 
 def start(walk: Walk, scale: Array, unseen: Array) -> Start:
-    """The start of a problem whose regressors, divided by ``scale``, see none of the vectors ``unseen`` (n, k).
+    """The start of a problem whose regressors, divided by ``scale``, are orthogonal to the vectors ``unseen`` (n, k).
 
-    A proper prior gives a row for each of its axes. Without one, a row that fixes the first point is needed in every
+    A proper prior gives one row for each of its axes. Without one, a row that fixes the first point is needed in every
     direction that the regressors never span; it costs nothing there, so its weight does not matter.
     """
     theta0 = walk.theta0 * scale
@@ -103,27 +103,27 @@ def start(walk: Walk, scale: Array, unseen: Array) -> Start:
 
 
 def unspanned(unseen: Array, scale: Array) -> Array:
-    """Orthonormal basis, in rows, of the theta that regressors do not see, from such vectors for scaled regressors."""
+    """Orthonormal basis, in rows, of the directions of theta without information, from those of scaled regressors."""
     basis: Array = np.linalg.qr(unseen / scale[:, None])[0].T
     return basis
 
 
 def undetermined(hidden: Array) -> Array:
-    """Which parameters have a share in unseen directions."""
+    """Which parameters have a component in undetermined directions."""
     share: Array = np.linalg.norm(hidden, axis=0) > 1e-8
     return share
 
 
 def gains(walk: Walk, G: Array, blocks: Array) -> Array:
-    """Smoothing gains (T - 1, n, n): the part of theta_t that follows theta_{t+1}.
+    """Smoothing gains (T - 1, n, n): the part of theta_t that depends on theta_{t+1}.
 
     With M the root of the information of the samples up to t on F theta_t = x, g = E G sqrt(drift_{t+1}) = V s W' and F
-    moving theta along its slope (1 where it has none), x minimises
+    moving theta along its slope (F = 1 without slopes), x minimises
 
         |M x|^2 + |s^-1 V' (x - theta_{t+1})|^2
 
-    by Householder reflections with the rows in the order of their size. M'M would lose what the past says where the
-    drift is far above the noise, and the gain as 1 less something would cancel there.
+    The solution uses Householder reflections with the rows sorted by size. M'M would lose the information of the past
+    if the drift is far above the noise, and computing the gain as 1 minus another matrix would cancel.
     """
     T, n = walk.phi.shape
     M = np.zeros((T, n + 1, n))
@@ -150,7 +150,7 @@ def gains(walk: Walk, G: Array, blocks: Array) -> Array:
 
 
 def block_type(n: int) -> np.dtype[Any]:
-    """`WIDTH` samples of what the two filters know before they see the sample: packed S and d, lane 0 and 1."""
+    """The information of the two filters before `WIDTH` samples: packed S and d, lanes 0 and 1."""
     packed = n * (n + 1) // 2
     return np.dtype([("S", np.float64, (2, packed, WIDTH)), ("d", np.float64, (2, n, WIDTH))])
 
@@ -166,7 +166,7 @@ def workspace(n: int, L: int) -> Array:
 
 @lru_cache
 def compiled() -> tuple[Any, Any]:
-    """The two loops; closures, so that the cache on disk sees when a kernel changes."""
+    """The two loops; they are closures, so that the cache on disk detects changes of a kernel."""
     absorb, spread, solve, invert = information.absorb, information.spread, information.solve, information.invert
     shear, width = information.shear, WIDTH
 

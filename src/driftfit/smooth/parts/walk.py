@@ -16,11 +16,11 @@ from driftfit.engine.kernel import Array
 from driftfit.trackers.base import RandomWalk
 
 NONE = np.zeros((0, 0))
-"""No parameter drifts otherwise than q says, and none has a slope."""
+"""No parameter has its own drift, and none has a slope."""
 
 
 class Walk(NamedTuple):
-    """T samples of a regression on n parameters that walk at random; q and p0 are relative to the noise variance."""
+    """T samples of a regression whose n parameters are random walks; q and p0 are relative to the noise variance."""
 
     phi: Array
     """(T, n), finite."""
@@ -37,11 +37,11 @@ class Walk(NamedTuple):
     p0: Array | None
     """(n, n), or None for the diffuse start."""
     r: float | None
-    """Noise variance; None where it is to be estimated."""
+    """Noise variance; None if it is to be estimated."""
     each: Array = NONE
-    """(T, n): roots of the factors of each parameter's drift before each sample; empty where there are none."""
+    """(T, n): square roots of the factors of each parameter's drift before each sample; empty if there are none."""
     trend: Array = NONE
-    """(T,): intervals of motion along a slope before each sample, where q is the drift of that slope; else empty."""
+    """(T,): intervals of motion along a slope before each sample, if q is the drift of that slope; otherwise empty."""
 
     @property
     def used(self) -> int:
@@ -54,18 +54,18 @@ class Walk(NamedTuple):
         return residual
 
     def pull(self, residual: Array) -> Array:
-        """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the force on each increment.
+        """sum over i > t of weight_i phi_i residual_i for t = -1 .. T - 2, (T, n): the gradient of each increment.
 
-        At the minimum of J its first row is zero (without a prior), and `moves` of it are the increments.
+        At the minimum of J its first row is zero (without a prior), and `moves` converts it to the increments.
         """
         weighted = self.phi * (self.weight * residual)[:, None]
         forces: Array = np.cumsum(weighted[::-1], axis=0)[::-1]
         return forces
 
     def moves(self, pull: Array) -> Array:
-        """theta_{t+1} - theta_t under forces (T, n) as `pull` gives them: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
+        """theta_{t+1} - theta_t from gradients (T, n) of `pull`: drift_{t+1} E q E pull_{t+1}, (T - 1, n).
 
-        Where theta has a slope, slope_{t+1} - slope_t, with sum over i > t of trend_i pull_i in the place of pull.
+        With slopes it is slope_{t+1} - slope_t, with sum over i > t of trend_i pull_i instead of pull.
         """
         if len(self.trend):
             pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
@@ -75,28 +75,28 @@ class Walk(NamedTuple):
 
 
 def constants(n: int) -> RandomWalk:
-    """Parameters that never change, of which nothing is known."""
+    """Constant parameters with a diffuse start."""
     return RandomWalk(np.zeros((n, n)), None, np.zeros(n), None, at_first_sample=True)
 
 
 def free(n: int) -> RandomWalk:
-    """Parameters whose drift is given for every sample, and the noise too, of which nothing is known."""
+    """Parameters with a diffuse start, whose drift and noise are given for every sample."""
     return RandomWalk(np.eye(n), 1.0, np.zeros(n), None)
 
 
 class Path(NamedTuple):
-    """What a smoother found; covariances are relative to the noise variance."""
+    """The result of a smoother; covariances are relative to the noise variance."""
 
     theta: Array
     """(T, n)"""
     var: Array
     """(T, n): inf for parameters that the record does not determine."""
     rho: Array
-    """(T,): NaN where there was no sample."""
+    """(T,): NaN for samples that were not used."""
     c: Array
     """(T,): sqrt(1 - leverage)."""
     cost: float
-    """The least J."""
+    """The minimum of J."""
     cov: Array
     """(T, n, n), or empty."""
     lag_cov: Array
@@ -106,15 +106,15 @@ class Path(NamedTuple):
     rank: Array = np.zeros(0, np.int64)
     """(T,): rank of the regressors up to each sample."""
     slope: Array = NONE
-    """(T, n), per nominal interval; empty where theta has none."""
+    """(T, n), per nominal interval; empty if theta has no slope."""
     slope_var: Array = NONE
     """(T, n), or empty."""
 
 
 def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
-    """(walk, order): the samples sorted by a state variable, one nominal step apart; equal values stay in time order.
+    """(walk, order): the samples sorted by a state variable, one nominal step apart; ties stay in time order.
 
-    A sample whose value is missing comes last and is not used.
+    Samples with a missing value of the variable come last and are not used.
     """
     value = as_numbers("order_by", by)
     if value.shape != walk.y.shape:

@@ -1,24 +1,24 @@
-"""A bank of hypotheses: Kalman filters along the histories of what may have happened, weighed by what they predict.
+"""A bank of hypotheses: Kalman filters along a tree of possible events, weighted by how well they predict.
 
     theta_t = theta_{t-1} + w_t,  w ~ N(0, Q_i) under change i;  y_t = phi_t' theta_t + v_t,  v ~ N(0, r_j), sensor j
     p(history, event | data) proportional to N(y_t; phi' m, phi' C- phi + r_j) p(event | history) p(history | data)
 
-(a jump Markov linear system). Every history of events is a leaf with its own Gaussian; a reduction keeps their number
-bounded (`driftfit.trackers.bank.reduction`). What is reported at t, the mixture over all leaves, is computed after the
+(a jump Markov linear system). Every history of events is a leaf of the tree with its own Gaussian; a reduction bounds
+their number (`driftfit.trackers.bank.reduction`). The result at t, the mixture over all leaves, is computed after the
 tree has grown by sample t and before it is reduced.
 
-Use it where parameters stand still and sometimes jump, or where the sensor may fail: jumps are seen by their fit, not
-by a compromise between following and averaging. Where parameters drift all the time `Kalman` is better and cheaper.
-Jumps show only through the regressors: no excitation, no detection.
+Use it if parameters are constant between occasional jumps, or if the sensor may fail: a jump is detected by its fit,
+without a compromise between tracking and averaging. If parameters drift all the time, `Kalman` is better and cheaper.
+Jumps are visible only through the regressors: without excitation there is no detection.
 
-`Bank()` alone has no scale: see `driftfit.trackers.bank.change`. With unknown noise variance (r of the nominal sensor
-left None) q and p0 are in units of it, unless a ``guess`` of it is given.
+`Bank()` alone depends on no scale: see `driftfit.trackers.bank.change`. If the noise variance is unknown (r of the
+nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it is given.
 
-A sample that is not used moves no weight: leaves widen by what may have happened, and depth counts used samples.
-Until there are four residuals (with known noise: full rank, or four samples that nothing new is in) only the first
-change acts. Then the tree grows in the directions that the regressors span, and a later one enters as the exact limit
-of a wide prior; a bank with changes that forget, with leaves that have output lags of their own or with form="sqrt"
-waits for full rank.
+A sample that is not used changes no weight: the leaves become wider by what may have happened, and depth counts used
+samples. Until there are four residuals (with known noise: full rank, or four samples without a new direction) only the
+first change acts. The tree then grows in the directions that the regressors span, and a later direction enters as the
+exact limit of a wide prior. A bank with changes that forget, with leaves that have their own output lags, or with
+form="sqrt" waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -26,13 +26,14 @@ time.
 
 Source: fixed-lag decisions and trees of hypotheses after the paper on Bayesian tracking of parameters with alternative
 developments; Bar-Shalom, Li and Kirubarajan (2001), chapter 11; Andersson (1985) for the beam. Departures: leaves are
-merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) a leaf update.
+merged at the present, not at the root; log weights; output lags per leaf. Cost per sample: O(n^2) per leaf update.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -45,10 +46,23 @@ from driftfit.models.base import Model
 from driftfit.trackers.bank import change as changes_
 from driftfit.trackers.bank import reduction as reductions
 from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.layout import (
+    COUNT,
+    FADE,
+    FAULTS,
+    HEAD,
+    LAST,
+    LEAVES,
+    LIMIT,
+    ROW,
+    SIZE,
+    TOLD,
+    WHOLE,
+    R,
+)
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
-from driftfit.trackers.bank.machine.layout import COUNT, FADE, FAULTS, HEAD, LAST, LEAVES, LIMIT, PACKED, SIZE, TOLD, R
 from driftfit.trackers.bank.machine.start import GROWTH, begin
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
@@ -62,7 +76,7 @@ from driftfit.trackers.parts.information import triangular_root
 from driftfit.trackers.parts.resolution import resolution, unresolved
 
 FAR = 100.0
-"""Standard deviations from its forecast beyond which a sample is a fault code to a bank that is given no sensors."""
+"""Standard deviations from its forecast beyond which a sample is a fault code, for a bank without given sensors."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +86,23 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        What may happen to theta between samples; the first is the ordinary course. None: a small drift, and a rare
-        jump of any parameter, free of scale.
+        What may happen to theta between samples; the first is the normal course. None: a small drift, and a rare
+        jump of any parameter, both scale-free.
     sensors : list of Sensor
-        What the sensor may do; the first must be nominal. None: nominal, with unknown noise variance.
+        How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance.
     transition : None, (H_d, H_d), (H, H), or a pair
         Markov prior P[from, to]: of the changes, of joint events (change i, sensor j at i H_m + j), or (changes,
-        sensors). None: events are independent, with the probabilities that changes and sensors carry.
+        sensors). None: events are independent, with the probabilities of the changes and sensors.
     reduce : Reduction
-        How histories are kept few. None: Beam(9), or Hybrid(9) with more than one sensor.
+        How the number of leaves is limited. None: Beam(9), or Hybrid(9) with more than one sensor.
     theta0, p0
         Mean and covariance of theta before the first sample; p0=None is the exact diffuse start.
     initial : (H,) or None
-        Distribution of the first event. None: the prior probabilities, or what the transition leaves as it is.
+        Distribution of the first event. None: the prior probabilities, or the stationary distribution of the
+        transition.
     lag_variance : bool
-        Whether leaves with output lags of their own (additive outliers, a frozen sensor) know how uncertain these
-        are; see `driftfit.trackers.bank.leaves.lags`. False takes them for certain.
+        Whether leaves with their own output lags (additive outliers, a frozen sensor) carry the uncertainty of these
+        lags; see `driftfit.trackers.bank.leaves.lags`. False treats the lags as certain.
     form : "covariance" or "sqrt"
         "sqrt" for collinear or badly scaled regressors, a wide prior and little noise: leaves keep factors U D U' of
         their covariances (`driftfit.trackers.bank.leaves.factored`), whose variances are positive by construction.
@@ -159,17 +174,17 @@ class Bank(Tracker):
 
     @property
     def all_changes(self) -> tuple[Change, ...]:
-        """The changes, also those that `Bank()` supplies."""
+        """The changes, including those that `Bank()` supplies."""
         return self.changes or changes_.usual()
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """The sensors, likewise."""
+        """The sensors, including those that `Bank()` supplies."""
         return self.sensors or (Sensor.nominal(limit=FAR),)
 
     @property
     def reduction(self) -> Reduction:
-        """How histories are kept few, also where none was given."""
+        """How the number of leaves is limited, including the default."""
         return self.reduce or (Beam() if len(self.all_sensors) == 1 else Hybrid())
 
     @property
@@ -191,7 +206,7 @@ class Bank(Tracker):
 
     @property
     def _apart(self) -> bool:
-        """Whether changes are events that know nothing of earlier ones, so that a gap is one floor."""
+        """Whether changes are independent of earlier ones, so that a gap is one level of the tree."""
         Hd, Hm = len(self.all_changes), len(self.all_sensors)
         if Hd == 1 or isinstance(self.reduction, reductions.FirstFloor):
             return False
@@ -224,7 +239,7 @@ class Bank(Tracker):
 
     @property
     def event_names(self) -> tuple[str, ...]:
-        """Names of the joint events, in their order."""
+        """Names of the joint events, in order."""
         if len(self.all_sensors) == 1:
             return self.change_names
         return tuple(f"{change}, {sensor.name}" for change in self.change_names for sensor in self.all_sensors)
@@ -256,7 +271,7 @@ class Bank(Tracker):
         state = self._state(model.n, (model.output_lags or 0) if cleans else 0)
         if len(model.outputs) == 1 or model.shared:
             return state
-        sizes = [np.size(state[name]) for name in ("memory", "report", "now", "many", "table")]
+        sizes = [np.size(state[name]) for name in ("memory", "report", "sample", "counters", "table")]
         return {**state, "flat": np.zeros(sum(sizes) + model.n * (model.n + 3))}
 
     def _state(self, n: int, na: int) -> Mapping[str, Any]:
@@ -265,26 +280,31 @@ class Bank(Tracker):
         unit = 1.0 if nominal.r is not None or nominal.guess is None else 1.0 / nominal.guess
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
-        now, many = np.zeros(SIZE), np.zeros(COUNT, int)
-        now[LAST], now[R], now[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
-        now[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
+        sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
+        sample[LAST], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0
         arrays = arrays_of(self, n, na, unit, theta0)
         scale = 1.0 if nominal.r is not None else np.nan
         if self.p0 is not None and (nominal.r is not None or guessed):
-            arrays["theta0"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
-            begin.py_func(arrays["B"], arrays["T"], theta0, P0, count, squares, many, self._count)
+            arrays["places"][forget.CAP] = GROWTH * np.trace(P0) or np.inf
+            begin.py_func(SimpleNamespace(**arrays, theta=theta0, cov=P0, counters=counters), count, squares)
             if self.form == "sqrt":
-                factorise.py_func(arrays["B"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
-            arrays["root"][:, 0], scale = arrays["B"][:, 0], 1.0
-        q0, Q0 = arrays["Q"][0, : n * (n + 1) // 2], np.zeros((n, n))
+                factorise.py_func(arrays["leaves"][FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 0.0)
+            arrays["root"][:, 0], scale = arrays["leaves"][:, 0], 1.0
+        q0, Q0 = arrays["walks"][0, : n * (n + 1) // 2], np.zeros((n, n))
+        numbers = {
+            "n": n, "output_lags": na, "unknown": nominal.r is None, "independent": self._alike, "apart": self._apart,
+            "plain": na == 0 and self.form == "covariance",
+        }  # fmt: skip
         Q0[np.tril_indices(n)] = q0
         return {  # memory first, where a cache line begins
-            **packed(arrays, n, na, nominal.r is None, self._alike, self.form == "sqrt", self._apart),
+            **packed(arrays, numbers),
             "theta": theta0, "P": P0, "g": np.zeros(n), "c": np.zeros(n), "active": np.zeros(n), "power": 0.0,
             "seen_samples": 0.0, "r": 1.0 if nominal.r is None else nominal.r, "unknown": int(nominal.r is None),
-            "scale": scale, "count": count, "squares": squares, "now": now, "many": many, **unresolved(),
+            "scale": scale, "count": count, "squares": squares, "sample": sample,
+            "counters": counters, **unresolved(),
             **(knowing_nothing(n, WORST if self._frames(na) else ALMOST_ANY) if self.p0 is None else knowing(n)),
             "can_frame": int(self.p0 is None and self._frames(na)), "framed": 0, "within": 0.0, "x": np.zeros(n),
             "W": np.zeros((n, n)), "Pz": np.zeros((n, n)), "no_power": np.zeros(n),
@@ -293,7 +313,7 @@ class Bank(Tracker):
         }  # fmt: skip
 
     def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where nothing is given; then
+        """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where none are given; then
         factors of the changes (T, H_d).
         """
         Hd, H = len(self.all_changes), self._count
@@ -315,8 +335,9 @@ class Bank(Tracker):
     def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
         columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
-        for name, values in (("given", columns[:-Hd]), ("factors", columns[-Hd:])):
-            start = lane["table"][PACKED.index(name), 0] // 8
+        given = np.split(columns, (self._count, len(columns) - Hd))
+        for name, values in zip(("given", "given_chain", "drift"), given, strict=True):
+            start = lane["table"][ROW[name], 0] // 8
             lane["memory"][start : start + len(values)] = values
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
@@ -338,7 +359,7 @@ class Bank(Tracker):
             C += add[np.tril_indices(n)][:, None] * each
 
     def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
-        """All leaves are moved alike, so that the mixture stands where it is said to."""
+        """All leaves are moved by the same amount, so that the mixture is at the given value."""
         name = "d" if lane["framed"] else "theta"
         before = lane[name].copy()
         super().place(lane, which, values)
@@ -346,13 +367,13 @@ class Bank(Tracker):
         B[FIRST : FIRST + len(before)] += (lane[name] - before)[:, None]
 
     def _leaves(self, lane: Mapping[str, Array]) -> Array:
-        """The leaves of a lane, as a view; before the bank has begun, the one that it will be."""
-        start, rows, columns = lane["table"][PACKED.index("B")]
+        """The leaves of a lane, as a view; before the tree starts, the single filter."""
+        start, rows, columns = lane["table"][ROW["leaves"]]
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return B[:, : max(int(lane["many"][LEAVES]), 1)]
+        return B[:, : max(int(lane["counters"][LEAVES]), 1)]
 
     def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (of the floors `floors_told`, H) or decided (held, 3) from reports
+        """evidence, window, kept, leaves, lag_prob (of the levels `floors_told`, H) or decided (held, 3) from reports
         (.., size).
         """
         if name in SINGLE:
@@ -366,23 +387,23 @@ class Bank(Tracker):
 
     @property
     def floors_told(self) -> tuple[int, ...]:
-        """The floors that a report tells of, counted back from the present: the newest, and the oldest."""
+        """The levels of the tree that a report contains, counted back from the present: the newest, and the oldest."""
         W = self._shape.floors
         return (*range(min(W, TOLD) - 1), W - 1)
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
         table = lane["table"] if "table" in lane else self.state_for(model)["table"]
-        start, rows, columns = table[PACKED.index(name)]
+        start, rows, columns = table[ROW[name]]
         part: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
-        return part.view(np.int64) if name in ("links", "group", "slots") else part
+        return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         told = run.hypotheses
         kinds = [event.kind for event in told.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
-        faults = int(run.state["many"][FAULTS])
+        faults = int(run.state["counters"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
         if told.impossible:
@@ -394,7 +415,7 @@ class Bank(Tracker):
         return (*said, *(resolution(lane) if self.all_sensors[0].r is None else ()))
 
     def learning(self, lane: Mapping[str, Array]) -> Array:
-        """Which entries of theta the regressors have told apart so far, (n,) bool."""
+        """Which entries of theta the regressors have distinguished so far, (n,) bool."""
         return np.isfinite(lane["var"])
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:

@@ -4,10 +4,10 @@
     theta <- theta,       C <- C / forget + Q         exponential forgetting, and two other kinds of forgetting
     theta <- theta0,      C <- Q                      reset: a new segment
 
-Q is `q` in squared units of theta, or free of scale, Q_ii = size^2 r / c_i: with r the noise variance and c_i the mean
-square of regressor i, a change of one standard deviation moves the output by `size` standard deviations of the noise.
-r / c_i is what a single sample tells of parameter i alone, so `size` counts in the parameters' own uncertainty. The
-formulas of forgetting are in `driftfit.trackers.bank.leaves.forget`.
+Q is `q` in squared units of theta, or scale-free, Q_ii = size^2 r / c_i. With r the noise variance and c_i the mean
+square of regressor i, a change of one standard deviation then moves the output by `size` standard deviations of the
+noise. r / c_i is the variance that a single sample leaves of parameter i alone, so `size` is in units of that
+uncertainty. The formulas of forgetting are in `driftfit.trackers.bank.leaves.forget`.
 
 With one change and one sensor the bank is the filter of that change: Change(q) is `Kalman`, Change(0) least squares,
 Change(forget=lam) is `RLS`, Change(forget=lam, kind="directional") `RLS` with directional forgetting.
@@ -27,36 +27,36 @@ from driftfit.trackers.bank.leaves import forget
 
 @dataclass(frozen=True)
 class Change(Settings):
-    """One hypothesis of how theta develops.
+    """One hypothesis about how theta changes.
 
     Parameters
     ----------
     q : number, (k,), (k, k)
-        Drift covariance per nominal sample, k being the number of parameters that ``which`` lists (all by default).
+        Drift covariance per nominal sample, where k is the number of parameters in ``which`` (by default all).
     size : number, (k,) or None
-        Free of scale, in place of q: standard deviation of the move in units of sqrt(r / c_i).
+        Scale-free, instead of q: standard deviation of the change in units of sqrt(r / c_i).
     prob : number or None
-        Prior probability at every sample; None is what the others leave.
+        Prior probability at every sample; None is the remainder of the others.
     which : indices or None
-        The parameters that move; None is all.
+        The parameters that change; None is all.
     forget : number in (0, 1]
         Forgetting factor per nominal sample.
     kind : "exponential", "directional" or "stabilised"
-        What is forgotten: everything alike; only what the last regressor brought news of; or everything, in favour of
+        Forget in all directions alike; only in the direction of the last regressor; or in all directions, towards
         N(theta0, anchor).
     anchor : number, (n,), (n, n) or None
-        For "stabilised": the positive definite covariance that the parameters return to; it bounds theirs.
+        For "stabilised": the positive definite covariance to which the parameters return; it bounds theirs.
     reset : bool
-        A new segment: the parameters that ``which`` lists are forgotten, and their prior takes its place, with mean
-        ``theta0`` of the bank and covariance q.
+        A new segment: the parameters in ``which`` are forgotten and get a new prior with mean ``theta0`` of the bank
+        and covariance q.
     name : str
-        What tables and plots call it.
+        The name in tables and plots.
 
     Raises
     ------
     ValueError
-        If q is no covariance, prob no probability, forget outside (0, 1], both q and size are given, or settings of
-        different kinds of change are mixed.
+        If q is not a covariance, prob not a probability, forget outside (0, 1], both q and size are given, or settings
+        of different kinds of change are mixed.
     """
 
     q: Any = None
@@ -106,7 +106,7 @@ class Change(Settings):
 
     @property
     def forgets(self) -> bool:
-        """Whether it is anything but a random walk."""
+        """Whether it is anything other than a random walk."""
         return self.reset or self.forget < 1.0
 
     def mapping(self) -> tuple[float, float, float, float]:
@@ -121,7 +121,7 @@ class Change(Settings):
         return keep, float(keep == 0.0), float(kind), float(np.log(self.forget))
 
     def anchors(self, n: int, unit: float) -> Array:
-        """(n, n): what that module keeps of it; covariances are multiplied by ``unit``."""
+        """(n, n): what that module stores of it; covariances are multiplied by ``unit``."""
         rows = np.zeros((n, n))
         if self.anchor is not None:
             rows = forget.anchors_of(matrix("Change", "anchor", self.anchor, n) * unit)
@@ -142,11 +142,11 @@ class Change(Settings):
         return Q, sizes
 
     def scales(self) -> tuple[Array, Array]:
-        """q and sizes as they were given, 0 where they were not."""
+        """q and sizes as given, 0 where they were not."""
         return np.asarray(self.q or 0.0, float), np.asarray(self.size or 0.0, float)
 
     def scaled(self, factor: float) -> Change:
-        """The same with standard deviations ``factor`` times as large."""
+        """The same change with standard deviations ``factor`` times as large."""
         q, size = self.scales()
         return replace(
             self, q=None if self.q is None else plain(factor * factor * q),
@@ -163,7 +163,7 @@ def probability(owner: str, value: Any) -> float:
 
 
 DRIFT, JUMP, RARELY = 0.003, 5.0, 0.01
-"""Sizes of the drift and of the jump of a bank that is given no changes, and how often that jumps."""
+"""Sizes of the drift and of the jump of a bank without given changes, and the probability of that jump."""
 
 
 def usual() -> tuple[Change, ...]:

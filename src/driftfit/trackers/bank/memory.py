@@ -10,14 +10,14 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaves import FIRST
-from driftfit.trackers.bank.machine import selection
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gaps.gap import SINCE
-from driftfit.trackers.bank.machine.layout import BESIDE, FLAGS, HEAD, PACKED, PLAIN, REPORTED, ROWS, THETA, TOLD
-from driftfit.trackers.bank.machine.lookahead import NODES
+from driftfit.trackers.bank.reducing import selection
+from driftfit.trackers.bank.reducing.lookahead import NODES
 from driftfit.trackers.bank.reduction import Reduction
 from driftfit.trackers.bank.sensor import Sensor, table_of
 
@@ -47,72 +47,100 @@ class Settings(Protocol):
 
 
 def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> dict[str, Array]:
-    """What `driftfit.trackers.bank.machine.advance` works on, before the first sample; covariances are multiplied by
-    ``unit``.
+    """The arrays of `driftfit.trackers.bank.layout` before the first sample, but for fields of the state and
+    windows of the scratch; covariances are multiplied by ``unit``.
     """
-    Hd, Hm, chained = len(bank.all_changes), len(bank.all_sensors), bank.chained
+    Hd, Hm, twice = len(bank.all_changes), len(bank.all_sensors), 2 if bank.chained else 1
     shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
-    tri, K, W = n * (n + 1) // 2, shape.children * (2 if chained else 1), shape.floors
-    wide, links = _eights(tri), _eights(K + 1)
-    chain, initial = bank.event_probabilities
-    rows, lower = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0), np.tril_indices(n)
-    steps = [one.increments(n) for one in bank.all_changes]
-    Q = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
-    scaled = any(sizes.any() for _, sizes in steps)
+    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.floors
+    rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
-    places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
-    places[forget.MEAN], places[forget.CAP] = theta0, np.inf
-    if forgets:
-        places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in bank.all_changes])
-    parents, children = _room(most := max(shape.parents * (2 if chained else 1), K // H), Hd, Hm)
+    parents, children = _room(most := max(shape.parents * twice, K // H), Hd, Hm)
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
-    past = _eights(W * (H + 1))
+    remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
     refilters, waits = shape.knobs[selection.KIND] == selection.REFILTER, shape.knobs[selection.WAIT] > 0.0
-    return {
-        "A": np.zeros((rows, parents)), "B": np.zeros((rows, children + WIDTH)), "T": np.zeros((K + 1, past)),
-        "T2": np.zeros((K + 1, past)), "X": np.zeros((tri + 3 * n + 8 + max(H, Hm) + more, children)),
-        "links": np.zeros((4, links), int), "group": np.zeros(K, int),
+    return _of_changes(bank, n, unit, theta0) | {
+        "parents": np.zeros((rows, parents)), "leaves": np.zeros((rows, children + WIDTH)),
+        "history": np.zeros((K + 1, remembered)), "history_2": np.zeros((K + 1, remembered)),
+        "scratch": np.zeros((_named_rows(n) + 5 + max(H, Hm) + more, children)),
+        **{name: np.zeros(links, int) for name in ("parent", "event", "start", "order")}, "group": np.zeros(K, int),
         "slots": np.zeros(max(2 * K, int(shape.bases[0])) + 1, int), "prior": np.zeros((H, children)),
-        "Q": Q, "fixed": Q,
-        "sizes": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]),
-        "factors": np.ones(Hd), "theta0": places,
-        "maps": np.array([change.mapping() for change in bank.all_changes] * 2),
-        "sensors": table_of(bank.all_sensors),
-        "chain": chain, "initial": initial, "given": np.full(H + Hd * Hd, np.nan),
-        "loss": bank.reduction.losses(H), "knobs": shape.knobs, "bases": shape.bases,
-        "stamps": np.zeros(shape.held), "parts": np.zeros((4 + NODES, K * H if waits else 1)),
-        "root": np.zeros((rows, WIDTH)), "ring": np.zeros((RING, BESIDE + H)), "Qt": np.zeros((Hd + 1, wide)),
+        "sensors": table_of(bank.all_sensors), "given": np.full(H, np.nan),
+        "row": np.zeros(H), "loss": bank.reduction.losses(H), "reduction": shape.knobs,
+        "bases": shape.bases, "stamps": np.zeros(shape.held),
+        "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-        "news": news_of(H, Hm, past), "gap": _closed(Hd, wide),
-        "path": path_of(H, Hd, wide, most if chained else 0),
-        "lag_prob": np.zeros((W, H)),
-        "brief": np.zeros((min(W, TOLD), H)), "moving": np.zeros((H, H)), "decided": np.full((shape.held, 3), -1.0),
+        "path": path_of(H, Hd, _whole_vectors(tri), most if bank.chained else 0),
+        "ring": np.zeros((RING, BESIDE + H)), "new_events": news_of(H, Hm, remembered), "lag_prob": np.zeros((W, H)),
+        "newest": np.zeros((min(W, TOLD), H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 
-def packed(
-    arrays: Mapping[str, Array], n: int, na: int, unknown: bool, alike: bool, factored: bool, apart: bool
-) -> dict[str, Any]:  # fmt: skip
+def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
+    """Those that say what may happen to theta."""
+    changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
+    steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
+    scaled, forgets = any(sizes.any() for _, sizes in steps), any(one.forgets for one in changes)
+    places = np.zeros((forget.ANCHORS + (Hd * n if forgets else 0), n))
+    places[forget.MEAN], places[forget.CAP] = theta0, np.inf
+    if forgets:
+        places[forget.ANCHORS :] = np.vstack([one.anchors(n, unit) for one in changes])
+    transition, initial = bank.event_probabilities
+    maps = np.array([change.mapping() for change in changes])
+    walks = np.array([np.pad(Q[lower] * unit, (0, wide - tri)) for Q, _ in steps])
+    return {
+        "walks": walks, "fixed_walks": walks,
+        "relative_walks": np.array([sizes if scaled else sizes[:0] for _, sizes in steps]), "drift": np.ones(Hd),
+        "Q": np.zeros((Hd + 1, wide)), "maps": maps, "maps_nominal": maps, "places": places, "transition": transition,
+        "chain": transition.copy(),
+        "initial": initial, "given_chain": np.full(Hd * Hd, np.nan), "gap": _closed(Hd, wide),
+    }  # fmt: skip
+
+
+def _named_rows(n: int) -> int:
+    """Rows of the scratch before its scores."""
+    return n * (n + 1) // 2 + 3 * n + 2
+
+
+def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
+    """First rows, and numbers of rows, of the windows of the scratch."""
+    tri = n * (n + 1) // 2
+    g, scores = tri + 2 * n, _named_rows(n)
+    return {
+        "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
+        "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
+        "narrow": (scores + 3, rows - scores - 3), "said": (rows - 1, 1),
+    }  # fmt: skip
+
+
+def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str, Any]:
     """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
 
-    Where covariances are ``factored`` no forecast comes from that of the mixture; where changes are events ``apart``
-    from each other a gap is one floor.
+    ``numbers`` are those of the table (`layout.NUMBERS`) but for two that the arrays say.
     """
-    table = np.zeros((ROWS, 3), int)
+    n, na, table = numbers["n"], numbers["output_lags"], np.zeros((ROWS, 3), int)
     flat: list[list[Array]] = [[], [np.zeros(HEAD)]]
-    for k, name in enumerate(PACKED):
+    for name in PACKED:
         array, into = np.ascontiguousarray(arrays[name]), flat[name in REPORTED]
         if into is flat[0]:
             into.append(np.zeros(-sum(part.size for part in into) % WIDTH))  # a cache line begins
-        table[k] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
+        table[ROW[name]] = 8 * sum(part.size for part in into), *(1, *array.shape)[-2:]
         into.append(array.ravel().view(np.float64))
-    table[THETA, 1] = n
-    table[FLAGS] = na, unknown, alike
+    start, rows, columns = table[ROW["scratch"]]
+    for name, (first, count) in windows(n, na, rows).items():
+        table[ROW[name]] = start + 8 * first * columns, count, columns
+    first, count = windows(n, na, rows)["narrow"]
+    table[ROW["narrow"], 1:] = count * columns // WIDTH, WIDTH
+    for name in ("phi", "powers", "theta"):
+        table[ROW[name]] = 0, 1, n
+    table[ROW["report"]], table[ROW["cov"]] = (0, 1, HEAD), (0, n, n)
+    table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
-    table[PLAIN] = na == 0 and walks and noises and not factored, walks, apart
+    for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
+        table[ROW[name], 0] = value
     memory, report = (np.concatenate(parts) for parts in flat)
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 
@@ -132,15 +160,15 @@ def _closed(Hd: int, wide: int) -> Array:
 
 
 def _room(parents: int, Hd: int, Hm: int) -> tuple[int, int]:
-    """Columns for leaves and for their children, with room for eights that begin at every block of them."""
+    """Columns for leaves and for their children, with room for SIMD vectors that begin at every block of them."""
     blocks = (parents, parents * Hd, parents * Hd * Hm)
-    up = [_eights(size) for size in blocks]
+    up = [_whole_vectors(size) for size in blocks]
     most = max(blocks[2] - size + room for size, room in zip(blocks, up, strict=True))
-    return up[0], _eights(most)
+    return up[0], _whole_vectors(most)
 
 
-def _eights(size: int) -> int:
-    """The next multiple of eight."""
+def _whole_vectors(size: int) -> int:
+    """The next multiple of the width of a SIMD vector."""
     return -(-size // WIDTH) * WIDTH
 
 

@@ -18,7 +18,7 @@ TOLERANCE = 1e-10
 
 
 def shares(owner: str, what: str, given: Sequence[Any]) -> Array:
-    """Prior probabilities (k,): those given, one None standing for what the others leave."""
+    """Prior probabilities (k,) as given; one None is replaced by the remainder."""
     open_ones = [i for i, one in enumerate(given) if one.prob is None]
     p = np.array([0.0 if one.prob is None else one.prob for one in given])
     if len(open_ones) > 1:
@@ -48,7 +48,7 @@ def rows(owner: str, P: Any, size: int, what: str) -> Array:
 
 
 def stationary(P: Array) -> Array:
-    """The distribution that P leaves as it is."""
+    """The stationary distribution of P."""
     size = len(P)
     system = np.vstack([P.T - np.eye(size), np.ones(size)])
     p: Array = np.linalg.lstsq(system, np.r_[np.zeros(size), 1.0], rcond=None)[0]
@@ -61,7 +61,7 @@ def events(
 ) -> tuple[Array, Array]:
     """(P, initial) of the joint events.
 
-    ``transition`` is None (independent), the matrix of the changes, of the sensors where there is one change only, of
+    ``transition`` is None (independent), the matrix of the changes, of the sensors if there is only one change, of
     the joint events, or a pair (changes, sensors) in which None is independent.
     """
     Hd, Hm = len(changes), len(sensors)
@@ -118,7 +118,7 @@ def _initial(owner: str, initial: Any, P: Array) -> Array:
 
 
 def chains(owner: str, P: Array, T: int, Hd: int) -> Array:
-    """Chains of the changes P[t, from, to], (T, H_d H_d), checked; where one is NaN the bank's own prior holds."""
+    """Chains of the changes P[t, from, to], (T, H_d H_d), checked; where one is NaN the bank's own prior applies."""
     if P.shape != (T, Hd, Hd):
         raise ValueError(f"{owner}: prob of a chain must be ({T}, {Hd}, {Hd}), P[sample, from, to]; got {P.shape}.")
     given = ~np.isnan(P).all(axis=(1, 2))
@@ -130,9 +130,9 @@ def chains(owner: str, P: Array, T: int, Hd: int) -> Array:
 
 
 def per_sample(owner: str, p: Array, usual: Array, Hd: int) -> Array:
-    """Priors (T, H) of joint events from such, or from (T, H_d) of changes; rows of NaN stay.
+    """Priors (T, H) of joint events from those of joint events or from (T, H_d) of changes; rows of NaN are kept.
 
-    ``usual`` (H,) is what holds where nothing is said.
+    ``usual`` (H,) applies where no prior is given.
     """
     Hm = len(usual) // Hd
     if p.shape[1] == Hd and Hm > 1:

@@ -1,7 +1,7 @@
-"""Reductions: how a bank of growing histories is kept small.
+"""Reductions: how the tree of a bank is kept small.
 
-Each is a class of settings that says what the compiled code needs: its kind and numbers, how many leaves it may have
-and how many floors of the past a leaf remembers. H is the number of joint events, H_d of changes, H_m of sensors.
+Each is a class of settings that gives the compiled code its kind and numbers, the largest number of leaves, and the
+number of past levels that a leaf remembers. H is the number of joint events, H_d of changes, H_m of sensors.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, numbers, one_of, plain, whole
-from driftfit.trackers.bank.machine import selection
+from driftfit.trackers.bank.reducing import selection
 
 REMEMBERED = 24
-"""Floors of the past that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four hundred
-samples, twenty times, 25 of 40 were found with 8 floors, 37 with 16, and 40 with 24.
+"""Number of past levels of the tree that leaves remember. Of two jumps of 1.6 standard deviations of the noise in four
+hundred samples, twenty times, 25 of 40 were found with 8 levels, 37 with 16, and 40 with 24.
 """
 MOST = 4096
-"""Leaf updates a sample above which a bank is refused."""
+"""Largest number of leaf updates per sample; a larger tree raises an error."""
 
 
 class Shape(NamedTuple):
-    """What a reduction asks of the compiled code: leaves before and after growth, floors remembered, its vector of
-    settings, and what the codes of joint events, sensors and changes are limited to.
+    """What a reduction requires of the compiled code: leaves before and after growth, levels remembered, its vector of
+    settings, and the limits of the codes of joint events, sensors and changes.
     """
 
     parents: int
@@ -38,14 +38,14 @@ class Shape(NamedTuple):
 
 
 class Reduction(Settings, ABC):
-    """How a bank is kept small."""
+    """How the tree of a bank is kept small."""
 
     @abstractmethod
     def shape(self, Hd: int, Hm: int) -> Shape:
-        """For so many changes and sensors."""
+        """The shape for these numbers of changes and sensors."""
 
     def losses(self, H: int) -> Array:
-        """L[true, decided]: the same for every error."""
+        """L[true, decided]: by default the same for every error."""
         return 1.0 - np.eye(H)
 
 
@@ -59,7 +59,7 @@ def knobs(kind: int, **values: float) -> Array:
 
 
 def tree(owner: str, H: int, depth: int, instead: str) -> int:
-    """H^depth, if a step can afford it."""
+    """H^depth, or ValueError if a step cannot afford it."""
     if H**depth > MOST:
         raise ValueError(
             f"{owner}: {H} events to depth {depth} are {H**depth} leaf updates per sample, more than {MOST}; {instead}."
@@ -69,21 +69,21 @@ def tree(owner: str, H: int, depth: int, instead: str) -> int:
 
 @dataclass(frozen=True)
 class Decide(Reduction):
-    """Fixed-lag Bayes decision (deferred decision, N-scan pruning): the oldest event is decided, other branches cut.
+    """Fixed-lag Bayes decision (deferred decision, N-scan pruning): decide the oldest event, prune other branches.
 
-    Of the events held the oldest has the marginal p; R_k = sum_e L[e, k] p_e; the k of least risk (of those with
-    p_k > 0, the lowest on ties) is kept. The latency is depth - 1 used samples. What comes later is conditional on the
-    decision. With depth="auto" it is decided as soon as the risk is at most ``tau``; with ``wait_cost`` c also when
-    waiting for one more sample is not expected to pay: R* <= c + E R(next). Cost: H^depth leaf updates a sample.
+    The oldest event that is still open has the marginal p; R_k = sum_e L[e, k] p_e; the k of least risk (of those with
+    p_k > 0, the lowest on ties) is kept. The latency is depth - 1 used samples. Later results are conditional on the
+    decision. With depth="auto" the event is decided as soon as the risk is at most ``tau``; with ``wait_cost`` c also
+    if waiting for one more sample is not expected to pay: R* <= c + E R(next). Cost: H^depth leaf updates per sample.
 
     Parameters
     ----------
     depth : int or "auto"
-        Samples that an event is seen by before it is decided.
+        Number of samples that are used to decide an event.
     loss : "map" or (H, H)
-        L[true, decided]; "map" is 1 for every error. Asymmetric losses steer the tracker too.
+        L[true, decided]; "map" is 1 for every error. Asymmetric losses change the estimates too.
     max_depth, tau, wait_cost
-        For "auto": the bound of the depth, the risk that is small enough, and the price of a sample of delay.
+        For "auto": the bound of the depth, the risk that is small enough, and the cost of a sample of delay.
     force : bool
         Allow depth 1 with outliers, which always prefers "outlier" and so never adapts.
     """
@@ -109,7 +109,7 @@ class Decide(Reduction):
 
     @property
     def deepest(self) -> int:
-        """The most events held."""
+        """Largest number of open events."""
         return int(self.max_depth if self.depth == "auto" else self.depth)
 
     def shape(self, Hd: int, Hm: int) -> Shape:
@@ -131,9 +131,9 @@ class Decide(Reduction):
 
 @dataclass(frozen=True)
 class GPB(Reduction):
-    """Generalised pseudo-Bayes of order n: leaves that agree in the newest n - 1 events become one, by their moments.
+    """Generalised pseudo-Bayes of order n: merge leaves that agree in the newest n - 1 events, matching moments.
 
-    Cost: H^n leaf updates a sample. GPB(2) with a ``transition`` is for modes that persist.
+    Cost: H^n leaf updates per sample. GPB(2) with a ``transition`` is for modes that persist.
     """
 
     order: int = 2
@@ -151,8 +151,8 @@ class GPB(Reduction):
 class IMM(Reduction):
     """Interacting multiple models (Blom and Bar-Shalom 1988): one leaf for every event, mixed before each sample.
 
-    c_j = sum_i mu_i P_ij, leaf j goes on from the mixture with weights mu_i P_ij / c_j. For independent events it is
-    GPB(1). Cost: H leaf updates a sample.
+    c_j = sum_i mu_i P_ij; leaf j continues from the mixture with weights mu_i P_ij / c_j. For independent events it is
+    GPB(1). Cost: H leaf updates per sample.
     """
 
     def shape(self, Hd: int, Hm: int) -> Shape:
@@ -162,10 +162,10 @@ class IMM(Reduction):
 
 @dataclass(frozen=True)
 class Beam(Reduction):
-    """The heaviest leaves (M-algorithm); ties go to the earlier leaf.
+    """Keep the leaves with the largest weights (M-algorithm); ties go to the earlier leaf.
 
-    ``window`` is how many floors of the past are remembered for the probabilities of events: a change that takes more
-    samples to tell is not found. The mass that was dropped is missing from the evidence; it is reported. Cost: leaves
+    ``window`` is the number of past levels that are remembered for the probabilities of events: a change that takes
+    more samples to detect is not found. The dropped weight is missing from the evidence; it is reported. Cost: leaves
     times H.
     """
 
@@ -183,12 +183,12 @@ class Beam(Reduction):
 
 @dataclass(frozen=True)
 class Hybrid(Reduction):
-    """Merge leaves that agree in the changes of the window, the last sensor events and their age; then a beam.
+    """Merge leaves that agree in the changes of the window, the last sensor events and their age; then keep a beam.
 
-    For the probabilities of events ``remembered`` floors are kept, on average over what was merged.
+    For the probabilities of events ``remembered`` levels are kept, averaged over merged leaves.
 
-    Old sensor events are nuisance and merged early, changes are the product and kept apart. Ages above ``age_cap``
-    count as one. Cost: leaves times H.
+    Old sensor events are nuisance parameters and merged early, while changes are of interest and kept apart. Ages above
+    ``age_cap`` count as equal. Cost: leaves times H.
     """
 
     leaves: int = 9
@@ -220,7 +220,7 @@ class Hybrid(Reduction):
 
 @dataclass(frozen=True)
 class FirstFloor(Reduction):
-    """The mixture over the oldest event becomes one density and the tree is grown again; for comparison only.
+    """Merge the mixture over the oldest event into one density and grow the tree again; for comparison only.
 
     weights="prior" is one Kalman filter with sum p_i Q_i; "posterior" uses the samples of the tree twice.
     """

@@ -1,13 +1,13 @@
-"""Sensor hypotheses: what the output says of theta at this sample.
+"""Sensor hypotheses: how the output depends on theta at a sample.
 
     nominal, outlier    y = phi' theta + e,   e ~ N(0, factor r)
     offset              y = phi' theta + value + e
     frozen              y ~ N(last output seen, r_f), nothing learned
     own                 a density of your own, of y given the forecast of a leaf (`Sensor.own`)
 
-An *innovation* outlier drives the plant: y stays in the regressors of later samples. An *additive* one is the sensor's
-alone: a leaf that believes it puts its own prediction into its output lags, and so does a frozen one. With
-r_f = resolution^2 / (2 pi) the density at the last output is 1 / resolution, the likelihood of "the same code again".
+An *innovation* outlier drives the plant: y stays in the regressors of later samples. An *additive* one affects only the
+reading: a leaf with this hypothesis puts its own prediction into its output lags, and so does one with a frozen sensor.
+With r_f = resolution^2 / (2 pi) the density at the last output is 1 / resolution, the likelihood of "the same code".
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STUCK = 1e-4
 
 @dataclass(frozen=True)
 class Sensor(Settings):
-    """One hypothesis of what the sensor does; made by `nominal`, `outlier`, `offset` and `frozen`."""
+    """One hypothesis about the sensor; made by `nominal`, `outlier`, `offset` and `frozen`."""
 
     kind: str = "nominal"
     r: float | None = None
@@ -66,7 +66,7 @@ class Sensor(Settings):
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """The name in tables."""
         if self.kind == "own":
             return str(self.likelihood.__name__)
         return f"offset {self.value:g}" if self.kind == "offset" else self.kind
@@ -81,20 +81,20 @@ class Sensor(Settings):
         memory: float | None = 100.0,
         limit: float | None = None,
     ) -> Sensor:
-        """The sensor as it should be, with noise variance r.
+        """The sensor in its normal state, with noise variance r.
 
         r=None: the variance is unknown, and every leaf carries an inverse gamma distribution of it that forgets over
-        ``memory`` samples (None: never). 1 / ``guess`` is the mean of 1 / r before the first sample, worth ``nu``
-        samples; without a guess it comes from the first residuals, and q and p0 are in units of it.
+        ``memory`` samples (None: never). 1 / ``guess`` is the mean of 1 / r before the first sample, with the weight of
+        ``nu`` samples; without a guess it comes from the first residuals, and q and p0 are in units of it.
 
-        A sample further than ``limit`` standard deviations from its forecast is taken for a fault code: it counts as
-        missing, also as a lag, and is counted. After three in a row the next one is believed. None: never.
+        A sample further than ``limit`` standard deviations from its forecast is treated as a fault code: it counts as
+        missing, also as a lag, and is counted. After three in a row the next one is accepted. None: never.
         """
         return cls("nominal", r, prob, guess=guess, nu=nu, memory=memory, limit=limit)
 
     @classmethod
     def outlier(cls, scale: float = 10.0, kind: str = "innovation", prob: float = 0.05, plus: bool = False) -> Sensor:
-        """Noise ``scale`` times as large: variance scale^2 r, or (1 + scale^2) r with plus=True (noise and a spike)."""
+        """Noise ``scale`` times as large: variance scale^2 r, or (1 + scale^2) r with plus=True (noise and spike)."""
         one_of("Sensor.outlier", "kind", kind, ("innovation", "additive"))
         scale = numbers("Sensor.outlier", "scale", scale, ndim=0, low=0.0, strict=True)
         name = "outlier" if kind == "innovation" else "additive"
@@ -104,9 +104,10 @@ class Sensor(Settings):
     def offset(
         cls, value: float | None = None, std: float | None = None, prob: float = 0.01, r: float | None = None
     ) -> Sensor:
-        """A known offset. One of unknown size, new at every sample (``std``), is an outlier: it warns and gives that.
+        """A known offset. One of unknown size that is new at every sample (``std``) is replaced by an outlier, with a
+        warning.
 
-        An offset that lasts is a parameter: ``intercept=True`` in the model, and a `Change` of that parameter.
+        A lasting offset is a parameter: ``intercept=True`` in the model, and a `Change` of that parameter.
         """
         if (value is None) == (std is None):
             raise ValueError(f"Sensor.offset: give either value= or std=; got value={value!r}, std={std!r}.")
@@ -123,8 +124,8 @@ class Sensor(Settings):
 
     @classmethod
     def frozen(cls, resolution: float | None = None, prob: float = 0.01) -> Sensor:
-        """The last value again. ``resolution`` is the step of the sensor's code, in units of y; it persists, so give
-        the bank a ``transition``.
+        """The last value is repeated. ``resolution`` is the step of the sensor's code, in units of y. A frozen sensor
+        persists, so give the bank a ``transition``.
         """
         if resolution is not None and not resolution > 0.0:
             raise ValueError(
@@ -179,7 +180,7 @@ class Sensor(Settings):
 
     @property
     def cleans(self) -> bool:
-        """Whether a leaf that believes it puts something other than y into its output lags."""
+        """Whether a leaf with this hypothesis puts something other than y into its output lags."""
         return self.kind in ("additive", "offset", "frozen") or self.own_lags
 
 

@@ -1,1 +1,1 @@
-"""What several trackers share: the start, square roots, noise levels, readings that mislead."""
+"""Parts that several trackers share: the start, square roots, noise levels, treatment of misleading readings."""

@@ -1,22 +1,23 @@
-"""Coordinates in which several filters run side by side: what the start has learned is white in them.
+"""Coordinates in which several filters run in parallel, and in which the information of the start is white.
 
     z = M theta,    x = M^-T phi,    phi' theta = x' z
 
-M is the square root of information S of the diffuse start (`driftfit.trackers.parts.diffuse`) as it was when the
-filters began, with a 1 on the diagonal of each column that was free. So z begins with the covariance r I, however far
-apart the units are and however large offsets beside an intercept. A covariance of theta has the square of such an
-offset for its condition, and loses as many digits; x has only the rounding of the readings themselves. A random walk
-of theta with covariance diag(q) is one of z with covariance M diag(q) M'.
+M is the square root of information S of the diffuse start (`driftfit.trackers.parts.diffuse`) at the time when the
+filters started, with a 1 on the diagonal of each column that was free. z therefore starts with the covariance r I,
+however different the units and however large the offsets next to an intercept. A covariance of theta would have the
+square of such an offset as its condition number, and lose as many digits; x has only the rounding of the readings
+themselves. A random walk of theta with covariance diag(q) is one of z with covariance M diag(q) M'.
 
-A free column has x_j = 0: what no sample has told apart takes no part. A regressor that leaves the span of those before
-it does so by its first free column j with a share rho_j that is not 0. Then row j of M becomes rho, the rest of phi,
+A free column has x_j = 0: directions that no sample has determined take no part. A regressor that leaves the span of
+the earlier ones does so by its first free column j with a component rho_j that is not 0. Then row j of M becomes rho,
+the rest of phi,
 
     rho = phi - sum_{i<j} x_i M_i.,    z_j = rho' theta,    y = sum_{i<j} x_i z_i + z_j + v
 
-and every filter takes z_j in by what remains of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
-limit of any prior of z_j that grows without end, also for a rho_j that is all but rounding: nothing is divided by it.
-The same serves where a sample tells of z_j so much more than all before it that a covariance would keep no digits of
-the difference (`outgrown`).
+and every filter estimates z_j from what remains of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
+limit of any prior of z_j whose variance grows without bound, also for a rho_j close to rounding: nothing is divided by
+it. The same rule applies if a sample carries so much more information on z_j than all earlier ones that a covariance
+would keep no digits of the difference (`outgrown`).
 
 Source: the square-root form is Bierman's (1977); filters in fixed coordinates of it are ours. Cost per sample: O(n^2)
 for x; O(n^3) where a column enters.

@@ -1,23 +1,23 @@
-"""The diffuse start: no knowledge at all before the first sample, no large number in its place, and no unit preferred.
+"""The diffuse start: no information before the first sample, no large number instead of it, and no preferred unit.
 
-Until the samples determine all of theta, and after that for as long as they determine it badly, what is known stands as
-a square root of information (`driftfit.trackers.parts.information`): S theta = d, S an upper triangle. A zero row is a
-direction of which nothing is known yet; its column is free, and with R = S^-1 on the others the vector
+Until the samples determine all of theta, and afterwards for as long as they determine it badly, the information is a
+square root (`driftfit.trackers.parts.information`): S theta = d, with S an upper triangle. A zero row is a direction
+without information; its column is called free, and with R = S^-1 on the other columns the vector
 
     R_.j = (-S_pp^-1 S_pj, 1)                     of each free column j
 
-is one that no sample has seen. A regressor phi lies in the span of those before it where u_j = phi' R_.j = 0 for all
-free j. Then it is a correction as any other, s = |S^-T phi|^2 + r. Otherwise s is infinite, the first j with u_j != 0
-is free no more, and the share in the diffuse log-likelihood is -1/2 log F, F = u_j^2 det(N_after' N_after) /
-det(N' N), N the matrix of these vectors: the limit of s / kappa for P0 = kappa I.
+is orthogonal to all regressors so far. A regressor phi is in their span if u_j = phi' R_.j = 0 for all free j. Then it
+is an ordinary correction, s = |S^-T phi|^2 + r. Otherwise s is infinite, the first j with u_j != 0 is no longer free,
+and the contribution to the diffuse log-likelihood is -1/2 log F, F = u_j^2 det(N_after' N_after) / det(N' N), with N
+the matrix of these vectors: the limit of s / kappa for P0 = kappa I.
 
-Rotations treat each column in its own unit: multiplying one by a power of 2 changes nothing but the exponents. So does
-the rank, as u_j counts as 0 only where rounding explains it. Of what is not spanned, theta keeps what it was: with
-isotropic q it is the answer nearest to theta0. With other q the exact limit may move theta in directions that nothing
-was seen of; here it stays.
+Rotations treat each column in its own unit: multiplying one by a power of 2 changes only the exponents. The same holds
+for the rank, because u_j counts as 0 only if rounding explains it. In directions that are not spanned, theta keeps its
+value: with isotropic q this is the solution nearest to theta0. With other q the exact limit may move theta in
+directions without information; here it does not move.
 
-The filter goes on with theta and P where variance inflation P_ii |S column i|^2 <= `WORST` for all parameters: the
-covariance form loses as many digits. Otherwise it stays with S, also at full rank.
+The filter continues with theta and P once the variance inflation P_ii |S column i|^2 <= `WORST` for all parameters:
+the covariance form loses as many digits. Otherwise it stays with S, also at full rank.
 
 Source: Bierman, Factorization Methods for Discrete Sequential Estimation (1977), chapter 5, for the start from zero
 information; Durbin and Koopman, Time Series Analysis by State Space Methods (2012), section 5.2, for the likelihood.

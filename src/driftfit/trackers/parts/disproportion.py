@@ -1,18 +1,18 @@
-"""Readings and regressors out of all proportion to what has been seen: fault codes, spikes, wrong units.
+"""Readings and regressors out of all proportion to earlier ones: fault codes, spikes, wrong units.
 
-A reading of 9999 where the output is near 10 says nothing of the system, and it does harm three times: as an output, as
-a lag in the regressors of later samples, and in every scale that is measured from the data. With m and v the mean and
-variance of the readings so far and e the innovation, it is left out (not used, and its lag is that of an output that is
-missing) if
+A reading of 9999 where the output is near 10 carries no information about the system, and it does harm in three ways:
+as an output, as a lag in the regressors of later samples, and in every scale that is estimated from the data. With m
+and v the mean and variance of the readings so far and e the innovation, it is left out (not used, and its lag is that
+of a missing output) if
 
     (y - m)^2 > (REACH p)^2 v    and    e^2 > (REACH p)^2 v
 
-so never where the model expects it. p, the patience, is 1, and doubles with every sample in a row that is so far off
-or an outlier: what keeps coming is a change of level, and is taken in. A change of level by a factor of 1000 costs
+so never if the model predicted it. p, the patience, is 1, and doubles with every consecutive sample that is so far off
+or an outlier: persistent readings are a change of level, and are accepted. A change of level by a factor of 1000 costs
 seven samples.
 
-A regressor out of proportion to its mean square c is not left out, for it may be a test or a flood, and so what was
-waited for. It counts as no more than LEVERAGE ordinary samples: the noise variance of its sample is multiplied by
+A regressor out of proportion to its mean square c is not left out, because it may be a test or a flood, and so contain
+the most information. It counts as at most LEVERAGE ordinary samples: the noise variance of its sample is multiplied by
 
     max(1, max_i phi_i^2 / (LEVERAGE c_i))
 
@@ -30,13 +30,13 @@ from driftfit.engine.kernel import Array, State, kernel
 REACH = 10.0
 """Standard deviations of the readings beyond which one is out of proportion."""
 LEVERAGE = 100.0
-"""Ordinary samples that one regressor may be worth."""
+"""Largest weight of one regressor, in ordinary samples."""
 FIRST = 10.0
-"""Readings that are taken as they come, to have something to compare with."""
+"""Number of first readings that are accepted as they are, for comparison with later ones."""
 MEMORY = 1000.0
 """Readings over which their mean and variance are remembered."""
 LONGEST = 1e12
-"""Patience is never above this."""
+"""Upper bound of the patience."""
 
 
 def no_proportion() -> dict[str, Any]:

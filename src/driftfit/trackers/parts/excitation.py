@@ -1,13 +1,13 @@
-"""How strongly the regressors excite: their scales, and a windowed Gram matrix that tells which parameters are learned.
+"""Excitation: scales of the regressors, and a windowed Gram matrix that shows which parameters are being learned.
 
     c_i <- mean of phi_i^2 over the last samples on which regressor i did anything
     G   <- fade G + D phi phi' D,   D = diag(c)^(-1/2)
 
-A dull regressor keeps its scale, since a mean square that fades to 0 would blow up any drift measured by it. So does y,
-whose scale keeps the noise variance of a sensor that went dead from falling to 0. Parameter
-i is being learned while 1 / (G^-1)_ii, the information that no other parameter could explain, is above one sample's
-worth.
-Cost per sample: O(n^2); the flag inverts G when asked.
+A regressor without excitation keeps its scale, since a mean square that decays to 0 would inflate any drift measured in
+it. So does y, whose scale keeps the noise variance of a failed sensor from falling to 0. Parameter i is being learned
+while 1 / (G^-1)_ii, the information that no other parameter can explain, is above that of one sample.
+
+Cost per sample: O(n^2); the flag inverts G when it is requested.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from driftfit.trackers.parts.disproportion import FIRST
 MEMORY = 200.0
 """Samples over which the mean square of a regressor is remembered."""
 DULL = 1e-4
-"""A square below this share of the mean square counts as nothing happening."""
+"""A square below this share of the mean square counts as no excitation."""
 
 LARGE = 25.0
 """A square above this multiple of the mean square counts as this multiple."""

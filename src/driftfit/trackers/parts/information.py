@@ -1,19 +1,20 @@
-"""Square roots of information: what is known of theta as an upper triangle, kept by rotations alone.
+"""Square roots of information: an upper triangle that represents the information on theta, updated by rotations only.
 
-    |S theta - d|^2   is what the samples so far say;   S' S = P^-1 in units of the noise variance,   S theta_hat = d
+    |S theta - d|^2   is the information of the samples so far;   S' S = P^-1 in units of the noise variance,
+                      S theta_hat = d
 
-    absorb   the row phi' theta = y is rotated into the triangle from the top; what is left of y is rho = c e, with c
+    absorb   the row phi' theta = y is rotated into the triangle from the top; what remains of y is rho = c e, with c
              the product of the cosines and s = 1 / c^2 the variance of the innovation e
     spread   theta <- theta + G w, w ~ N(0, I), G an upper triangle: the row (1 | 0) of each w and the rows (-S g | S)
              lose their first column to that of w by rotations from the bottom, which leave S a triangle
 
 Nothing is subtracted that was added before, so S keeps its relative accuracy at any ratio of drift to noise and with
-collinear and badly scaled regressors, and S' S cannot lose its positivity. A zero row is a direction of which nothing
-is known: the diffuse start needs no case of its own.
+collinear and badly scaled regressors, and S' S cannot lose its positivity. A zero row is a direction without
+information: the diffuse start needs no special case.
 
-Arrays have the lane as their last axis, as fields of a record do. Source: Bierman, Factorization Methods for Discrete
+Arrays have the lane as their last axis, like fields of a record. Source: Bierman, Factorization Methods for Discrete
 Sequential Estimation (1977), chapters 5 and 6; departure: rotations one component of the drift at a time, in an order
-that keeps the triangle. Cost: n rotations a sample and n (n + 1) / 2 for the drift, so O(n^2) and O(n^3).
+that preserves the triangle. Cost: n rotations per sample and n (n + 1) / 2 for the drift, so O(n^2) and O(n^3).
 """
 
 from __future__ import annotations

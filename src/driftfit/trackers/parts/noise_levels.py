@@ -1,7 +1,7 @@
-"""Noise that changes, and outliers: levels f_j r of the noise variance as modes of a chain.
+"""Changing noise and outliers: levels f_j r of the noise variance are modes of a Markov chain.
 
-The last level is an outlier's: it comes with probability 0.02 at every sample and says nothing about the others, which
-form a sticky chain (stay, or one rung up or down). r itself follows what the levels leave unexplained,
+The last level is for outliers: it has probability 0.02 at every sample and does not affect the other levels, which form
+a persistent chain (stay, or one rung up or down). r itself adapts to what the levels do not explain,
 
     log r <- log r + (sum_j p_j (e^2 / s_j - 1) + sum_j nu_j log f_j) / memory
 
@@ -20,7 +20,7 @@ from driftfit.trackers.parts.resolution import lasting
 LEVELS = (1.0 / 16.0, 0.25, 1.0, 4.0, 16.0, 100.0)
 """Noise levels in units of r; the last is the outlier's."""
 STAY = 0.99
-"""Probability that the level stays where it is from one sample to the next."""
+"""Probability that the level is the same at the next sample."""
 OUTLIER = 0.02
 """Probability of an outlier."""
 MEMORY = 100.0

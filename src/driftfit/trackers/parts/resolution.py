@@ -1,19 +1,19 @@
-"""How fine the readings are: the step of a coarse meter, found from readings that repeat.
+"""The resolution of the readings: the step of a coarse meter, estimated from readings that repeat.
 
-Readings of an integer meter, a counter or a converter of few bits are right to half a step, and where they stand still
-residuals are zero although nothing was measured exactly. A noise variance learned from those collapses, and bands and
-likelihood with it. So
+Readings of an integer meter, a counter or a converter of few bits are accurate to half a step, and where they are
+constant, residuals are zero although nothing was measured exactly. A noise variance learned from those residuals
+collapses, and bands and likelihood with it. Therefore
 
-    quantum    the least step between two readings in a row, if steps of its size (up to one and a half) are a tenth
-               of all steps, and a tenth of the readings repeat the one before
-    coarse     quantum^2 / 12, the variance of what rounding takes away; 0 where readings are fine
-    fresh      whether a residual tells of the noise: not that of a reading that repeats the one before, as long as
-               the quantum is unknown
+    quantum    the smallest step between two consecutive readings, if steps of its size (up to one and a half) are a
+               tenth of all steps, and a tenth of the readings repeat the previous one
+    coarse     quantum^2 / 12, the variance of the rounding error; 0 if readings are not coarse
+    fresh      whether a residual carries information about the noise: not that of a reading that repeats the previous
+               one, as long as the quantum is unknown
 
-and no tracker takes its noise variance to be below ``coarse``. `AdaptiveKalman` also takes readings that repeat for
-what they are, one error of rounding seen again (`lasting`). Readings of a fine sensor never repeat, and nothing
-changes for them. Where they do, at a limit, at 0 while a pump is off, or because a value is held, the other steps are
-of all sizes and the least stands alone.
+and no tracker takes its noise variance to be below ``coarse``. `AdaptiveKalman` also treats readings that repeat as
+one rounding error observed several times (`lasting`). Readings of a fine sensor never repeat, and nothing changes for
+them. If they do repeat, at a limit, at 0 while a pump is off, or because a value is held, the other steps have all
+sizes, and no step is frequent.
 
 Source: quantum^2 / 12 is Sheppard's (1898); the rest is ours. Cost per sample: a few comparisons.
 """
@@ -30,7 +30,7 @@ from driftfit.engine.kernel import Array, State, kernel
 SHARE = 0.1
 """Share of the readings that repeat, and of the steps that are about as small as the least, for a quantum."""
 ENOUGH = 3.0
-"""Steps of the size of the quantum, and repeated readings, before it is believed."""
+"""Number of steps of the size of the quantum, and of repeated readings, before it is accepted."""
 ROUNDING = 1e-12
 """A step below this share of the reading is rounding, and the reading a repeated one."""
 

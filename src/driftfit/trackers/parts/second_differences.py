@@ -1,18 +1,18 @@
-"""Second differences, on line: parameters that move along a slope, and whose slope walks at random.
+"""Second differences, on line: parameters that move along a slope which is a random walk.
 
-At every t it gives the last point of the path that minimises
+At every t it computes the last point of the path that minimises
 
     J = sum_k w_k (y_k - phi_k' theta_k)^2 + sum_k (slope_{k+1} - slope_k)' D_k (slope_{k+1} - slope_k)
     slope_{k+1} = (theta_{k+1} - theta_k) / dt_{k+1},   D_k = diag(mu / d_{k+1}) / dt_{k+1}
 
-which for even steps prices theta_{k+1} - 2 theta_k + theta_{k-1}. With x = (theta, slope):
+which for even steps penalises theta_{k+1} - 2 theta_k + theta_{k-1}. With x = (theta, slope):
 
     predict   x <- F x,  F = [[1, dt], [0, 1]];   P <- F P F' + D^-1 (dt, 1)(dt, 1)'       (not before the first sample)
     correct   as in `driftfit.trackers.fls`, with the regressor h = (phi, 0)
 
-Start: nothing is known of x at the first sample (`driftfit.trackers.parts.diffuse`), and rank goes to 2 n. What is
-known of x moves with it, S <- S F^-1, which is a shear of the triangle: a level that was known is not after a gap,
-before there is a slope.
+The start is diffuse in x at the first sample (`driftfit.trackers.parts.diffuse`), and the rank goes up to 2 n. The
+information moves with x, S <- S F^-1, which is a shear of the triangle: after a gap, a level that was determined is not
+determined any more until there is a slope.
 
 Use it through ``FLS(mu, differences=2)``, for parameters that move smoothly and for forecasts that follow a trend.
 Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 4 (the integrated random walk). Departure:

@@ -1,9 +1,9 @@
-"""A drift of its own for every parameter at every sample: ``drift=`` of shape (T, n).
+"""A separate drift for every parameter at every sample: ``drift=`` of shape (T, n).
 
     q_t = diag(d_t)^(1/2) q diag(d_t)^(1/2),   d_t >= 0 known before sample t
 
-For flexible least squares it is a weight of its own for every step and parameter, mu_i / d_ti; d = 0 keeps a parameter
-where it is. Trackers that support it have a field ``each`` (n,), the roots of d, 1 where the user gives nothing.
+For flexible least squares it is a separate weight for every step and parameter, mu_i / d_ti; d = 0 keeps a parameter
+where it is. Trackers that support it have a field ``each`` (n,), the square roots of d, which are 1 by default.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Basis functions of static curves, f(x) = sum_k c_k f_k(x): what stands in the blocks of a Hammerstein-Wiener model.
+"""Basis functions of static curves, f(x) = sum_k c_k f_k(x), for the blocks of a Hammerstein-Wiener model.
 
     Polynomial(degree)           x, x^2, ..
     Legendre(degree, range)      P_1(s), P_2(s), ..,  s = (x - middle) / half-width
@@ -10,13 +10,13 @@
     Saturation(u_max)            [p2<u<p1] u, [u>=p1], [u<=p2],  coefficients (1, p1, p2)
     Functions(values, slopes, n) any two compilable functions of your own
 
-None has a constant: constants of the input and of the output block cannot be told apart, and a model has one
-``intercept`` for both. Scaling and range are given, never taken from the data.
+No basis contains a constant: constants of the input and of the output block cannot be distinguished, and a model has
+one ``intercept`` for both. Scaling and range are settings, never estimated from the data.
 
-Raw powers are fine up to degree 3 on data of unit size; beyond that their columns are nearly collinear, and `Legendre`
-on the range of the data is the remedy. B-splines say nothing outside their knots: samples there count as missing.
+Raw powers are suitable up to degree 3 on data of unit size; beyond that their columns are nearly collinear, and you
+should use `Legendre` on the range of the data. B-splines are undefined outside their knots: samples there are missing.
 
-Every basis gives `value(x)`, `derivative(x)`, n and names (`driftfit.models.hammerstein_wiener.curves.curve`).
+Every basis has `value(x)`, `derivative(x)`, n and names (`driftfit.models.hammerstein_wiener.curves.curve`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ __all__ = [
 
 
 def basis_of(value: Any) -> Basis | None:
-    """A basis, what `Basis.plain` wrote of one, or its words ("legendre", 4, -2, 2); None is the identity."""
+    """A basis from its description by `Basis.plain`, or from words ("legendre", 4, -2, 2); None is the identity."""
     if value is None or isinstance(value, Basis):
         return value
     if isinstance(value, Mapping) and value.get("class") in _kinds():
@@ -76,7 +76,7 @@ def _kinds() -> dict[str, type[Basis]]:
 
 @dataclass(frozen=True)
 class Polynomial(Basis):
-    """Raw powers x .. x^degree; from degree 4 on, `Legendre` is the better choice and a warning says so."""
+    """Raw powers x .. x^degree; from degree 4 on, `Legendre` is the better choice, and a warning is issued."""
 
     degree: int
 
@@ -110,7 +110,7 @@ def _ordered(owner: str, name: str, value: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Orthogonal(Basis):
-    """Orthogonal polynomials on a range; outside it they are continued."""
+    """Orthogonal polynomials on a range; they are continued outside it."""
 
     degree: int
     range: Any
@@ -157,11 +157,11 @@ class Chebyshev(_Orthogonal):
 
 @dataclass(frozen=True)
 class Thresholds(Basis):
-    """What dead zone and saturation share: two thresholds p2 <= 0 <= p1 among the coefficients (1, p1, p2).
+    """The common part of dead zone and saturation: two thresholds p2 <= 0 <= p1 among the coefficients (1, p1, p2).
 
-    The functions of an input take the thresholds from the estimates of the sample before it, held within 0 .. 0.97
-    u_max and -0.97 u_max .. 0: a Gauss-Newton step in p. What is learnt while they are wrong is wrong, so the tracker
-    must forget: with q = 0 they approach the truth as slowly as the share of those samples falls.
+    The functions of an input take the thresholds from the estimates of the sample before it, limited to 0 .. 0.97 u_max
+    and -0.97 u_max .. 0: a Gauss-Newton step in p. What is learned while they are wrong is wrong, so the tracker must
+    forget: with q = 0 they approach the truth only as fast as the share of those samples falls.
     """
 
     u_max: float
@@ -170,7 +170,7 @@ class Thresholds(Basis):
 
     adaptive: ClassVar[bool] = True
     begins: ClassVar[float]
-    """Where the thresholds begin, as a share of u_max, unless that is said."""
+    """Initial value of the thresholds, as a share of u_max, by default."""
     machine: ClassVar[tuple[Any, Any]]
 
     def __post_init__(self) -> None:
@@ -194,10 +194,10 @@ class Thresholds(Basis):
 
     @abstractmethod
     def split(self, u: Array, above: Array, below: Array) -> Array:
-        """The functions (.., 3) where it is known which inputs lie above and below the thresholds."""
+        """The functions (.., 3), given which inputs are above and below the thresholds."""
 
     def known(self, p1: float, p2: float) -> Functions:
-        """The basis with thresholds that are known, for simulations."""
+        """The basis with known thresholds, for simulations."""
         return Functions(*self.machine, 3, (p1, p2, self.u_max), self.names)
 
 
@@ -205,7 +205,7 @@ class Thresholds(Basis):
 class DeadZone(Thresholds):
     """A dead zone between p2 < 0 < p1: v = u - p1 above it, u - p2 below, 0 inside; an input block only.
 
-    In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u outside the dead zone, f_2 = -1 above it and
+    In terms of coefficients, v = f_1 + p1 f_2 + p2 f_3, where f_1 = u outside the dead zone, f_2 = -1 above it and
     f_3 = -1 below it, 0 elsewhere. A valve ends where it is fully open: u beyond ``limit`` acts as the limit does.
 
     Parameters
@@ -213,13 +213,13 @@ class DeadZone(Thresholds):
     u_max : number
         The largest size of the input, above 0.
     start : number
-        Where both thresholds begin, in size.
+        Initial size of both thresholds.
     fed : "least-squares" or "average"
-        A filter of products has nb estimates of each threshold, the products b_j p1 beside the b_j. They are fed back
-        as sum_j b_j (b_j p1) / sum_j b_j^2, or as the mean over j of (b_j p1) / b_j, which Feng and Hong (2021) have
-        and a b_j near zero throws off. With minimal parameters (`ExtendedKalman`) p1 and p2 are estimated themselves.
+        A filter of products has nb estimates of each threshold, the products b_j p1 together with the b_j. They are fed
+        back as sum_j b_j (b_j p1) / sum_j b_j^2, or as the mean over j of (b_j p1) / b_j, as in Feng and Hong (2021),
+        which fails for a b_j near zero. With minimal parameters (`ExtendedKalman`) p1 and p2 are estimated themselves.
     limit : number or None
-        Known size beyond which the input moves the valve no more, as the 10 V of equation (61) of Feng and Hong (2021).
+        Known size beyond which the input has no further effect, as the 10 V of equation (61) of Feng and Hong (2021).
 
     Raises
     ------
@@ -246,7 +246,7 @@ class DeadZone(Thresholds):
 
     @property
     def reach(self) -> float:
-        """Size beyond which the input moves nothing."""
+        """Size beyond which the input has no further effect."""
         return LARGEST if self.limit is None else self.limit
 
     @property
@@ -265,9 +265,9 @@ class DeadZone(Thresholds):
 class Saturation(Thresholds):
     """A saturation at p2 < 0 < p1: v = u between them, p1 above, p2 below; an input block only.
 
-    In coefficients that is v = f_1 + p1 f_2 + p2 f_3, where f_1 = u inside, f_2 = 1 above p1 and f_3 = 1 below p2, 0
-    elsewhere. Parameters as for `DeadZone`; the thresholds begin at half of u_max unless ``start`` says otherwise. A
-    threshold that no input reaches settles near the largest input.
+    In terms of coefficients, v = f_1 + p1 f_2 + p2 f_3, where f_1 = u inside, f_2 = 1 above p1 and f_3 = 1 below p2, 0
+    elsewhere. Parameters as for `DeadZone`; the thresholds begin at half of u_max unless ``start`` is given. A
+    threshold that no input reaches converges to about the largest input.
     """
 
     code: ClassVar[int] = kernels.SATURATION
@@ -285,9 +285,9 @@ class Saturation(Thresholds):
 
 @dataclass(frozen=True)
 class Sigmoid(Basis):
-    """Sigmoids tanh((x - m_k) / width) + tanh(m_k / width) at increasing ``centres`` m_k: 0 at 0, level far away.
+    """Sigmoids tanh((x - m_k) / width) + tanh(m_k / width) at increasing ``centres`` m_k: 0 at 0, constant far away.
 
-    A sum of them with positive coefficients rises everywhere and levels off at both ends, as valves and sensors do.
+    A sum of them with positive coefficients increases everywhere and saturates at both ends, as valves and sensors do.
     """
 
     centres: Any

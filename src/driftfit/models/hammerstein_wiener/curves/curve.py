@@ -1,7 +1,7 @@
-"""Static curves f(x) = sum_k c_k f_k(x): what every basis offers, and functions of your own.
+"""Static curves f(x) = sum_k c_k f_k(x): the interface of every basis, and functions of your own.
 
-A basis gives `value(x)` and `derivative(x)`, (..., n) each, and for steps the machine ``evaluate``.
-Its numbers p (``parameters``) live in the record, so that another range needs no other code.
+A basis has `value(x)` and `derivative(x)`, (..., n) each, and for steps the compiled routine ``evaluate``.
+Its numbers p (``parameters``) are stored in the record, so another range needs no new compilation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _over(evaluate: Any) -> Driver:
 
 
 def values_and_slopes(evaluate: Any, x: Array, p: Array, n: int) -> tuple[Array, Array]:
-    """The functions of a machine at x (k,), and their derivatives, (k, n) each; its numbers p may be written to."""
+    """The functions of a compiled routine at x (k,), and their derivatives, (k, n) each; p may be overwritten."""
     evaluate.load()
     out, slopes = np.empty((2, len(x), n))
     _over(evaluate)(np.ascontiguousarray(x), p, out, slopes)
@@ -45,9 +45,9 @@ class Basis(Settings, ABC):
     """A set of functions of one variable, without a constant."""
 
     code: ClassVar[int] = -1
-    """The kind, as `driftfit.models.hammerstein_wiener.curves.kernels` knows it."""
+    """The kind, as a code of `driftfit.models.hammerstein_wiener.curves.kernels`."""
     adaptive: ClassVar[bool] = False
-    """Whether the functions depend on their own coefficients, which then are fed back at every sample."""
+    """Whether the functions depend on their own coefficients, which are then fed back at every sample."""
 
     @property
     @abstractmethod
@@ -56,12 +56,12 @@ class Basis(Settings, ABC):
 
     @property
     def evaluate(self) -> Any:
-        """The machine that evaluates the functions and their derivatives; see `curve_kernels`."""
+        """The compiled routine that evaluates the functions and their derivatives; see `curve_kernels`."""
         return kernels.evaluate
 
     @property
     def kind(self) -> tuple[Any, int]:
-        """The machine and the code, which steps are made from."""
+        """The compiled routine and the code, from which steps are made."""
         return self.evaluate, self.code
 
     @property
@@ -71,24 +71,24 @@ class Basis(Settings, ABC):
 
     @property
     def parameters(self) -> Array:
-        """What the compiled functions get as p: the code of the kind, and the numbers of the basis."""
+        """The array p of the compiled functions: the code of the kind, and the numbers of the basis."""
         return np.concatenate([[float(self.code)], self.own_numbers])
 
     @property
     def expected(self) -> tuple[float, float]:
-        """Where data are expected."""
+        """The range in which data are expected."""
         return (-np.inf, np.inf)
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Where the functions are defined; a sample outside is missing."""
+        """The range in which the functions are defined; a sample outside is missing."""
         return (-np.inf, np.inf)
 
     @property
     def rise_between(self) -> tuple[float, float]:
         """Two inputs: a curve that is higher at the second than at the first counts as rising.
 
-        0, or what is nearest to it in the range, and the upper end; so an even curve has a sign as well.
+        They are 0, or the point of the range nearest to it, and the upper end; so an even curve has a sign as well.
         """
         low, high = self.expected
         if not (np.isfinite(low) and np.isfinite(high)):
@@ -104,7 +104,7 @@ class Basis(Settings, ABC):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the functions are, in the order of the coefficients."""
+        """Names of the functions, in the order of the coefficients."""
         return tuple(f"f{k + 1}" for k in range(self.n))
 
     def value(self, x: Any) -> Array:
@@ -123,7 +123,7 @@ class Basis(Settings, ABC):
 
     @classmethod
     def from_words(cls, words: tuple[Any, ...]) -> Self:
-        """The basis from its numbers one after the other, as on the command line."""
+        """The basis from a sequence of numbers, as on the command line."""
         try:
             return cls(*words)
         except TypeError:
@@ -141,14 +141,15 @@ class Functions(Basis):
     Parameters
     ----------
     values, slopes : functions (x, p, out) that Numba can compile
-        Fill ``out`` (n,) with the functions, and with their derivatives, at the number x. They may use numpy, math,
-        numbers and ``driftfit.engine.kernel`` functions. To be saved they must stand in a module that can be imported.
+        Fill ``out`` (n,) with the functions, or with their derivatives, at the number x. They may use numpy, math,
+        numbers and ``driftfit.engine.kernel`` functions. To be saved they must be defined in a module that can be
+        imported.
     n : int
-        How many functions.
+        Number of functions.
     numbers : sequence
-        What they get as the array p.
+        The content of the array p.
     labels : sequence of str or None
-        What the functions are called.
+        Names of the functions.
     """
 
     values: Any
@@ -186,13 +187,13 @@ class Functions(Basis):
 
 @lru_cache
 def _compiled(function: Callable[..., Any]) -> Any:
-    """A function of the user's as a kernel."""
+    """A user's function as a kernel."""
     return function if hasattr(function, "identity") else kernel(getattr(function, "py_func", function))
 
 
 @lru_cache
 def _together(values: Any, slopes: Any) -> Any:
-    """The machine of two functions of the user's."""
+    """The compiled routine of a user's two functions."""
     first, second = _compiled(values), _compiled(slopes)
 
     @kernel
@@ -204,13 +205,13 @@ def _together(values: Any, slopes: Any) -> Any:
 
 
 def _place(function: Any) -> str:
-    """Where a function can be imported from."""
+    """The module and name from which a function can be imported."""
     source = getattr(function, "py_func", function)
     return f"{source.__module__}:{source.__qualname__}"
 
 
 def _imported(function: Any) -> Any:
-    """A function, or the one that stands at ``module:name``."""
+    """A function, or the one at ``module:name``."""
     if isinstance(function, str):
         module, _, name = function.partition(":")
         try:

@@ -1,7 +1,7 @@
 """Curves in pieces: lines that bend at knots, and B-splines.
 
-B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs stands at
-the end of their parameters p = [degree, knots.., scratch.., values at the anchor..].
+B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch space of their recursion is at the end
+of their parameters p = [degree, knots.., scratch.., values at the anchor..].
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def knots_of(owner: str, value: Any, least: int, name: str = "knots") -> tuple[f
 
 @dataclass(frozen=True)
 class PiecewiseLinear(Basis):
-    """A line that bends at increasing ``knots``; its first coefficient is the slope of the piece that holds 0."""
+    """A line that bends at increasing ``knots``; its first coefficient is the slope of the piece that contains 0."""
 
     knots: Any
 
@@ -46,7 +46,7 @@ class PiecewiseLinear(Basis):
 
     @property
     def rise_between(self) -> tuple[float, float]:
-        """Well beyond the last knot, since a curve may be level between the knots."""
+        """A point well beyond the last knot, since a curve may be constant between the knots."""
         return 0.0, max(self.knots[-1], 0.0) + max(map(abs, self.knots))
 
     @property
@@ -66,7 +66,7 @@ class PiecewiseLinear(Basis):
 class BSpline(Basis):
     """B-splines of a degree on increasing ``knots``, clamped at both ends, zero together at ``anchor``.
 
-    They add up to 1, so one is left out and the constant is taken away: n = len(knots) + degree - 2.
+    They add up to 1, so one of them is left out and the constant is removed: n = len(knots) + degree - 2.
     """
 
     degree: int

@@ -1,1 +1,1 @@
-"""What a Hammerstein-Wiener run is asked for: blocks, free runs, diagnostics, pictures."""
+"""Results of a Hammerstein-Wiener run: blocks, free runs, diagnostics, plots."""

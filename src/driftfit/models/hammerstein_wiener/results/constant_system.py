@@ -1,19 +1,19 @@
 """Constant Hammerstein-Wiener systems from a whole noisy record: least squares, instruments, the unbiased basis.
 
-    theta_0  = argmin sum (z_t - phi_t' theta)^2                     biased: phi holds the noisy y
+    theta_0  = argmin sum (z_t - phi_t' theta)^2                     biased: phi contains the noisy y
     y_s      = the output simulated with the estimate, from the inputs alone
-    theta    = (sum phi_s,t phi_t' / R_t)^-1 sum phi_s,t z_t / R_t   phi_s from y_s, again and again
-    R_t      = sum_i a_i^2 F'(y_s,t-i)^2,  a_0 = 1                   what white noise on y makes of the equation
+    theta    = (sum phi_s,t phi_t' / R_t)^-1 sum phi_s,t z_t / R_t   phi_s from y_s, repeatedly
+    R_t      = sum_i a_i^2 F'(y_s,t-i)^2,  a_0 = 1                   variance that white noise on y adds to the equation
 
-The simulated regressors know nothing of the noise of the record, so that white noise on y no longer biases what is
-linear in y. Weighting by R_t leaves a third of the error that equal weights leave. Powers of y stay biased, as
-E y^2 = y0^2 + sigma^2; where sigma is known, and the noise Gaussian, Hermite polynomials of y have the powers of the
-clean output as their means,
+The simulated regressors are independent of the noise of the record, so white noise on y no longer biases the part that
+is linear in y. Weighting by R_t leaves a third of the error of equal weights. Powers of y remain biased, because
+E y^2 = y0^2 + sigma^2; if sigma is known, and the noise is Gaussian, the expectations of Hermite polynomials of y are
+the powers of the noise-free output,
 
     h_1 = y,  h_2 = y^2 - sigma^2,  h_3 = y^3 - 3 sigma^2 y,  h_(k+1) = y h_k - k sigma^2 h_(k-1)
 
-Use it where nothing drifts; `OutputError` follows what does. Source of instruments by simulation: Young, Recursive
-Estimation and Time-Series Analysis (2011), chapter 7. Cost: O(T n^2) a round.
+Use it if nothing drifts; otherwise use `OutputError`. Source of instruments by simulation: Young, Recursive
+Estimation and Time-Series Analysis (2011), chapter 7. Cost: O(T n^2) per iteration.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ POINTS = 2000
 
 
 class Constant(NamedTuple):
-    """theta (n,) and what it separates into, a, b, c, d; xi (n_x,); and ``y`` (T,), the output simulated with it, where
+    """theta (n,) and its blocks a, b, c, d; xi (n_x,); and ``y`` (T,), the output simulated with it, where
     the output block has the ``slope`` (T,).
     """
 
@@ -51,16 +51,16 @@ class Constant(NamedTuple):
 
 
 def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, sigma: float | None = None) -> Constant:
-    """Fit a system that does not change.
+    """Fit a system whose parameters are constant.
 
     Parameters
     ----------
     model : HammersteinWiener
-        Without a dead zone.
+        A model without a dead zone.
     y, u : (T,)
         A record; samples that need a missing value are left out.
     rounds : int
-        Rounds with instruments; 0 is least squares.
+        Iterations with instruments; 0 is least squares.
     sigma : number or None
         Standard deviation of Gaussian noise on y, for the unbiased basis; the output must be a `Polynomial` or None.
 
@@ -90,7 +90,7 @@ def fit_constant(model: HammersteinWiener, y: Any, u: Any, *, rounds: int = 5, s
 
 
 def unbiased(model: HammersteinWiener, y: Array, sigma: float) -> Array:
-    """Functions (T, n_out) of a noisy output whose means are the powers of the clean one."""
+    """Functions (T, n_out) of a noisy output whose expectations are the powers of the noise-free one."""
     if not isinstance(model.out, Polynomial):
         raise ValueError(f"fit_constant: sigma needs raw powers in the output block; got {model.out!r}.")
     variance = numbers("fit_constant", "sigma", sigma, ndim=0, low=0.0, strict=True) ** 2
@@ -111,7 +111,7 @@ def regression(model: HammersteinWiener, f: Array, g: Array) -> tuple[Array, Arr
 
 
 def noise_of_equation(fit: Constant) -> Array:
-    """R_t (T,), and a hundredth of its mean, so that flat places of the output block do not count for everything."""
+    """R_t (T,) plus a hundredth of its mean, so that flat parts of the output block do not get all the weight."""
     squares = fit.slope**2
     total = sum(a**2 * np.concatenate([squares[:i], squares[: len(squares) - i]]) for i, a in enumerate((1.0, *fit.a)))
     return np.asarray(total + 0.01 * np.mean(total))
@@ -122,7 +122,7 @@ def _late(x: Array, k: int) -> Array:
 
 
 def _separated(model: HammersteinWiener, theta: Array, f: Array, y: Array) -> Constant:
-    """The blocks of products, and the output that they make of the inputs."""
+    """The blocks of products, and the output that they produce from the inputs."""
     a, b, c, d = (part[0] for part in split(model, theta[None], "svd-joint")[:4])
     rest = theta[-1:] if model.intercept else None
     v = np.nan_to_num(f @ c)

@@ -1,18 +1,18 @@
-"""How far the blocks of a run can be trusted, sample by sample.
+"""Diagnostics of the blocks of a run, sample by sample.
 
     excitation   least eigenvalue of the windowed Gram matrix of phi, its columns scaled to unit norm: 0 to 1
-    nis          e^2 / s, 1 on average where q and r are right
-    quality      sigma_2 / sigma_1 of [b, BC] and [a, AD]: how far theta is from products
-    slope        least F'(y; d_t) over the outputs of the window
+    nis          e^2 / s, 1 on average if q and r are correct
+    quality      sigma_2 / sigma_1 of [b, BC] and [a, AD]: the distance of theta from products
+    slope        smallest F'(y; d_t) over the outputs of the window
     radius       largest pole of the estimated linear block
     trace, condition   of the covariance P of theta (scaled to unit diagonal for the condition)
-    memory       samples, (p + q) / q with p the largest eigenvalue of P: what the filter averages over
+    memory       samples, (p + q) / q with p the largest eigenvalue of P: the averaging length of the filter
     trusted      excitation above a limit, slope above 0 and radius below 1
 
-The boundedness constants of Feng and Hong (2021), theorem 1, are no error bounds to be shown: they hold, and
-are too large by factors of 1e4 and more, as `python -m lab reproduce hammerstein-wiener` measures.
+The boundedness constants of Feng and Hong (2021), theorem 1, are not useful as error bounds: they hold, but are too
+large by factors of 1e4 and more, as `python -m lab reproduce hammerstein-wiener` measures.
 
-Source: specification of the persistent excitation condition (42) there. Cost: O(n^3) per sample looked at.
+Source: specification of the persistent excitation condition (42) there. Cost: O(n^3) per diagnosed sample.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 LEAST = 1e-8
-"""Excitation below which samples are not trusted: some product cannot be told from the others."""
+"""Excitation below which samples are not trusted, because some product is not determined."""
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What `diagnose_blocks` returns; each field (samples,), ``quality`` (samples, 2), ``weakest`` (samples, n).
+    """The result of `diagnose_blocks`; each field (samples,), ``quality`` (samples, 2), ``weakest`` (samples, n).
 
-    ``at`` are the samples looked at; ``weakest`` is the direction of theta that was excited least, in units of scaled
-    columns.
+    ``at`` are the diagnosed samples; ``weakest`` is the direction of theta with the least excitation, in units of
+    scaled columns.
     """
 
     names: tuple[str, ...]
@@ -62,7 +62,7 @@ class Diagnostics:
         return (self.excitation > self.limit) & (self.slope > 0.0) & (self.radius < 1.0)
 
     def dull(self, k: int = -1) -> tuple[str, ...]:
-        """Names of the columns that sample ``at[k]`` could not tell apart; empty where all are excited."""
+        """Names of the columns that sample ``at[k]`` does not distinguish; empty if all are excited."""
         if self.excitation[k] > self.limit:
             return ()
         share = np.abs(self.weakest[k])
@@ -70,7 +70,7 @@ class Diagnostics:
 
 
 def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit: float = LEAST) -> Diagnostics:
-    """Diagnose every ``every``-th sample over a window of samples, at least and by default 3 n.
+    """Diagnose every ``every``-th sample over a window of samples, by default and at least 3 n.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def diagnose_blocks(run: Track, window: int | None = None, every: int = 1, limit
 
 
 def excitation_of(phi: Array, at: Array, span: int) -> tuple[Array, Array]:
-    """Least eigenvalue of the scaled Gram matrix of each window and its eigenvector."""
+    """Smallest eigenvalue of the scaled Gram matrix of each window, and its eigenvector."""
     n = phi.shape[1]
     least, weakest = np.zeros(len(at)), np.zeros((len(at), n))
     for k, t in enumerate(at):
@@ -115,7 +115,7 @@ def excitation_of(phi: Array, at: Array, span: int) -> tuple[Array, Array]:
 
 
 def _least_slope(model: HammersteinWiener, d: Array, y: Array) -> float:
-    """The least F' over the span of the outputs of a window."""
+    """The smallest F' over the span of the outputs of a window."""
     seen = y[np.isfinite(y)]
     if not seen.size:
         return float("nan")

@@ -1,14 +1,14 @@
-"""Which ratio of drift to noise: filters with several, side by side, weighed by what they predict of y.
+"""Estimate the ratio of drift to noise: filters with several ratios in parallel, weighted by how well they predict y.
 
     filter j     Kalman with r = 1, q = rho_j I;   sigma_j^2 <- discounted mean of e^2 / s
     L_j,t        = 0.998 L_j,t-1 - 1/2 log(sigma_j^2 s) - e^2 / (2 sigma_j^2 s) + log F'(y_t; d_t)
 
-with sigma_j^2 from before the sample and d after it. What is reported at t is the estimate of the filter whose L is the
-largest by then: nothing looks ahead. Without the Jacobian F' the likelihood prefers estimates with F' = 0.
+with sigma_j^2 from before the sample and d after it. The result at t is the estimate of the filter with the largest L
+at that time: nothing looks ahead. Without the Jacobian F' the likelihood prefers estimates with F' = 0.
 
-Use it where no record is at hand that `tune` could fit a ratio to, or where the ratio changes. The filters are one
-grid, `track` with a list, which spreads them over the cores. Cost: that of the filters. As lanes of one tile seven
-filters take 1.2 times as long as by themselves at n = 7, and 1.6 times at n = 14: lanes pay where the model's step
+Use it if there is no record to which `tune` could fit a ratio, or if the ratio changes. The filters are one grid,
+`track` with a list, which distributes them over the cores. Cost: that of the filters. As lanes of one tile seven
+filters take 1.2 times as long as separately at n = 7, and 1.6 times at n = 14: lanes pay if the model's step
 vectorises over them, as that of an `ARX` does.
 """
 
@@ -31,25 +31,25 @@ FADE = 0.998
 
 
 class Ratios(NamedTuple):
-    """What `track_ratios` returns."""
+    """The result of `track_ratios`."""
 
     rhos: Array
     """(J,)"""
     rho: Array
-    """(T,): the ratio that leads."""
+    """(T,): the ratio with the highest likelihood."""
     theta: Array
-    """(T, n): the estimate of the filter that leads."""
+    """(T, n): the estimate of its filter."""
     score: Array
     """(T, J): discounted log-likelihoods of y."""
     runs: Any
-    """The run of every filter, by its place."""
+    """The run of every filter, by its index."""
 
 
 def track_ratios(
     model: HammersteinWiener, y: Any, u: Any, *, rhos: Sequence[float] = RHOS, fade: float = FADE, p0: float = 1e8,
     theta0: Any = 0.01,
 ) -> Ratios:  # fmt: skip
-    """Track with every ratio and report the one that leads.
+    """Track with every ratio, and return the results of the one with the highest likelihood.
 
     Parameters
     ----------
@@ -58,9 +58,9 @@ def track_ratios(
     rhos : numbers
         Ratios q / r.
     fade : number
-        What a sample's likelihood is worth one sample later; below 1.
+        Weight of a sample's likelihood one sample later; below 1.
     p0, theta0
-        Start, p0 in units of r.
+        Initial covariance, in units of r, and mean.
 
     Raises
     ------

@@ -2,11 +2,11 @@
 
     v_t = sum_k c_k f_k(u_t),   w_t = -sum_i a_i w_{t-i} + sum_j b_j v_{t-nk-j+1} (- l),   y_t = F^-1(w_t)
 
-Sample t uses the coefficients that were known after sample t - 1. F is inverted on the range of the outputs seen until
-then, widened by a fifth; where it does not increase there, its monotone envelope is inverted and the sample is flagged.
+Sample t uses the coefficients that were known after sample t - 1. F is inverted on the range of the outputs observed
+until then, widened by a fifth; where it does not increase, its monotone envelope is inverted and the sample is flagged.
 Poles on or outside the unit circle are flagged, and reflected for that sample (z -> 1 / z).
 
-Under measurement noise a free run predicts better than the one-step prediction, which feeds noisy outputs back.
+With measurement noise a free run predicts better than the one-step prediction, which feeds noisy outputs back.
 Cost per sample: O(64 n_out).
 """
 
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """``y``, ``w`` and ``v`` (T,), v the sum over all inputs; ``rising`` and ``stable`` (T,) bool: where F increased,
-    and where no pole was reflected.
+    """``y``, ``w`` and ``v`` (T,), v the sum over all inputs; ``rising`` and ``stable`` (T,) bool: whether F increased,
+    and whether no pole was reflected.
     """
 
     y: Array
@@ -46,7 +46,7 @@ class FreeRun:
 def free_run(run: Track, method: str = "svd-joint", start: int | None = None) -> FreeRun:
     """Simulate the output of a record from sample ``start`` on (by default after max(50, 5 n) samples).
 
-    The w before are taken from the measured outputs; results before ``start`` are NaN.
+    The earlier w are taken from the measured outputs; results before ``start`` are NaN.
     """
     found = blocks_of(run, method)
     T, na = len(run), found.a.shape[1]
@@ -72,7 +72,7 @@ def free_run(run: Track, method: str = "svd-joint", start: int | None = None) ->
 
 
 def inputs(found: Blocks, u: Array, i: int = 0) -> Array:
-    """v (T,) of input i, each with the coefficients after the sample before; a missing input is 0."""
+    """v (T,) of input i, each with the coefficients of the previous sample; a missing input is 0."""
     basis, c = found.model.bases[i], found.of_input(i)[1]
     late = np.concatenate([c[:1], c[:-1]])
     if isinstance(basis, Thresholds):
@@ -84,7 +84,7 @@ def inputs(found: Blocks, u: Array, i: int = 0) -> Array:
 
 
 def _drive(found: Blocks, curves: list[Array], nks: tuple[int, ...], t: int) -> float:
-    """What the inputs add to w_t."""
+    """The contribution of the inputs to w_t."""
     total, at = 0.0 if found.intercept is None else -float(found.intercept[t - 1]), 0
     for v, nb, nk in zip(curves, found.model.structure.nb, nks, strict=True):
         past = v[max(t - nk - nb + 1, 0) : max(t - nk + 1, 0)][::-1]
@@ -94,7 +94,7 @@ def _drive(found: Blocks, curves: list[Array], nks: tuple[int, ...], t: int) -> 
 
 
 def reflected(a: Array) -> Array:
-    """Coefficients whose poles outside the unit circle are at 1 / conj(z) instead, and just inside where on it."""
+    """Coefficients with poles outside the unit circle moved to 1 / conj(z), and poles on it to just inside."""
     poles = np.roots(np.concatenate([[1.0], a]))
     size = np.abs(poles)
     moved = np.where(size >= 1.0, poles / np.maximum(size, 1.0 + 1e-6) ** 2, poles)
@@ -124,7 +124,7 @@ def believed(y: Array) -> tuple[Array, Array]:
 
 
 class _Grid:
-    """The functions of the output block over the outputs believed so far."""
+    """The functions of the output block over the accepted outputs so far."""
 
     def __init__(self, found: Blocks, y: Array) -> None:
         self.basis = found.model.out
@@ -132,7 +132,7 @@ class _Grid:
         self.y = np.empty(0)
 
     def upto(self, t: int) -> None:
-        """Lay the grid for the outputs before sample t, if it does not hold them."""
+        """Build the grid for the outputs before sample t, if it does not contain them."""
         low, high = float(self.low[t - 1]), float(self.high[t - 1])
         low, high = (low, high) if np.isfinite(low) and np.isfinite(high) else (-1.0, 1.0)
         if not self.y.size or low < self.y[0] or high > self.y[-1]:
@@ -142,7 +142,7 @@ class _Grid:
             self.curve = self.basis.value(self.y)
 
     def invert(self, d: Array, w: float) -> tuple[float, bool]:
-        """(y, whether F increases), polished by Newton's method where it does."""
+        """(y, whether F increases), refined by Newton's method if it does."""
         level = self.curve @ d
         rising = bool((np.diff(level) > 0.0).all())
         if not rising:

@@ -1,8 +1,8 @@
 """Hybrid start: stage one until the record has excited every product, then a filter on the minimal parameters.
 
-Stage one finds the basin from any start, the extended Kalman and output-error filters are more accurate within it. The
-second one begins at the separation by generalised least squares, with its covariance, with the lags of the model and
-at the time where the first one ended.
+Stage one finds the basin of attraction from any initial value; within it the extended Kalman and output-error filters
+are more accurate. The second filter starts from the separation by generalised least squares, with its covariance, with
+the lags of the model, and at the time when the first one ended.
 """
 
 from __future__ import annotations
@@ -97,9 +97,9 @@ def hand_off(
 
 
 def _sufficient(model: HammersteinWiener, first: Tracker, y: Array, u: Array, limit: float) -> int:
-    """The first sample at which a window of 3 n has excited every product."""
+    """The first sample at which a window of 3 n samples has excited every product."""
     n = model.n
-    for T in (20 * n, len(y)):  # most records excite soon
+    for T in (20 * n, len(y)):  # most records are excited early
         run = track_one(model, first, y[:T], u[:T])
         seen = replay(run)
         phi = np.where(seen["ok"][:, :1] > 0.0, seen["phi"][..., 0], 0.0)

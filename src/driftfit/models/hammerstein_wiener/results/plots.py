@@ -1,4 +1,4 @@
-"""Pictures of blocks."""
+"""Plots of blocks."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
 
 
 def _points(signal: Any) -> Any:
-    """Points over the middle 99 % of a signal."""
+    """Points over the central 99 % of a signal."""
     seen = signal[np.isfinite(signal)]
     low, high = np.quantile(seen, (0.005, 0.995)) if seen.size else (-1.0, 1.0)
     return np.linspace(low, high, POINTS)
 
 
 def _paths(axis: Axes, run: Track, group: Any, names: Any, std: Any) -> None:
-    """Coefficients over time, with bands of two standard deviations where they are known; the leading 1 is left out."""
+    """Coefficients over time, with bands of two standard deviations if known; the leading 1 is left out."""
     late = settled(run)
     shown = [i for i in range(group.shape[1]) if not np.all(group[late, i] == 1.0)]
     for i in shown:

@@ -1,11 +1,12 @@
-"""A drift covariance of the shape of products, for stage one: Q = J Q_xi J' + eps I.
+"""A drift covariance with the structure of products, for stage one: Q = J Q_xi J' + eps I.
 
     J = dg/dxi at the separated xi,   Q_xi = diag(one variance per group a, b, c, d),   eps = 1e-3 of the largest
 
-When b_j walks, so do all b_j c_k: the drift of theta is far from a multiple of the identity, and four numbers say
-more than a full matrix that nobody knows. J moves with xi, so the record is tracked in pieces, each with J at the end
-of the piece before; the filter goes on where it stood. A stream does the same, with `renewed` between two samples, and
-gets the same bits. On example 1 of Feng and Hong (2021) pieces of 20 samples are as accurate as pieces of 100.
+If b_j drifts, so do all b_j c_k: the drift of theta is far from a multiple of the identity, and four numbers describe
+it better than a full matrix of unknown entries. J changes with xi, so the record is tracked in pieces, each with J at
+the end of the previous piece; the filter continues from its state. In a stream, calling `renewed` between two samples
+does the same and gives the same bits. On example 1 of Feng and Hong (2021) pieces of 20 samples are as accurate as
+pieces of 100.
 
 Source: the covariance of a product to first order. Cost per sample: that of `Kalman` with a full q.
 """
@@ -30,7 +31,7 @@ from driftfit.run.track import track_one
 from driftfit.trackers.kalman import Kalman
 
 FLOOR = 1e-3
-"""eps over the largest variance."""
+"""eps divided by the largest variance."""
 
 
 class ProductTrack(NamedTuple):
@@ -42,7 +43,7 @@ class ProductTrack(NamedTuple):
 
 
 def product_drift(model: HammersteinWiener, xi: Array, q: Any) -> Array:
-    """Q (n, n) at xi (n_x,), for one variance q, or four: those of a, b, c and d per nominal sample."""
+    """Q (n, n) at xi (n_x,), from one variance q, or four: those of a, b, c and d per nominal sample."""
     given = numbers("product_drift", "q", q, low=0.0)
     four = given if isinstance(given, tuple) else (given,) * 4
     if len(four) != 4:
@@ -59,7 +60,7 @@ def track_products(
     model: HammersteinWiener, y: Any, u: Any, *, q: Any, r: float, start: Any = None, p0: float = 1e8,
     theta0: Any = 0.01, every: int = 100,
 ) -> ProductTrack:  # fmt: skip
-    """Track a record with a drift of the shape of products, renewed every so many samples.
+    """Track a record with a drift that has the structure of products, renewed at regular intervals.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def track_products(
     start : (n_x,) or None
         xi for the first piece; None: a first piece with q I.
     p0, theta0
-        Start of the products.
+        Initial covariance and mean of the products.
 
     Raises
     ------
@@ -89,7 +90,7 @@ def track_products(
         part = slice(first, first + every)
         Q = float(np.max(q)) * np.eye(model.n) if xi is None else product_drift(model, xi, q)
         tracker = Kalman(q=Q, r=r, p0=p0, theta0=theta0)
-        with warnings.catch_warnings():  # a piece is too short for what is said about records
+        with warnings.catch_warnings():  # a piece is too short for warnings that concern records
             warnings.simplefilter("ignore", UserWarning)
             run = track_one(model, tracker, output[part], inputs[part], keep="cov", warm_start=run)
             paths.append(blocks_of(run, "gls").xi)
@@ -99,18 +100,18 @@ def track_products(
 
 
 def renewed(live: Live, q: Any) -> Live:
-    """The stream, from its next sample on with the drift of products at its present separated parameters.
+    """Continue a stream with the drift of products at its present separated parameters.
 
     Parameters
     ----------
     live : Live
-        A `Kalman` with a full q on a `HammersteinWiener`; the first one with the largest of ``q`` times the identity.
+        A `Kalman` with a full q on a `HammersteinWiener`; initially with the largest of ``q`` times the identity.
     q : number or four
         Drift variances of a, b, c and d per sample.
 
     Returns
     -------
-    Live, one that goes on where the given one stands, which may be dropped. Cost: that of making a `Live`, about a
+    Live, which continues from the state of the given one; you may drop that one. Cost: that of making a `Live`, about a
     millisecond; the compiled steps are the same.
     """
     model, tracker = live.model, live.tracker
@@ -125,7 +126,7 @@ def renewed(live: Live, q: Any) -> Live:
 
 
 def _separated(model: HammersteinWiener, theta: Array, before: Any) -> Any:
-    """xi of one theta (n,) by "svd-joint", or what held before where that is not finite."""
+    """xi of one theta (n,) by "svd-joint", or the previous value if that is not finite."""
     groups = Separator(model)(theta, "svd-joint")
     xi = minimal(model, groups, np.asarray(theta[-1]) if model.intercept else None)
     return xi if np.isfinite(xi).all() else before

@@ -1,4 +1,4 @@
-"""The blocks of a run: its theta separated by a method, or the minimal parameters that a tracker followed."""
+"""The blocks of a run: its theta separated by a method, or the minimal parameters of its tracker."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 BLOCK = 512
-"""Samples whose covariances are held at a time."""
+"""Number of samples whose covariances are in memory at a time."""
 WEAK = 1e-3
-"""1 / |(1, c)| below this: the first coefficient is next to nothing beside the others, and a bad gauge."""
+"""If 1 / |(1, c)| is below this, the first coefficient is close to zero relative to the others, and a bad gauge."""
 
 
 def blocks_of(
@@ -49,7 +49,7 @@ def _intercept(run: Track) -> Array | None:
 
 
 def _warn(found: Blocks, run: Track, input: str | None) -> None:
-    """Say where a separation cannot be relied on."""
+    """Warn of separations that are not reliable."""
     used, n = int(run.ok.sum()), run.model.n
     if used < n:
         warnings.warn(
@@ -85,7 +85,7 @@ def _warn(found: Blocks, run: Track, input: str | None) -> None:
 
 
 def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
-    """The blocks of a tracker that follows the minimal parameters themselves."""
+    """The blocks of a tracker of the minimal parameters."""
     structure = model.structure
     at = structure.na + sum(structure.nb)
     leads = at + structure.leads - np.arange(model.m)
@@ -113,7 +113,7 @@ def _by_least_squares(run: Track, model: HammersteinWiener) -> Blocks:
         part = slice(first, first + len(P))
         theta = np.ascontiguousarray(run.theta[part])
         refine(theta, P, orders, sizes, zeta[part], cov[part], cost[part])
-    cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # of d_1
+    cov = np.insert(np.insert(cov, at, 0.0, axis=1), at, 0.0, axis=2)  # the row and column of d_1
     x = np.insert(zeta, at, 1.0, axis=1)
     a, b, c, d, more = np.split(x, np.cumsum([a.shape[1], b.shape[1], c.shape[1], d.shape[1]]), axis=1)
     std, intercept = deviations(model, np.einsum("tii->ti", cov)), more[:, 0] if model.intercept else None

@@ -2,9 +2,9 @@
 
     [b_o, BC_o] = b_o c',  o = 1 .. ny        one c for each input:   [b_1, BC_1; b_2, BC_2; ..] = [b_1; b_2; ..] c'
 
-A valve has one characteristic, whatever is measured behind it. Each output follows products of its own, so that its
-regression stays what it is; their curves are the nearest matrix of rank one to the products of all outputs, each
-divided by the standard deviation of its innovation, which makes the answer one of no unit.
+A valve has one characteristic, whatever is measured behind it. Each output has its own products, so its regression is
+unchanged. The common curves are the nearest matrix of rank one to the products of all outputs, each divided by the
+standard deviation of its innovation, so that the result does not depend on units.
 
 Source: the nearest product as in Bai (1998), on stacked outputs. Cost per sample: O(ny nb n_in^2).
 """

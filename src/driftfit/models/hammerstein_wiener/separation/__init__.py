@@ -1,1 +1,1 @@
-"""Separation: the parameters of the blocks from the products that stage one follows."""
+"""Separation: the parameters of the blocks from the products of stage one."""

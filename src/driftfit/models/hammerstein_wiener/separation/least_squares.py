@@ -3,10 +3,10 @@
     zeta = argmin (theta - g(zeta))' P^-1 (theta - g(zeta)),     |c| = 1 for each input
     cov(zeta) = (J' P^-1 J)^-1 over the directions with c'dc = 0,       J = dg/dzeta
 
-with zeta = (a, b, c, d_2 .., l), by Levenberg-Marquardt steps from another separation. That all of c is free keeps the
-problem well posed where c_1 = 0. Its standard deviations are those of the delta method under the
-filter's own P, and only as good as q and r. P is scaled to a unit diagonal before its Cholesky factor is taken, with
-1e-13 added to the diagonal: a prior of 1e8 leaves computed eigenvalues below zero in every form that is no square root.
+with zeta = (a, b, c, d_2 .., l), by Levenberg-Marquardt steps from another separation. All of c is free, which keeps
+the problem well posed for c_1 = 0. The standard deviations are those of the delta method under the filter's own P, and
+only as good as q and r. P is scaled to a unit diagonal before its Cholesky factorisation, with 1e-13 added to the
+diagonal: after a prior of 1e8, computed eigenvalues are negative in every form that is not a square root.
 
 Source: the delta method; Levenberg (1944). Cost per sample: O(n^3).
 """
@@ -18,13 +18,13 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver, shared
 
 STEPS = 30
-"""Steps, at most; three to ten are the rule."""
+"""Largest number of steps; three to ten are typical."""
 JITTER = 1e-13
 
 
 @shared
 def factor(P: Array, scale: Array, L: Array) -> bool:
-    """L, the lower Cholesky factor of P scaled to a unit diagonal; False where P is no finite covariance."""
+    """L, the lower Cholesky factor of P scaled to a unit diagonal; False if P is not a finite covariance."""
     n = P.shape[0]
     for i in range(n):
         if not (P[i, i] > 0.0 and P[i, i] < np.inf):
@@ -116,7 +116,7 @@ def jacobian(zeta: Array, orders: tuple[int, int], sizes: Array, J: Array) -> No
 
 @shared
 def starts(na: int, sizes: Array) -> tuple[int, int]:
-    """Where b and c begin in zeta."""
+    """The positions of b and c in zeta."""
     at_c = na
     for i in range(sizes.shape[1]):
         at_c += sizes[0, i]
@@ -142,7 +142,7 @@ def rescale(zeta: Array, na: int, sizes: Array) -> None:
 
 @shared
 def hold_scales(zeta: Array, na: int, sizes: Array, N: Array) -> None:
-    """Add c c' to N for each input, as large as what stands there: it moves no product, and c'dc = 0 follows."""
+    """Add c c' to N for each input, scaled to its size: it changes no product, and c'dc = 0 follows."""
     _, at_c = starts(na, sizes)
     for i in range(sizes.shape[1]):
         last = at_c + sizes[1, i]
@@ -158,7 +158,7 @@ def hold_scales(zeta: Array, na: int, sizes: Array, N: Array) -> None:
 
 @shared
 def project(zeta: Array, na: int, sizes: Array, cov: Array, v: Array, h: Array) -> None:
-    """cov <- (I - v g') cov (I - v g')', g = (0, c) and v = (-b, c): what is left has c'dc = 0 for each input."""
+    """cov <- (I - v g') cov (I - v g')', g = (0, c) and v = (-b, c), after which c'dc = 0 for each input."""
     at_b, at_c = starts(na, sizes)
     for i in range(sizes.shape[1]):
         v[:] = 0.0
@@ -182,7 +182,7 @@ def project(zeta: Array, na: int, sizes: Array, cov: Array, v: Array, h: Array) 
 
 @shared
 def solve(N: Array, damping: float, right: Array, C: Array, step: Array) -> bool:
-    """step = (N + damping diag N)^-1 right by Cholesky, factor in C; False where N is not positive."""
+    """step = (N + damping diag N)^-1 right by Cholesky, factor in C; False if N is not positive definite."""
     n = N.shape[0]
     for j in range(n):
         for i in range(j, n):

@@ -4,13 +4,13 @@
 
 The scales of v (of each input) and of w are free. A gauge fixes them,
 
-    input "unit", "c1", "b1"       |c| = 1 and the curve rises; c_1 = 1; or b_1 = 1: the gain stands in the curve
+    input "unit", "c1", "b1"       |c| = 1 and the curve rises; c_1 = 1; or b_1 = 1: the gain is in the curve
     output "d1", "unit", "slope"   d_1 = 1; |d| = 1; or F'(at) = 1: w has the unit of y at the working point
 
-and `Blocks.gauge` goes from one to another and takes standard deviations along by the delta method. "unit" cannot
-degenerate; c_1 = 1, the gauge of Feng and Hong (2021), makes the other coefficients infinite where c_1 passes zero, as
-in a valve that is dead about 0. A curve counts as rising where it is higher at the upper end of its range than at 0, or
-the point of the range nearest to it. Ratios such as b_j / b_1, and the local gain b_1 / F', depend on no gauge.
+and `Blocks.gauge` converts between them, including standard deviations by the delta method. "unit" cannot degenerate;
+c_1 = 1, the gauge of Feng and Hong (2021), makes the other coefficients infinite where c_1 passes through zero, as in a
+valve with a dead zone around 0. A curve counts as rising if it is higher at the upper end of its range than at 0, or at
+the point of the range nearest to 0. Ratios such as b_j / b_1, and the local gain b_1 / F', do not depend on the gauge.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ class Blocks:
     Attributes
     ----------
     a, b, c, d : (T, na), (T, nb), (T, n_in), (T, n_out)
-        Coefficients after each sample; b and c of several inputs stand side by side, see `of_input`.
+        Coefficients after each sample; those of several inputs are concatenated in b and c, see `of_input`.
     names : Groups of tuples of str
     quality : (T, 2)
-        sigma_2 / sigma_1 of [b, BC] and of [a, AD]: 0 for an exact product, near 1 where there is none.
+        sigma_2 / sigma_1 of [b, BC] and of [a, AD]: 0 for an exact product, near 1 if there is none.
     std : Groups
         Standard deviations; NaN unless the method is "gls" or the tracker followed the minimal parameters.
     cov : (T, k, k) or None
-        Covariance of a, b, c, d and the intercept in this gauge, which leaves it singular.
+        Covariance of a, b, c, d and the intercept in this gauge, in which it is singular.
     intercept : (T,) or None
         d_0 (1 + sum a) - c_0 sum b, if the model has one.
     cost : (T,) or None
@@ -89,7 +89,7 @@ class Blocks:
 
     @property
     def xi(self) -> Array:
-        """The minimal parameters, (T, n_x), which have c_1 = d_1 = 1; ValueError where c_1 is 0."""
+        """The minimal parameters, (T, n_x), which have c_1 = d_1 = 1; ValueError if c_1 is 0."""
         found = self.gauge("c1", "d1")
         return self.model.structure.minimal(found.a, found.b, found.c, found.d, found.intercept)
 
@@ -119,7 +119,7 @@ class Blocks:
         return found
 
     def of_input(self, i: int = 0) -> tuple[Array, Array]:
-        """b (T, nb) and c (T, n_in) of input i, a number from 0 on."""
+        """b (T, nb) and c (T, n_in) of input i, an index from 0 on."""
         structure = self.model.structure
         return structure.of_inputs(self.b, structure.nb)[i], structure.of_inputs(self.c, structure.n_in)[i]
 
@@ -144,7 +144,7 @@ class Blocks:
         Parameters
         ----------
         input : "unit", "c1" or "b1"
-            What is 1: the size of c, with the sign of a curve that rises, c_1 or b_1.
+            What is set to 1: |c|, with the sign of a rising curve, c_1 or b_1.
         output : "d1", "unit" or "slope"
             d_1 = 1, |d| = 1 with d_1 > 0, or F'(at) = 1.
         at : number
@@ -153,7 +153,7 @@ class Blocks:
         Raises
         ------
         ValueError
-            If the coefficient that is to be 1 is 0 in some sample.
+            If the coefficient to be set to 1 is 0 at some sample.
         """
         one_of("gauge", "input", input, INPUTS)
         one_of("gauge", "output", output, OUTPUTS)
@@ -176,7 +176,7 @@ class Blocks:
         return self._apart(x * scale, cov, (input, output), spans)
 
     def _together(self) -> tuple[Array, _Spans]:
-        """a, b, c, d and the intercept side by side, (T, k), and where they stand."""
+        """a, b, c, d and the intercept concatenated, (T, k), and their positions."""
         rest = [] if self.intercept is None else [self.intercept[:, None]]
         return np.concatenate([self.a, self.b, self.c, self.d, *rest], axis=1), _spans(self.model)
 
@@ -193,7 +193,7 @@ class Blocks:
 
 
 class _Spans(NamedTuple):
-    """Where b and c of each input, d and the intercept stand among all coefficients."""
+    """The positions of b and c of each input, d and the intercept among all coefficients."""
 
     b: list[slice]
     c: list[slice]
@@ -210,7 +210,7 @@ def _spans(model: HammersteinWiener) -> _Spans:
 
 
 def _output_scale(found: Blocks, output: str, at: float, x: Array, spans: _Spans) -> tuple[Array, Array]:
-    """L (T,), by which d is divided, and d log L / dx (T, k)."""
+    """L (T,), the divisor of d, and d log L / dx (T, k)."""
     rate = np.zeros(x.shape)
     if output == "unit":
         level = np.copysign(np.linalg.norm(found.d, axis=1), found.d[:, 0])
@@ -268,19 +268,19 @@ def deviations(model: HammersteinWiener, var: Array) -> Groups:
 
 
 def empty(model: HammersteinWiener, T: int) -> tuple[Array, Array]:
-    """a, b, c, d side by side and quality, to be filled."""
+    """Empty arrays of (a, b, c, d), one after the other, and of quality."""
     na, nb, n_in, n_out, _ = model.structure
     return np.empty((T, na + sum(nb) + sum(n_in) + n_out)), np.empty((T, 2))
 
 
 def apart(model: HammersteinWiener, groups: Array) -> list[Array]:
-    """a, b, c, d from all of them side by side."""
+    """Split (a, b, c, d) into its four arrays."""
     na, nb, n_in, _, _ = model.structure
     return np.split(groups, np.cumsum([na, sum(nb), sum(n_in)]), axis=1)
 
 
 class Separator:
-    """Separates one theta after another, for streams: the arrays are made once."""
+    """Separates one theta after another, for streams; its arrays are allocated once."""
 
     def __init__(self, model: Model) -> None:
         if not isinstance(model, HammersteinWiener):

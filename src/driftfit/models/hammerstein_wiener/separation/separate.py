@@ -1,4 +1,4 @@
-"""Stage two: a, b, c, d from the products theta that stage one follows, for a whole path at once.
+"""Stage two: a, b, c, d from the products theta of stage one, for a whole path at once.
 
     [b, BC] (nb, n_in) = b c'        [a, AD] (na, n_out) = a (1, d_2 ..)'
 
@@ -7,14 +7,14 @@
     "svd-joint"  b, c as "svd"; a, d the nearest array of rank one to [[1, d], [a, AD]] whose corner is 1, by
                  alternating least squares: a = (a0 + AD d) / (1 + d'd), d = (d0 + AD' a) / (1 + a'a)
 
-The scale of c is that of a singular vector, |c| = 1, with the sign of curves that rise, r'c > 0 (`Basis.rise`): no
-coefficient needs to be different from zero. Where r = 0 it is c_1 = 1. The regression is written with d_1 = 1.
+The scale of c is that of a singular vector, |c| = 1, with the sign of rising curves, r'c > 0 (`Basis.rise`): no
+coefficient needs to be different from zero. If r = 0 it is c_1 = 1. The regression is written with d_1 = 1.
 
-Divisors below 1e-12 are put there. "average" is cheap and has large spikes whenever a b_j or c_k passes zero; the guard
-prevents the division, not the spike. All agree on exact products.
+Divisors below 1e-12 are replaced by 1e-12. "average" is cheap and has large spikes whenever a b_j or c_k passes through
+zero; the guard prevents the division by zero, not the spike. All methods agree on exact products.
 
-Singular vectors come from one-sided Jacobi rotations on the smaller side: relative accuracy without the squares of a
-Gram matrix, and no library call. Source: Feng and Hong (2021), eq. 21 to 27; Bai (1998); the rotations Hestenes (1958).
+Singular vectors come from one-sided Jacobi rotations on the smaller side: they have high relative accuracy without the
+squares of a Gram matrix, and need no library. Source: Feng and Hong (2021), eq. 21 to 27; Bai (1998); Hestenes (1958).
 Departures: (21) needs a definition of c; the paper swaps left and right vectors and gives no gauge. Cost per sample:
 O(nb n_in^2 + na n_out^2).
 """
@@ -28,13 +28,13 @@ from driftfit.engine.kernel import Array, Driver, shared
 METHODS = ("average", "svd", "svd-joint", "gls")
 LEAST = 1e-12
 ROUNDS = 200
-"""Rounds of the alternating least squares, at most."""
+"""Largest number of iterations of the alternating least squares."""
 SWEEPS = 30
 
 
 @shared
 def guard(x: float) -> float:
-    """x, or the nearest number that can be divided by."""
+    """x, or the nearest number by which one can divide."""
     if abs(x) >= LEAST:
         return x
     return LEAST if x >= 0.0 else -LEAST
@@ -42,7 +42,7 @@ def guard(x: float) -> float:
 
 @shared
 def orthogonal(W: Array) -> None:
-    """Rotate pairs of rows until all are orthogonal; their lengths then are the singular values."""
+    """Rotate pairs of rows until all are orthogonal; their lengths are then the singular values."""
     k, length = W.shape
     for _ in range(SWEEPS):
         turned = False

@@ -6,15 +6,15 @@
     correct   H = phi' J(xi);  e = z - phi' g(xi);  h = H P H';  s = (1 + inflation) h + r / w;  K = P H' / s
               xi <- xi + K e;  P <- (I - K H) P (I - K H)' + (s - h) K K' = P - s K K'
 
-with phi, z of the model and g, J of `driftfit.models.hammerstein_wiener.products`: theta of the run is xi = (a, b, c_2
+with phi, z of the model and g, J of `driftfit.models.hammerstein_wiener.products`. theta of the run is xi = (a, b, c_2
 .., d_2 ..), n_x numbers instead of n products, each with its own drift. inflation = 1 takes smaller steps while errors
 are large.
 
-Use it when a start near the truth is known, as from `hand_off`; from afar it can fail where stage one cannot. It is not
-iterated: the iterated filter lost 17 % of the runs of example 1 of Feng and Hong (2021).
+Use it if an initial value near the truth is known, as from `hand_off`; from a distant one it can fail where stage one
+cannot. It is not iterated: the iterated filter failed in 17 % of the runs of example 1 of Feng and Hong (2021).
 
-Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. One triangle of
-P is kept. Cost per sample: O(n_x^2 + n).
+Source: the implicit-measurement form of Jazwinski (1970), section 8.3; inflation and hand-off are ours. Only one
+triangle of P is kept. Cost per sample: O(n_x^2 + n).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from driftfit.trackers.parts.varying_drift import told
 
 
 def structure_of(owner: str, model: Model) -> Structure:
-    """The structure of a Hammerstein-Wiener model; ValueError for any other, and for one whose xi is ambiguous."""
+    """The structure of a Hammerstein-Wiener model; ValueError for any other model, and if xi is ambiguous."""
     if not isinstance(model, HammersteinWiener):
         raise ValueError(
             f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."

@@ -6,14 +6,14 @@
     measure     y_t = F^-1(w_t; d) + n_t,  n ~ N(0, r);   F' = max(F'(y_hat), 0.05)
                 row of the measurement: 1 / F' for w_t, -g_k(y_hat) / F' for d_k
 
-Measurement noise of y biases every method that has y among its regressors; here it stands in the measurement alone. A
-missing y only skips the measurement; a missing input is taken as v = 0 with its usual power as process noise. The
-price: the filter is local and needs a start in its basin, from
-`driftfit.models.hammerstein_wiener.results.hybrid_start`. The past w are taken from the first outputs. w is held
-within three times the range of F over the outputs seen, whatever the poles do.
+Measurement noise of y biases every method that has y among its regressors; here it appears in the measurement only. A
+missing y only skips the measurement; a missing input is treated as v = 0 with its usual power as process noise. In
+return, the filter converges only locally and needs an initial value in its basin of attraction, from
+`driftfit.models.hammerstein_wiener.results.hybrid_start`. The past w are taken from the first outputs. w is limited
+to three times the range of F over the observed outputs, whatever the poles are.
 
 innovation, its variance and the likelihood are those of y. Source: the output-error form of Ljung and Soderstrom (1983)
-with the blocks of Feng and Hong (2021); the guards are ours. Cost per sample: O((na + n_x)^2).
+with the blocks of Feng and Hong (2021); the limits are ours. Cost per sample: O((na + n_x)^2).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _steps(machine: Any) -> TrackerSteps:
 
 @lru_cache
 def _applying(place: Step, p: tuple[int, ...]) -> Step:
-    """The input also counts for the usual power of v."""
+    """The input also updates the usual power of v."""
     orders = np.array(p)
 
     def apply(s: State, l: int) -> None:
@@ -92,7 +92,7 @@ class OutputError(Tracker):
     r : number
         Variance of the measurement noise, in squared units of y.
     p0, theta0 : covariance and mean of xi before the first sample
-        A start in the basin of the truth; see `driftfit.models.hammerstein_wiener.results.hybrid_start.hand_off`.
+        An initial value in the basin of the truth; see `driftfit.models.hammerstein_wiener.results.hybrid_start`.
     q_w, p_w : number
         Process noise of w per sample, and variance of the w before the first sample.
 
@@ -129,7 +129,7 @@ class OutputError(Tracker):
         return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
 
     def state(self, n: int) -> Mapping[str, Any]:
-        """The part of the state that depends on the number n of minimal parameters alone."""
+        """The part of the state that depends only on the number n of minimal parameters."""
         return {
             "theta": vector("OutputError", "theta0", self.theta0, n),
             "P": matrix("OutputError", "p0", self.p0, n),
@@ -145,8 +145,7 @@ class OutputError(Tracker):
         structure = structure_of("OutputError", model)
         n_w = max(structure.na, 1)
         N = n_w + structure.n_x
-        own = np.ones(V_POWER + model.m)
-        own[:V_POWER] = 0.0
+        own = np.zeros(V_POWER + model.m)
         own[[R, Q_W, P_W]] = self.r, self.q_w, self.p_w
         S = np.zeros((N, N))
         S[n_w:, n_w:] = matrix("OutputError", "p0", self.p0, structure.n_x)

@@ -51,12 +51,14 @@ FLATTEST = 0.05
 """Least slope of F that the filter divides by."""
 REACH = 3.0
 """Times the largest w of the outputs seen: w is held within that."""
-FARTHEST = 1e6
-"""The same before any output was seen."""
 TINY = 1e-300
 """Least variance of what is missing: a sample without an input is marked, also where b is 0."""
-LARGEST_VARIANCE = 1e20
-"""Of w: an unstable estimate must not overflow in a long outage. The cross-covariances shrink along."""
+WIDEST = 1e3
+"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without end in an outage.
+The cross-covariances shrink along."""
+SHARE, LARGE = 0.01, 25.0
+"""What a sample counts in the usual power of v, and the multiple of it that its square counts as at most: a fault code
+may not make a scale of its own."""
 
 TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, V_POWER = range(11)
 """Numbers of the filter: nominal intervals times the drift, variances, whether w stands, what comes out; from V_POWER
@@ -103,8 +105,10 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
 
 
 @shared
-def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float) -> None:
-    """The time update of w and of S."""
+def advance(
+    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
+) -> None:  # fmt: skip
+    """The time update of w, which is held within reach whatever the poles do, and of S."""
     n_w, N = len(w), len(S)
     total, x_d = transition(p, theta, phi, w, row)
     for x in range(x_d + p[N_OUT] - 1, N):
@@ -117,11 +121,12 @@ def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array,
             S[i, j] = S[i - 1, j - 1]
         for x in range(n_w, N):
             S[x, i] = S[x, i - 1]
-    shrink = np.sqrt(LARGEST_VARIANCE / own) if own > LARGEST_VARIANCE else 1.0
+    most = WIDEST * WIDEST * reach * reach
+    shrink = np.sqrt(most / own) if own > most else 1.0
     for x in range(1, N):
         S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
-    S[0, 0] = min(own, LARGEST_VARIANCE)
-    w[0] = total
+    S[0, 0] = min(own, most)
+    w[0] = min(max(total, -reach), reach)
 
 
 @part
@@ -202,21 +207,22 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
         v = m[f, 0]
         for k in range(more_in):
             v += theta[c + k] * m[f + 1 + k, 0]
-        own[V_POWER + i] += 0.01 * (v * v - own[V_POWER + i]) if abs(v) < 1e6 else 0.0
+        if abs(v) < LARGEST:
+            power = own[V_POWER + i]
+            own[V_POWER + i] += SHARE * (min(v * v, LARGE * power) - power) if power > 0.0 else v * v
         c += more_in
 
 
 @shared
-def hold(m: Array, p: Places, w: Array) -> None:
-    """Keep the present w within reach of the outputs seen, whatever the poles do."""
+def reach_of(m: Array, p: Places) -> float:
+    """How large w may be, by the outputs seen."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
     if p[IDENTITY] == 0:
         rising, last = rises(m, p), GRID - 1
         low = level(m, p, p[CURVE], 0) if rising else m[p[LEVEL], 0]
         high = level(m, p, p[CURVE], last) if rising else m[p[LEVEL] + last, 0]
     reach = REACH * max(abs(low), abs(high))
-    reach = reach if reach > 0.0 and reach < np.inf else FARTHEST
-    w[0] = min(max(w[0], -reach), reach)
+    return reach if reach > 0.0 and reach < LARGEST else LARGEST
 
 
 @lru_cache
@@ -239,8 +245,7 @@ def _work(out: Kind) -> Any:
             own[BEGUN] = 1.0
         power = unknown_power(m, p, theta, own)
         known = power == 0.0
-        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power)
-        hold(m, p, w)
+        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power, reach_of(m, p))
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
         fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])

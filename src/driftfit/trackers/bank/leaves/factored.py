@@ -10,8 +10,8 @@ negative. So z'C z is a sum of squares, sum_j D_j (U'z)_j^2, and no rounding mak
             which leaves a = z'C z + noise, and the gain b / a
     condense  sum_k d_k w_k w_k' with d_k >= 0, by weighted Gram-Schmidt on the rows of W
 
-A leaf keeps D_j where a covariance has C_jj, and U_ij where it has C_ji = C_ij, i < j. Leaves are taken by eights;
-vectors of eight leaves lie in the rows of narrow matrices, eight numbers wide, from column 0.
+A leaf keeps D_j where a covariance has C_jj, and U_ij where it has C_ji = C_ij, i < j. Leaves are taken by SIMD
+vectors of eight, which lie in the rows of narrow matrices, eight numbers wide, from column 0.
 
 Source: Bierman (1977), chapters 5 and 6 (Agee and Turner 1972; Thornton 1976 for Gram-Schmidt); the order of operations
 in `add` after Fletcher and Powell (1974), which keeps digits where c p^2 is much larger than D_j. Cost: O(n^2) for the
@@ -34,7 +34,7 @@ ROUNDING = 4.0 * np.finfo(float).eps
 
 @kernel
 def add(C: Array, n: int, l: int, V: Array, c: Any) -> None:
-    """C + c v v' in the columns from l, v being the first n rows of V, which are used up; c is an eight."""
+    """C + c v v' in the columns from l, v being the first n rows of V, which are used up; c is a SIMD vector."""
     for j in range(n - 1, -1, -1):
         at = j * (j + 1) // 2
         p, was = load(V, j, 0), load(C, at + j, l)
@@ -53,7 +53,7 @@ def add(C: Array, n: int, l: int, V: Array, c: Any) -> None:
 
 @kernel
 def raised(C: Array, n: int, l: int, q: Array, share: Any, V: Array) -> None:
-    """C + share Q in the columns from l, q being the factor of Q; share is an eight, V has n narrow rows."""
+    """C + share Q in the columns from l, q being the factor of Q; share is a SIMD vector, V has n narrow rows."""
     for k in range(n):
         at = k * (k + 1) // 2
         if q[at + k] > 0.0:
@@ -65,7 +65,7 @@ def raised(C: Array, n: int, l: int, q: Array, share: Any, V: Array) -> None:
 
 @kernel
 def along(C: Array, n: int, l: int, Z: Array, zl: int, F: Array, fl: int) -> Any:
-    """f = U'z; returns z'C z, an eight."""
+    """f = U'z; returns z'C z, a SIMD vector."""
     h, at = fill(0.0), 0
     for j in range(n):
         f = load(Z, j, zl)
@@ -78,21 +78,21 @@ def along(C: Array, n: int, l: int, Z: Array, zl: int, F: Array, fl: int) -> Any
 
 
 @kernel
-def absorb(C: Array, l: int, n: int, F: Array, fl: int, a: Any, b: Array, B: Array, row: int, to: int) -> Any:
-    """A measurement: from C, column l, and f to the rows of B from ``row``, column ``to``; b takes the gain times a,
-    which is returned. a is an eight, b has n narrow rows; B may be C.
+def absorb(C: Array, l: int, n: int, b: Array, a: Any, B: Array, to: int) -> Any:
+    """A measurement: from C, column l, to B, column ``to``; the n narrow rows of b hold f = U'z and take the gain times
+    a, which is returned. a is a SIMD vector; B may be C.
     """
     at = 0
     for j in range(n):
-        f, d = load(F, j, fl), load(C, at + j, l)
+        f, d = load(b, j, 0), load(C, at + j, l)
         v, p = times(d, f), over(f, a)
         more = plus(a, times(f, v))
         for i in range(j):
             u, gain = load(C, at + i, l), load(b, i, 0)
-            store(B, row + at + i, to, minus(u, times(gain, p)))
+            store(B, at + i, to, minus(u, times(gain, p)))
             store(b, i, 0, plus(gain, times(u, v)))
         store(b, j, 0, v)
-        store(B, row + at + j, to, times(d, over(a, more)))
+        store(B, at + j, to, times(d, over(a, more)))
         a = more
         at += j + 1
     return a
@@ -101,7 +101,7 @@ def absorb(C: Array, l: int, n: int, F: Array, fl: int, a: Any, b: Array, B: Arr
 @shared
 def condense(W: Array, count: int, n: int, A: Array, to: int) -> None:
     """The factor of sum_k d_k w_k w_k' into column ``to`` of A: the w_k are columns of the first n rows of W, the d_k
-    its row n; row n + 1 is spare, and there is room up to the next eight.
+    its row n; row n + 1 is spare, and there is room up to the end of a SIMD vector.
     """
     for row in range(n + 1):
         for k in range(count, -(-count // WIDTH) * WIDTH):

@@ -1,16 +1,17 @@
 """Changes on factors: what may happen to eight leaves whose covariances are U D U'.
 
-A walk is an `add` for every column of its factor, exponential forgetting scales D, the directional one is an `add`, the
-stabilised one n of `absorb`, and a reset of some parameters adds up what is left of the columns. The formulas are those
-of `driftfit.trackers.bank.leaves.forget`, the operations those of `driftfit.trackers.bank.leaves.factored`. Every
-function works on the eight columns from ``l``; V are narrow rows that may be overwritten.
+A random walk is an `add` for every column of its factor, exponential forgetting scales D, directional forgetting is an
+`add`, stabilised forgetting n of `absorb`, and a reset of some parameters adds up what remains of the columns. The
+formulas are those of `driftfit.trackers.bank.leaves.forget`, the operations those of
+`driftfit.trackers.bank.leaves.factored`. Every function works on the eight columns from ``l``; V are narrow rows that
+may be overwritten.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.kernel import Array, kernel
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import fill, higher, load, lower, minus, over, plus, reaches, store, times
 from driftfit.trackers.bank.leaves.factored import absorb, add, along, raised
 from driftfit.trackers.bank.leaves.forget import (
@@ -87,17 +88,16 @@ def measure(C: Array, m: Array, n: int, l: int, w: Array, mean: Array, r: float,
     for i in range(n):
         store(V, 2 * n + i, 0, fill(w[i]))
         away = plus(away, times(fill(w[i]), minus(fill(mean[i]), load(m, i, l))))
-    along(C, n, l, V[2 * n :], 0, V[n:], 0)
-    gain = over(away, absorb(C, l, n, V[n:], 0, fill(r), V, C, 0, l))
+    along(C, n, l, V[2 * n :], 0, V, 0)
+    gain = over(away, absorb(C, l, n, V, fill(r), C, l))
     for i in range(n):
         store(m, i, l, plus(load(m, i, l), times(gain, load(V, i, 0))))
 
 
-@kernel
-def develop_eight(
-    A: Array, of: int, n: int, c: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, to: int, V: Array
-) -> None:  # fmt: skip
+@shared
+def develop_eight(t: Any, A: Array, of: int, c: int, C: Array, m: Array, to: int, V: Array) -> None:
     """Eight leaves of A with change c, to the columns from ``to``; V has n + max(tri, 2 n) narrow rows."""
+    n, maps, places = t.n, t.maps, t.places
     keep, kind = maps[c, KEEP], int(maps[c, KIND])
     for k in range(n * (n + 1) // 2):
         store(C, k, to, load(A, FIRST + n + k, of))
@@ -109,7 +109,7 @@ def develop_eight(
         guard(C, n, to, keep, places[CAP, 0])
     elif kind == PARTIAL and maps[c, GAIN] > 0.0:
         renew(C, m, n, to, places[ANCHORS + c * n], places[MEAN], V)
-    raised(C, n, to, Q[c], fill(1.0), V)
+    raised(C, n, to, t.Q[c], fill(1.0), V)
     if kind == DIRECTIONAL:
         toward(C, n, to, places[BEFORE], maps[c, GAIN], V)
     elif kind == STABILISED and maps[c, GAIN] > 0.0:
@@ -126,34 +126,33 @@ def chance_of(prior: Array, c: int, Hm: int, l: int) -> Any:
     return chance
 
 
-@kernel
-def blur(B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, V: Array) -> None:
+@shared
+def blur(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
     """`leaves.blur` of eight leaves."""
-    for k in range(n * (n + 1) // 2):
-        store(C, k, l, load(B, FIRST + n + k, l))
-    for c in range(len(Q)):
-        raised(C, n, l, Q[c], chance_of(prior, c, Hm, l), V)
+    for k in range(t.n * (t.n + 1) // 2):
+        store(t.C, k, l, load(t.leaves, FIRST + t.n + k, l))
+    for c in range(Hd):
+        raised(t.C, t.n, l, t.Q[c], chance_of(t.prior, c, Hm, l), V)
 
 
-@kernel
-def average(
-    B: Array, l: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, V: Array
-) -> None:  # fmt: skip
+@shared
+def average(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
     """`forget.average` of eight leaves. Changes are merged one after the other, with their chances p so far and now:
 
         C <- C + p_c C_c + p p_c / (p + p_c) d d',   m <- m + p_c / (p + p_c) d,   d = m_c - m
 
     which subtracts nothing.
     """
+    n, C, m = t.n, t.C, t.m
     tri = n * (n + 1) // 2
     one, mean, V, so_far = V[:tri], V[tri : tri + n], V[tri + n :], fill(0.0)
     for k in range(tri):
         store(C, k, l, fill(0.0))
     for i in range(n):
-        store(m, i, l, load(B, FIRST + i, l))
-    for c in range(len(Q)):
-        chance = chance_of(prior, c, Hm, l)
-        develop_eight(B, l, n, c, Q, maps, places, one, mean, 0, V)
+        store(m, i, l, load(t.leaves, FIRST + i, l))
+    for c in range(Hd):
+        chance = chance_of(t.prior, c, Hm, l)
+        develop_eight(t, t.leaves, l, c, one, mean, 0, V)
         for k in range(n):
             at = k * (k + 1) // 2
             for i in range(k):
@@ -170,11 +169,11 @@ def average(
         so_far = both
 
 
-@kernel
-def walked(n: int, Q: Array, prior: Array, Hm: int, Z: Array, zl: int, l: int) -> Any:
-    """sum_c p_c z'Q_c z of eight leaves."""
-    total = fill(0.0)
-    for c in range(len(Q)):
+@shared
+def add_walked(t: Any, l: int, Hd: int, Hm: int) -> None:
+    """h <- h + sum_c p_c z'Q_c z of eight leaves."""
+    n, Q, Z, zl, total = t.n, t.Q, t.z, l if t.output_lags > 0 else 0, fill(0.0)
+    for c in range(Hd):
         wide = fill(0.0)
         for k in range(n):
             at = k * (k + 1) // 2
@@ -183,5 +182,5 @@ def walked(n: int, Q: Array, prior: Array, Hm: int, Z: Array, zl: int, l: int) -
                 for i in range(k):
                     f = plus(f, times(fill(Q[c, at + i]), load(Z, i, zl)))
                 wide = plus(wide, times(fill(Q[c, at + k]), times(f, f)))
-        total = plus(total, times(chance_of(prior, c, Hm, l), wide))
-    return total
+        total = plus(total, times(chance_of(t.prior, c, Hm, l), wide))
+    store(t.expected, 0, l, plus(load(t.expected, 0, l), total))

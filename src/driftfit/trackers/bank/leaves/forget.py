@@ -1,24 +1,26 @@
-"""Changes that forget: what may happen to a leaf N(m, C) beside a random walk.
+"""Changes that forget: what may happen to a leaf N(m, C) other than a random walk.
 
-    exponential   C <- C / lam, which is a walk with Q = (1/lam - 1) C; its trace never grows above the cap
+    exponential   C <- C / lam, which is a random walk with Q = (1/lam - 1) C; its trace never grows above the cap
     directional   C <- C + (1/lam - 1) g g' / (z' g),   g = C z, z the regressor of the last sample that was used
     stabilised    C^-1 <- lam C^-1 + (1 - lam) A^-1,   C^-1 m <- lam C^-1 m + (1 - lam) A^-1 theta0
     reset         m <- theta0, C <- Q; of some parameters: these, independent of the others
 
-lam is the forgetting factor of this interval, ``forget`` to the power dt; directional forgetting belongs to samples and
-not to time. Stabilised forgetting is exponential forgetting and then a measurement of theta0 with noise A / (1 - lam):
-n measurements by the rows w_k of W, W'W = A^-1, each with noise 1 / (1 - lam). So C stays below A / (1 - lam), whatever
-the regressors do, and unexcited parameters return to theta0.
+lam is the forgetting factor of this interval, ``forget`` to the power dt; directional forgetting depends on samples and
+not on time. Stabilised forgetting is exponential forgetting followed by a measurement of theta0 with noise
+A / (1 - lam): n measurements by the rows w_k of W, W'W = A^-1, each with noise 1 / (1 - lam). C therefore stays below
+A / (1 - lam), whatever the regressors are, and unexcited parameters return to theta0.
 
 Source: Kulhavy and Zarrop (1993) for stabilised forgetting; Hagglund (1983), Kulhavy and Karny (1984) for directional.
-Cost: O(n^2) a leaf, O(n^3) where it is stabilised.
+Cost: O(n^2) per leaf, O(n^3) if it is stabilised.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from driftfit.engine.kernel import Array, exp, part, shared
+from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.leaves.leaves import FIRST, blur, spread
 
 KEEP, RESET, KIND, GAIN = range(4)
@@ -53,23 +55,9 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
 
 
 @shared
-def apply(C: Array, m: Array, a: int, b: int, c: int, maps: Array, places: Array, Q: Array, g: Array, h: Array) -> None:
-    """The rest of change c in the columns a .. b, which have taken in KEEP, RESET and Q."""
-    kind, n = int(maps[c, KIND]), len(m)
-    if kind == EXPONENTIAL:
-        guard(C, n, a, b, maps[c, KEEP], places[CAP, 0], Q[c], h)
-    elif kind == DIRECTIONAL:
-        toward(C, n, a, b, places[BEFORE], maps[c, GAIN], g, h)
-    elif kind == STABILISED and maps[c, GAIN] > 0.0:
-        for k in range(n):
-            measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], g, h)
-    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
-        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], Q[c])
-
-
-@shared
-def guard(C: Array, n: int, a: int, b: int, keep: float, cap: float, q: Array, h: Array) -> None:
+def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
     """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
+    n, keep, cap, q = t.n, t.maps[c, KEEP], t.places[CAP, 0], t.Q[c]
     for l in range(a, b):
         h[l] = 0.0
     for i in range(n):
@@ -100,8 +88,9 @@ def along(C: Array, n: int, a: int, b: int, z: Array, g: Array, h: Array) -> Non
 
 
 @shared
-def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, g: Array, h: Array) -> None:
+def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array) -> None:
     """Directional forgetting; nothing where z or C z is zero."""
+    g, h = work, work[n]
     along(C, n, a, b, z, g, h)
     for l in range(a, b):
         h[l] = gain / h[l] if h[l] > 0.0 else 0.0
@@ -114,9 +103,10 @@ def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, g: Array, h:
 
 
 @shared
-def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, g: Array, h: Array) -> None:
+def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, work: Array) -> None:
     """A measurement of w' theta with noise r that says w' mean."""
-    n = len(m)
+    n = len(w)
+    g, h = work, work[n]
     along(C, n, a, b, w, g, h)
     for l in range(a, b):
         h[l] = 1.0 / (h[l] + r)
@@ -140,7 +130,7 @@ def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float,
 def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
     """Some parameters begin anew."""
     at = 0
-    for i in range(len(m)):
+    for i in range(len(which)):
         if which[i] > 0.0:
             for l in range(a, b):
                 m[i, l] = mean[i]
@@ -152,15 +142,49 @@ def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Arra
 
 
 @shared
-def average(
-    B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, C: Array, m: Array, X: Array
-) -> None:  # fmt: skip
-    """Mean and covariance of every leaf if any change may happen and no data come: the first two moments.
+def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
+    """The rest of change c in the columns a .. b of C and m, which have taken in KEEP, RESET and Q.
 
-    Needs tri + 2 n + 2 rows of X.
+    ``work`` has n rows, for C z, and one more.
     """
+    maps, places, n = t.maps, t.places, t.n
+    kind = int(maps[c, KIND])
+    if kind == EXPONENTIAL:
+        guard(t, C, a, b, c, work[n])
+    elif kind == DIRECTIONAL:
+        toward(C, n, a, b, places[BEFORE], maps[c, GAIN], work)
+    elif kind == STABILISED and maps[c, GAIN] > 0.0:
+        for k in range(n):
+            measure(C, m, a, b, places[ANCHORS + c * n + k], places[MEAN], 1.0 / maps[c, GAIN], work)
+    elif kind == PARTIAL and maps[c, GAIN] > 0.0:
+        renew(C, m, a, b, places[ANCHORS + c * n], places[MEAN], t.Q[c])
+
+
+@shared
+def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
+    """The share of one change in the first two moments about the means of the leaves."""
+    B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
+    for i in range(n):
+        for l in range(L):
+            m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
+        for j in range(i + 1):
+            for l in range(L):
+                away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
+                C[at, l] += chance[l] * (one[at, l] + away)
+            at += 1
+
+
+@shared
+def average(t: Any, L: int, Hd: int, Hm: int) -> None:
+    """Mean m and covariance C of every leaf if any change may happen and no data come: the first two moments
+
+        m = sum_c p_c m_c,   C = sum_c p_c (C_c + (m_c - m) (m_c - m)'),
+
+    computed about the leaf's own mean. Needs tri + 2 n + 2 spare rows.
+    """
+    B, C, m, X, n, Q, maps, places = t.leaves, t.C, t.m, t.spare, t.n, t.Q, t.maps, t.places
     tri = n * (n + 1) // 2
-    chance, h, g = X[0], X[1], X[2 : 2 + n]
+    chance, work = X[0], X[1 : 2 + n]
     one, mean = X[2 + n : 2 + n + tri], X[2 + n + tri : 2 + 2 * n + tri]
     for k in range(tri):
         for l in range(L):
@@ -168,28 +192,20 @@ def average(
     for i in range(n):
         for l in range(L):
             m[i, l] = 0.0
-    for c in range(len(Q)):
+    for c in range(Hd):
         for l in range(L):
             chance[l] = 0.0
         for j in range(Hm):
             for l in range(L):
-                chance[l] += prior[c * Hm + j, l]
+                chance[l] += t.prior[c * Hm + j, l]
         for k in range(tri):
             for l in range(L):
                 one[k, l] = maps[c, KEEP] * B[FIRST + n + k, l] + Q[c, k]
         for i in range(n):
             for l in range(L):
                 mean[i, l] = places[MEAN, i] if maps[c, RESET] > 0.0 else B[FIRST + i, l]
-        apply(one, mean, 0, L, c, maps, places, Q, g, h)
-        at = 0
-        for i in range(n):
-            for l in range(L):
-                m[i, l] += chance[l] * (mean[i, l] - B[FIRST + i, l])
-            for j in range(i + 1):
-                for l in range(L):
-                    away = (mean[i, l] - B[FIRST + i, l]) * (mean[j, l] - B[FIRST + j, l])
-                    C[at, l] += chance[l] * (one[at, l] + away)
-                at += 1
+        apply(t, one, mean, 0, L, c, work)
+        add_moments(t, one, mean, chance, L)
     at = 0
     for i in range(n):
         for j in range(i + 1):
@@ -201,19 +217,16 @@ def average(
             m[i, l] += B[FIRST + i, l]
 
 
-@part
-def foresee(
-    B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
-    used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
-) -> None:  # fmt: skip
-    """The rows z'C z and z'm of ``expected`` for every leaf with all that may happen to it, and m; and C, which no
-    caller needs where the sample is ``used``.
+@shared
+def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
+    """The rows z'C z and z'm of `expected` for every leaf with all that may happen to it, and m; and C, which no caller
+    needs where the sample is ``used``. Only the first ``Hd`` changes may happen, under ``Hm`` sensors.
     """
-    if walks:
-        blur(B, L, n, prior, Hm, Q, C, m, X[0])
+    if t.walks_only > 0:
+        blur(t, L, Hd, Hm)
     else:
-        average(B, L, n, prior, Hm, Q, maps, places, C, m, X)
-    spread(C, Z, m, L, n, na, g, expected)
+        average(t, L, Hd, Hm)
+    spread(t.C, t.z, t.m, L, t.n, t.output_lags, t.g, t.expected)
 
 
 def anchors_of(covariance: Array) -> Array:

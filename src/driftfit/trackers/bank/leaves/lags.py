@@ -1,23 +1,25 @@
-"""Output lags that leaves keep of their own, and how uncertain they are.
+"""Output lags that leaves keep separately, and their uncertainty.
 
-A leaf that believes its sensor at fault puts its own prediction into its lags. Taken for certain, a wrong prediction is
-worse than a wrong output: while a sensor is frozen, predictions feed on themselves, and the first good sample is
-believed for its huge regressor. So leaves carry the covariance V of their lags too. With a the leaf's coefficients of
-the output lags,
+A leaf with the hypothesis of a sensor fault puts its own prediction into its lags. If a wrong prediction is treated as
+certain, it is worse than a wrong output: while a sensor is frozen, predictions are fed back, and the first good sample
+is trusted because of its huge regressor. Leaves therefore carry the covariance V of their lags too. With a the leaf's
+coefficients of the output lags,
 
     s = z' C z + a' V a + r,          V+ = [[s, (V a)'], [V a, V]]  without its last row and column
 
-after a prediction was put in, and a zero row for an output that was measured. It is a plug-in still: that a and the
-lags are wrong together is left out, and so is what later outputs tell of earlier ones. Merged leaves take the spread of
-their lags into V. A prediction that cannot be an output (`PLAUSIBLE`) is not put in: y is, or where there is none the
-largest that can be.
+after a prediction was stored, and a zero row for an output that was measured. This is a plug-in approximation: joint
+errors of a and the lags are neglected, and so is the information of later outputs about earlier ones. Merged leaves add
+the spread of their lags to V. A prediction that cannot be an output (`PLAUSIBLE`) is not stored: y is, or, if there is
+none, the largest possible output.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
+from driftfit.trackers.bank.layout import IN_Y, MOST, R
 from driftfit.trackers.bank.leaves.leaves import FIRST
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
@@ -39,9 +41,9 @@ def covariance_row(n: int, na: int) -> int:
 
 
 @shared
-def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array, most: float) -> None:
+def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
     """Output lags of leaves that took no sample in: y where it was seen, else what each expected, within bounds."""
-    limit = math.sqrt(most)
+    B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.sample[IN_Y], math.sqrt(most)
     at = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
         for l in range(L):
@@ -52,9 +54,10 @@ def push(B: Array, L: int, n: int, na: int, y: float, seen: bool, y_hat: Array, 
 
 
 @shared
-def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: Array) -> None:
-    """h <- h + a' V a for columns c K + l, whose lags are those of leaf l."""
-    at = covariance_row(n, na)
+def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
+    """h <- h + a' V a for columns c K + l, whose lags are those of leaf l of B."""
+    na, m, h = t.output_lags, t.m, t.expected[0]
+    at = covariance_row(t.n, na)
     if at >= len(B):
         return
     for i in range(na):
@@ -67,29 +70,27 @@ def widen_by_lags(B: Array, K: int, columns: int, n: int, na: int, m: Array, h: 
 
 
 @shared
-def shift_covariance(
-    A: Array, K: int, B: Array, block: slice, n: int, na: int, own: bool, m: Array, expected: Array, r: float,
-    most: float, X: Array,
-) -> None:  # fmt: skip
-    """V of the children: one lag later, and the variance of what was put in, zero where that was measured or given up.
-
-    ``expected`` has z'C z and z'm of every column. A may be B. Needs na rows of X.
+def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool) -> None:
+    """V of the leaves from column ``at`` on, whose parents are K columns of A: one lag later, and the variance of what
+    was put in, zero where that was measured or given up. A may be the leaves themselves.
     """
-    first = covariance_row(n, na)
+    B, na, m, expected, X = t.leaves, t.output_lags, t.m, t.expected, t.spare_lags
+    r, most, block = t.sample[R], t.sample[MOST], slice(at, at + columns)
+    first = covariance_row(t.n, na)
     if first >= len(B):
         return
-    for i in range(na - 1):
-        for l in range(block.stop - block.start):
+    for i in range(na - 1):  # V a, but for its last entry
+        for l in range(columns):
             X[i, l] = 0.0
         for j in range(na):
             entry = A[first + (i * (i + 1) // 2 + j if j <= i else j * (j + 1) // 2 + i)]
-            for start in range(0, block.stop - block.start, K):
+            for start in range(0, columns, K):
                 for l in range(K):
                     X[i, start + l] += entry[l] * m[j, start + l]
-    for i in range(na - 1, 0, -1):
+    for i in range(na - 1, 0, -1):  # V moves down by a row and a column
         for j in range(i, 0, -1):
             to, was = B[first + i * (i + 1) // 2 + j, block], A[first + (i - 1) * i // 2 + j - 1]
-            for start in range(0, len(to), K):
+            for start in range(0, columns, K):
                 for l in range(K):
                     to[start + l] = was[l]
     for i in range(na - 1, 0, -1):
@@ -102,8 +103,9 @@ def shift_covariance(
 
 
 @shared
-def merge_covariance(B: Array, members: Array, n: int, na: int, share: Array, A: Array, to: int) -> None:
-    """Column ``to`` of A: the average of V and the spread of the lags, whose mean stands there already."""
+def merge_covariance(t: Any, members: Array, share: Array, to: int) -> None:
+    """A parent, column ``to``: the average of V and the spread of the lags, whose mean stands there already."""
+    B, A, n, na = t.leaves, t.parents, t.n, t.output_lags
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
     if first >= len(B):
         return

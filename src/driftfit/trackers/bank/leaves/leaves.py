@@ -1,20 +1,22 @@
-"""Leaves: the columns of one matrix, and what all of them together say.
+"""Leaves of the hypothesis tree: the columns of one matrix, and their mixture.
 
-A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves lie side by side along the last axis,
-which is what the compiler vectorises over; the rows of a column are
+A leaf is one history of events with its Gaussian N(m, C) and its weight. Leaves are adjacent along the last axis, over
+which the compiler vectorises; the rows of a column are
 
     log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
 
-nu and S are those of the inverse gamma distribution of the noise variance where that is unknown, C then in its units.
-Codes are the newest events as the digits of a number; what they are for is the reduction's business. What a leaf
-remembers of its past floors, for the user and not for the recursion, are marginals of events in a table of their own,
-which the children of a leaf share: block k of it has the joint events k floors back, and the probability of no change
-since.
+nu and S are those of the inverse gamma distribution of the noise variance if that is unknown, and C is then in its
+units. Codes contain the newest events as the digits of a number, for use by the reduction. The past levels that a leaf
+remembers are needed by the user and not by the recursion; they are marginal probabilities of events in a separate
+table, which the children of a leaf share: its block k has the joint events k levels back, and the probability of no
+change since.
 
 Everything here is compiled once for all sizes.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +36,7 @@ from driftfit.engine.simd import (
     sum_of,
     times,
 )
+from driftfit.trackers.bank.layout import ALIKE, FLIPPED, R
 
 LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 """Rows of a leaf; the mean begins at FIRST."""
@@ -93,19 +96,21 @@ def normalise(B: Array, L: int) -> float:
 
 
 @shared
-def variance_factor(B: Array, L: int, unknown: bool, X: Array, row: int) -> None:
-    """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2)."""
+def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
+    """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2); spec, section 8."""
+    B, unknown = t.leaves, t.unknown > 0
     for l in range(0, L, WIDTH):
         ratio = over(load(B, S, l), minus(load(B, NU, l), fill(2.0))) if unknown else fill(1.0)
         store(X, row, l, only(ratio, load(B, WEIGHT, l)))
 
 
 @part(sizes=(2, 3, 4))
-def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
-    """Mean and covariance (lower triangle) of all leaves: sum w m, sum w (C + d d')."""
-    variance_factor(B, L, unknown, X, n)
+def mixture(n: int, t: Any, L: int) -> None:
+    """Mean and covariance (lower triangle) of all leaves, spec section 4: sum w m, sum w (C + d d'), d = m - mean."""
+    B, X, theta, P = t.leaves, t.scratch, t.theta, t.cov
+    variance_factor(t, X, n, L)
     parts, tri = n + 1, n * (n + 1) // 2
-    for i in range(n):
+    for i in range(n):  # the mean, and d in the first rows of the scratch
         sums = fill(0.0)
         for l in range(0, L, WIDTH):
             sums = plus(sums, times(load(B, WEIGHT, l), load(B, FIRST + i, l)))
@@ -117,7 +122,7 @@ def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: 
         for l in range(0, L, WIDTH):
             store(X, i, l, minus(load(B, FIRST + i, l), fill(theta[i])))
     at = 0
-    for i in range(n):
+    for i in range(n):  # the covariance, entry by entry of its lower triangle
         for j in range(i + 1):
             sums = fill(0.0)
             for l in range(0, L, WIDTH):
@@ -135,12 +140,14 @@ def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: 
 
 
 @shared
-def priors(
-    T: Array, event: Array, expanded: bool, first: bool, same: bool, L: int, P: Array, row: Array, prior: Array
-) -> None:
-    """prior[e, l] = p(next event is e | leaf): the same row for all, or the row of P for the leaf's last event."""
-    H = len(row)
-    if first or same:
+def priors(t: Any, L: int, expanded: bool) -> None:
+    """prior[e, l] = p(next event is e | leaf): one row for all, or the row of the chain for the leaf's last event.
+
+    Where histories are ``expanded``, the last event of a leaf is known by its probabilities.
+    """
+    prior, row, P, event, H = t.prior, t.row, t.chain, t.event, len(t.row)
+    history = t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    if t.counters[ALIKE] > 0:
         for e in range(H):
             for l in range(L):
                 prior[e, l] = row[e]
@@ -152,7 +159,7 @@ def priors(
             for last in range(H):
                 if P[last, e] > 0.0:
                     for l in range(L):
-                        prior[e, l] += P[last, e] * T[l, last]
+                        prior[e, l] += P[last, e] * history[l, last]
         else:
             for l in range(L):
                 prior[e, l] = P[event[l], e]
@@ -186,62 +193,64 @@ def standstill(prior: Array, L: int, Hm: int) -> None:
             prior[j, l] = share
 
 
-@part
-def increments(
-    Q: Array, sizes: Array, c: Array, r: float, unknown: bool, time: float, each: float, factors: Array, out: Array
-) -> None:  # fmt: skip
-    """out[i] = lower triangle of the covariance that change i adds in this interval; ``sizes`` may have no columns.
+@shared
+def increments(t: Any, time: float, each: float) -> None:
+    """Q[i] = lower triangle of the covariance that change i adds in this interval.
 
-    The first change takes ``time``, the others ``each``.
+    The first change takes ``time``, the others ``each``. Relative walks are in units of r / (mean square of phi_k).
     """
-    for i in range(len(Q)):
-        span = (time if i == 0 else each) * factors[i]
-        for k in range(0, Q.shape[1], WIDTH):
-            store(out, i, k, times(load(Q, i, k), fill(span)))
-        for k in range(sizes.shape[1]):
-            if sizes[i, k] > 0.0 and c[k] > 0.0:
-                out[i, k * (k + 1) // 2 + k] += sizes[i, k] * ((1.0 if unknown else r) / c[k]) * span
+    walks, relative, powers, Q = t.walks, t.relative_walks, t.powers, t.Q
+    unit = 1.0 if t.unknown > 0 else t.sample[R]
+    for i in range(len(walks)):
+        span = (time if i == 0 else each) * t.drift[i]
+        for k in range(0, walks.shape[1], WIDTH):
+            store(Q, i, k, times(load(walks, i, k), fill(span)))
+        for k in range(relative.shape[1]):
+            if relative[i, k] > 0.0 and powers[k] > 0.0:
+                Q[i, k * (k + 1) // 2 + k] += relative[i, k] * (unit / powers[k]) * span
 
 
-@part
-def ready(Q: Array, n: int) -> None:
+@shared
+def ready(t: Any) -> None:
     """Covariances of changes as leaves take them in: as they are."""
 
 
 @part
-def regressors(phi: Array, B: Array, L: int, copies: int, n: int, na: int, Z: Array) -> None:
+def regressors(n: int, t: Any, B: Array, L: int, copies: int, phi: Array) -> None:
     """The regressor of every leaf, with its own output lags where it keeps some; else phi, for the first eight."""
+    z, na = t.z, t.output_lags
     lags = FIRST + n + n * (n + 1) // 2
     for i in range(na):
         for at in range(0, copies * L, L):
             for l in range(L):
-                Z[i, at + l] = B[lags + i, l]
+                z[i, at + l] = B[lags + i, l]
     for i in range(na, n):
         for l in range(0, copies * L if na > 0 else 1, WIDTH):
-            store(Z, i, l, fill(phi[i]))
+            store(z, i, l, fill(phi[i]))
 
 
 @part
-def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
+def spread(C: Array, z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
     """g = C z, and the rows h = z' C z and y = z' m of ``expected``, for every leaf; C is a lower triangle."""
     for l in range(0, L, WIDTH):
         h, y, k = fill(0.0), fill(0.0), l if na > 0 else 0
         for i in range(n):
-            z, sums, row = load(Z, i, k), fill(0.0), i * (i + 1) // 2
+            zi, sums, row = load(z, i, k), fill(0.0), i * (i + 1) // 2
             for j in range(i + 1):
-                sums = plus(sums, times(load(C, row + j, l), load(Z, j, k)))
+                sums = plus(sums, times(load(C, row + j, l), load(z, j, k)))
             for j in range(i + 1, n):
-                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(Z, j, k)))
+                sums = plus(sums, times(load(C, j * (j + 1) // 2 + i, l), load(z, j, k)))
             store(g, i, l, sums)
-            h = plus(h, times(z, sums))
-            y = plus(y, times(z, load(m, i, l)))
+            h = plus(h, times(zi, sums))
+            y = plus(y, times(zi, load(m, i, l)))
         store(expected, 0, l, h)
         store(expected, 1, l, y)
 
 
 @shared
-def blur(B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, m: Array, chance: Array) -> None:
+def blur(t: Any, L: int, Hd: int, Hm: int) -> None:
     """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
+    B, C, m, Q, prior, chance, n = t.leaves, t.C, t.m, t.Q, t.prior, t.spare[0], t.n
     at = FIRST + n
     for i in range(n):
         for l in range(L):
@@ -249,7 +258,7 @@ def blur(B: Array, L: int, n: int, prior: Array, Hm: int, Q: Array, C: Array, m:
     for k in range(n * (n + 1) // 2):
         for l in range(L):
             C[k, l] = B[at + k, l]
-    for c in range(len(Q)):
+    for c in range(Hd):
         for l in range(L):
             chance[l] = 0.0
         for j in range(Hm):

@@ -12,8 +12,8 @@ leaf, where it is unknown) and last the last output seen. The leaf is updated as
 so that C stays a covariance whatever the function says; a = inf learns nothing of theta (it counts as `LARGEST` times
 h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
 
-The function is compiled by itself, and the machine of a bank calls it by its address (`driftfit.engine.callback`):
-a second or two, and none of the machine's minute.
+The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
+(`driftfit.engine.callback`); the routine is not compiled anew.
 """
 
 from __future__ import annotations
@@ -25,64 +25,58 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.callback import address_of, call
-from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
+from driftfit.engine.kernel import State, floats, kernel, machine, shared
+from driftfit.trackers.bank.layout import LAST
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
 
-LARGEST = 1e12
-"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing."""
+LARGEST, LEAST = 1e12, 1e-12
+"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing, and those below this
+share of the nominal one as that.
+"""
 LOG_P, NOISE, CLEAN = range(3)
 """What a function says."""
 
 
 @shared
-def judge(
-    address: int, which: float, B: Array, at: int, l: int, expected: Array, y: float, r: float, unknown: bool,
-    last: float, said: Array,
-) -> None:  # fmt: skip
-    """What the function at an address says of column l, its noise variance in the units of C."""
-    unit = B[S, at + l] / (B[NU, at + l] - 2.0) if unknown else 1.0
+def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
+    """What function ``which`` says of the leaf in column at + l, its noise variance in the units of C; r is that of the
+    nominal sensor.
+    """
+    B, expected, said = t.leaves, t.expected, t.said[0]
+    unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    call(address, which, y, expected[1, l], h * unit, r * unit, last, said.ctypes.data)
+    call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
     most = LARGEST * (h + r)
-    said[NOISE] = max(said[NOISE] / unit, 0.0) if said[NOISE] < most * unit else most
+    said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
     said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf
     said[CLEAN] = said[CLEAN] if abs(said[CLEAN]) < np.inf else y
 
 
 @shared
-def judge_all(
-    address: int, which: float, B: Array, at: int, columns: int, expected: Array, y: float, r: float, unknown: bool,
-    last: float, X: Array, row: int, said: Array,
-) -> None:  # fmt: skip
-    """h + a in the place of h, which is kept in a row of X."""
+def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+    """h + a in the place of h, which is kept in the first row of `scores`."""
     for l in range(columns):
-        judge(address, which, B, at, l, expected, y, r, unknown, last, said)
-        X[row, l] = expected[0, l]
-        expected[0, l] += said[NOISE]
+        judge(t, which, at, l, y, r)
+        t.scores[0, l] = t.expected[0, l]
+        t.expected[0, l] += t.said[0, NOISE]
 
 
 @shared
-def weigh_all(
-    address: int, which: float, B: Array, at: int, columns: int, expected: Array, y: float, r: float, unknown: bool,
-    last: float, X: Array, row: int, said: Array,
-) -> None:  # fmt: skip
+def weigh_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
     """The log densities in the place of what `judge_all` kept, which is given back."""
     for l in range(columns):
-        expected[0, l] = X[row, l]
-        judge(address, which, B, at, l, expected, y, r, unknown, last, said)
-        X[row, l] = said[LOG_P]
+        t.expected[0, l] = t.scores[0, l]
+        judge(t, which, at, l, y, r)
+        t.scores[0, l] = t.said[0, LOG_P]
 
 
 @shared
-def clean_all(
-    address: int, which: float, B: Array, at: int, columns: int, n: int, expected: Array, y: float, r: float,
-    unknown: bool, last: float, said: Array,
-) -> None:  # fmt: skip
+def clean_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
     """The newest output lag as the function has it."""
-    lag = FIRST + n + n * (n + 1) // 2
+    lag = FIRST + t.n + t.n * (t.n + 1) // 2
     for l in range(columns):
-        judge(address, which, B, at, l, expected, y, r, unknown, last, said)
-        B[lag, at + l] = said[CLEAN]
+        judge(t, which, at, l, y, r)
+        t.leaves[lag, at + l] = t.said[0, CLEAN]
 
 
 @kernel

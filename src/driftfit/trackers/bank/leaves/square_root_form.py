@@ -1,7 +1,7 @@
-"""The machine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
+"""The compiled routine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the machine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
-that everything else, as growing, weighing, planning and remembering, is one source for both. The operations are in
+It is the routine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
+that everything else, as growing, weighing, choosing and remembering, is one source for both. The operations are in
 `driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
 are factorised once a sample.
 
@@ -11,37 +11,41 @@ distances from the mean. Until the tree begins, the one filter keeps a covarianc
 
 from __future__ import annotations
 
-from driftfit.engine.kernel import Array, part, shared
+from typing import Any
+
+from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
 from driftfit.trackers.bank.leaves import forget, leaves
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
-from driftfit.trackers.bank.leaves.factored_changes import average, blur, develop_eight, walked
+from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
-from driftfit.trackers.bank.machine import grow, lookahead, merge, refilter, start
+from driftfit.trackers.bank.machine import grow, start
 from driftfit.trackers.bank.machine.gaps import chain_gap
+from driftfit.trackers.bank.reducing import lookahead, merge, refilter
 
 covariance_begin = start.begin
 
 
-@part
-def ready(Q: Array, n: int) -> None:
+@shared
+def ready(t: Any) -> None:
     """`leaves.ready`: factorised."""
-    for i in range(len(Q)):
-        factorise(Q[i], n, 0.0)
+    for i in range(len(t.walks)):
+        factorise(t.Q[i], t.n, 0.0)
 
 
 @shared
-def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
+def begin(t: Any, nu: float, squares: float) -> None:
     """`start.begin`, factorised."""
-    covariance_begin(B, T, theta, P, nu, squares, many, H)
-    n = len(theta)
-    factorise(B[FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 1.0)
+    covariance_begin(t, nu, squares)
+    n = t.n
+    factorise(t.leaves[FIRST + n : FIRST + n + n * (n + 1) // 2, 0], n, 1.0)
 
 
-@part
-def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: Array) -> None:
+@shared
+def mixture(n: int, t: Any, L: int) -> None:
     """`leaves.mixture`, multiplied out."""
-    variance_factor(B, L, unknown, X, n)
+    B, X, theta = t.leaves, t.scratch, t.theta
+    variance_factor(t, X, n, L)
     for i in range(n):
         sums = fill(0.0)
         for l in range(0, L, WIDTH):
@@ -62,7 +66,7 @@ def mixture(n: int, B: Array, L: int, unknown: bool, X: Array, theta: Array, P: 
                     inner = plus(inner, times(load(C, at + k, l), times(load(C, at + i, l), load(C, at + j, l))))
                 entry = plus(times(inner, load(X, n, l)), times(load(X, i, l), load(X, j, l)))
                 sums = plus(sums, times(load(B, WEIGHT, l), entry))
-            P[i, j] = sum_of(sums)
+            t.cov[i, j] = sum_of(sums)
 
 
 @shared
@@ -76,83 +80,56 @@ def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
         store(expected, 1, l, y)
 
 
-@part
-def correct(
-    n: int, B: Array, at: int, columns: int, C: Array, m: Array, g: Array, expected: Array, y: float, noise: float,
-    X: Array, row: int,
-) -> None:  # fmt: skip
+@shared
+def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
     """`grow.correct`; what the uncertainty of lags adds to z'C z counts as noise."""
-    b = X[row + 2 :].reshape(((X.shape[0] - row - 2) * X.shape[1] // WIDTH, WIDTH))
+    B, C, m, g, expected, scores, b = t.leaves, t.C, t.m, t.g, t.expected, t.scores, t.narrow
     for l in range(0, columns, WIDTH):
         h = fill(0.0)
         for i in range(n):
             f = load(g, i, l)
+            store(b, i, 0, f)
             h = plus(h, times(f, times(load(C, i * (i + 3) // 2, l), f)))
         lags, eps = minus(load(expected, 0, l), h), minus(fill(y), load(expected, 1, l))
-        a = absorb(C, l, n, g, l, plus(fill(noise), higher(lags, fill(0.0))), b, B, FIRST + n, at + l)
+        a = absorb(C, l, n, b, plus(fill(noise), higher(lags, fill(0.0))), B[FIRST + n :], at + l)
         gain = over(eps, a)
-        store(X, row, l, times(eps, gain))
-        store(X, row + 1, l, a)
+        store(scores, 1, l, times(eps, gain))
+        store(scores, 2, l, a)
         for i in range(n):
             store(B, FIRST + i, at + l, plus(load(m, i, l), times(gain, load(b, i, 0))))
 
 
-@part
-def ahead(
-    n: int, A: Array, K: int, phi: Array, na: int, Q: Array, maps: Array, places: Array, own: bool, Hm: int, C: Array,
-    m: Array, Z: Array, g: Array, expected: Array,
-) -> int:  # fmt: skip
-    """`grow.ahead`. An eight may reach into the columns of the next change, which are written after it."""
-    V = g.reshape((g.shape[0] * g.shape[1] // WIDTH, WIDTH))
-    columns = K if own else K * len(Q)
-    for c in range(len(Q)):
+@shared
+def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
+    """`grow.ahead`. A SIMD vector may reach into the columns of the next change, which are written after it."""
+    A, V, Hd, Hm = t.parents, t.narrow, len(t.walks), len(t.sensors)
+    columns = K if own else K * Hd
+    for c in range(Hd):
         of, to, count = (c * Hm, c * Hm, Hm) if own else (0, c * K, K)
         for l in range(0, count, WIDTH):
-            develop_eight(A, of + l, n, c, Q, maps, places, C, m, to + l, V)
-    regressors(phi, A, K, columns // K, n, na, Z)
-    spread(C, Z, m, columns, n, na, g, expected)
+            develop_eight(t, A, of + l, c, t.C, t.m, to + l, V)
+    regressors(n, t, A, K, columns // K, phi)
+    spread(t.C, t.z, t.m, columns, n, t.output_lags, t.g, t.expected)
     return int(columns)
 
 
 @shared
-def foresee(
-    B: Array, L: int, n: int, na: int, prior: Array, Hm: int, Q: Array, maps: Array, places: Array, walks: bool,
-    used: bool, C: Array, m: Array, Z: Array, g: Array, expected: Array, X: Array,
-) -> None:  # fmt: skip
+def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
     """`forget.foresee`. Where all changes walk the variance of the forecast needs no factor of what may happen."""
-    V = X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
-    if not walks:
+    B, m, n, V = t.leaves, t.m, t.n, t.narrow
+    if t.walks_only == 0:
         for l in range(0, L, WIDTH):
-            average(B, l, n, prior, Hm, Q, maps, places, C, m, V)
-        spread(C, Z, m, L, n, na, g, expected)
+            average(t, l, Hd, Hm, V)
+        spread(t.C, t.z, m, L, n, t.output_lags, t.g, t.expected)
         return
     for l in range(0, L, WIDTH):
         for i in range(n):
             store(m, i, l, load(B, FIRST + i, l))
-    spread(B[FIRST + n :], Z, m, L, n, na, g, expected)
+    spread(B[FIRST + n :], t.z, m, L, n, t.output_lags, t.g, t.expected)
     for l in range(0, L, WIDTH):
-        store(expected, 0, l, plus(load(expected, 0, l), walked(n, Q, prior, Hm, Z, l if na > 0 else 0, l)))
+        add_walked(t, l, Hd, Hm)
         if not used:
-            blur(B, l, n, prior, Hm, Q, C, V)
-
-
-@shared
-def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
-    """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
-    room = X.shape[0] * X.shape[1] // ((n + 2) * WIDTH) * WIDTH
-    W, count = X.reshape(X.shape[0] * X.shape[1])[: (n + 2) * room].reshape((n + 2, room)), 0
-    for k in range(len(members)):
-        l = members[k]
-        if count + n + 1 > room:
-            condense(W, count, n, A, to)
-            spill(A, to, n, 1.0, W, 0)
-            count = n
-        spill(B, l, n, share[k], W, count)
-        for i in range(n):
-            W[i, count + n] = B[FIRST + i, l] - A[FIRST + i, to]
-        W[n, count + n] = share[k] * (B[NU, l] / B[S, l] if unknown else 1.0)
-        count += n + 1
-    condense(W, count, n, A, to)
+            blur(t, l, Hd, Hm, V)
 
 
 @shared
@@ -170,17 +147,37 @@ def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
 
 
 @shared
-def widen(root: Array, n: int, weight: Array, Q: Array, X: Array) -> None:
-    """`refilter.widen`."""
-    V = X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
-    for e in range(len(Q)):
-        raised(root[FIRST + n :], n, 0, Q[e], fill(weight[e]), V)
+def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
+    """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
+    A, B, n = t.parents, t.leaves, t.n
+    room = X.shape[0] * X.shape[1] // ((n + 2) * WIDTH) * WIDTH
+    W, count = X.reshape(X.shape[0] * X.shape[1])[: (n + 2) * room].reshape((n + 2, room)), 0
+    for k in range(len(members)):
+        l = members[k]
+        if count + n + 1 > room:
+            condense(W, count, n, A, to)
+            spill(A, to, n, 1.0, W, 0)
+            count = n
+        spill(B, l, n, share[k], W, count)
+        for i in range(n):
+            W[i, count + n] = B[FIRST + i, l] - A[FIRST + i, to]
+        W[n, count + n] = share[k] * (B[NU, l] / B[S, l] if t.unknown > 0 else 1.0)
+        count += n + 1
+    condense(W, count, n, A, to)
 
 
 @shared
-def widen_leaf(A: Array, n: int, k: int, q: Array, X: Array) -> None:
+def widen(t: Any, weight: Array, X: Array) -> None:
+    """`refilter.widen`."""
+    for e in range(len(t.walks)):
+        raised(t.root[FIRST + t.n :], t.n, 0, t.Q[e], fill(weight[e]), t.narrow)
+
+
+@shared
+def widen_leaf(t: Any, k: int, q: Array) -> None:
     """`chain_gap.widen_leaf`; q is factorised."""
-    tri, W = n * (n + 1) // 2, X.reshape((X.shape[0] * X.shape[1] // WIDTH, WIDTH))
+    A, W, n = t.parents, t.narrow, t.n
+    tri = n * (n + 1) // 2
     factorise(q, n, 0.0)
     for i in range(tri):
         store(W, i, 0, fill(A[FIRST + n + i, k]))

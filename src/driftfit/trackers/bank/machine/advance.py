@@ -1,21 +1,61 @@
-"""One sample of a bank: forecast, reduce, grow, weigh, plan, report.
+"""One sample of a bank: forecast, reduce, grow, weigh, decide which leaves go on, report.
 
 What a sample that is not used does is what time does: every leaf takes in the ordinary course, no weight moves, and no
-leaf is dropped; what else may have happened waits, with the reduction that was planned, for the next sample that can be
+leaf is dropped; what else may have happened waits, with the reduction that was chosen, for the next sample that can be
 used (`driftfit.trackers.bank.machine.gaps.gap`).
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from driftfit.engine.kernel import Array, floats, machine, part, shared, wholes
+from driftfit.engine.kernel import Array, machine, shared
+from driftfit.trackers.bank.layout import (
+    AGAIN,
+    ALIKE,
+    BESIDE,
+    CHAINED,
+    CLOCK,
+    ELAPSED,
+    EVIDENCE,
+    EXPANDED,
+    FAULTS,
+    FLIPPED,
+    FLOORS,
+    GROUPS,
+    HELD,
+    IMPOSSIBLE,
+    IN_DT,
+    IN_NOISE,
+    IN_OK,
+    IN_SEEN,
+    IN_TIME,
+    IN_Y,
+    KEPT,
+    LAST,
+    LEAVES,
+    LIMIT,
+    MOST,
+    OPEN,
+    PARENTS,
+    PARTED,
+    REFUSED,
+    S2,
+    SETTLED,
+    STORED,
+    TAKEN,
+    WIDE,
+    WINDOW,
+    Y_HAT,
+    first,
+    table_at,
+)
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaves import (
     FIRST,
-    WEIGHT,
     increments,
     later,
     mixture,
@@ -30,63 +70,10 @@ from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summ
 from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.layout import (
-    AGAIN,
-    AT,
-    BESIDE,
-    CLOCK,
-    COUNT,
-    COV,
-    ELAPSED,
-    EVIDENCE,
-    EXPANDED,
-    FADE,
-    FAULTS,
-    FLAGS,
-    FLIPPED,
-    FLOORS,
-    GROUPS,
-    HEAD,
-    HELD,
-    IMPOSSIBLE,
-    IN_DT,
-    IN_NOISE,
-    IN_OK,
-    IN_SEEN,
-    IN_TIME,
-    IN_Y,
-    KEPT,
-    LAST,
-    LEAST,
-    LEAVES,
-    LIMIT,
-    MANY,
-    MOST,
-    NOW,
-    OPEN,
-    OWNERS,
-    PARENTS,
-    PHI,
-    PLAIN,
-    POWERS,
-    REFUSED,
-    REPORT,
-    ROWS,
-    S2,
-    SETTLED,
-    SIZE,
-    STORED,
-    TAKEN,
-    THETA,
-    WINDOW,
-    Y_HAT,
-    R,
-    packed,
-    whole,
-)  # fmt: skip
-from driftfit.trackers.bank.machine.merge import combine, mix, sort, take
-from driftfit.trackers.bank.machine.refilter import NOISE, TIME, Y, histories, refilter
-from driftfit.trackers.bank.machine.selection import (
+from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
+from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
+from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
+from driftfit.trackers.bank.reducing.selection import (
     BEAM,
     CUT,
     DEPTH,
@@ -94,7 +81,6 @@ from driftfit.trackers.bank.machine.selection import (
     INTERACT,
     KIND,
     MERGE,
-    PRIOR,
     REFILTER,
     WAIT,
     beam,
@@ -103,325 +89,24 @@ from driftfit.trackers.bank.machine.selection import (
     merge,
     number,
 )
-from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
 
 FAULTS_IN_A_ROW = 3
 """As many samples in a row may be taken for fault codes."""
 
 
-@part
-def reduce(
-    A: Array, B: Array, T: Array, T2: Array, many: Array, now: Array, prior: Array, row: Array, knobs: Array,
-    bases: Array, links: Array, group: Array, n: int, na: int, Hm: int, unknown: bool, Q: Array, sizes: Array, c: Array,
-    factors: Array, maps: Array, theta0: Array, sensors: Array, root: Array, samples: Array, Qt: Array, news: Array,
-    X: Array,
-) -> int:  # fmt: skip
-    """Carry out what was planned: the parents of the next floor, in A."""
-    H, L, kind = len(row), many[LEAVES], int(knobs[KIND])
-    expanded = many[EXPANDED] > 0
-    parent, event, start, order = links[0], links[1], links[2], links[3]
-    now[KEPT] = 1.0
-    full = kind == REFILTER and many[STORED] >= int(knobs[DEPTH])
-    alone = kind in (CUT, BEAM)  # the plan has put them in order
-    if kind == REFILTER and not full:
-        for l in range(L):
-            order[l] = l
-        many[GROUPS], alone = L, True
-    elif kind in (MERGE, HYBRID):
-        alone = sort(group, L, many[GROUPS], start, order) == many[GROUPS]
-    if not alone and not expanded:
-        write_out(T, L, H, Hm, parent, event, news, T2)
-        flip(many)
-        T, T2 = T2, T
-    if full:
-        many[STORED] -= 1
-        L = refilter(
-            root, samples, int(knobs[DEPTH]), B, L, A, knobs[PRIOR] > 0.0, Q, sizes, c, now[R], unknown, now[FADE],
-            now[LEAST], factors, maps, theta0, sensors, row, bases, parent, event, prior, na, kind == INTERACT, Qt, X,
-        )  # fmt: skip
-        histories(A, L, int(knobs[DEPTH]), H, Hm, T)
-        return int(L)
-    flip(many)
-    if kind == INTERACT:
-        return int(mix(B, L, prior, n, na, unknown, A, order, X, T, T2))
-    G = many[GROUPS]
-    if alone:
-        pick(T, expanded, H, Hm, parent, event, order, G, news, T2)
-        kept = take(B, order, G, len(A), unknown, bases, A)
-    else:
-        kept = combine(B, group, L, G, n, na, unknown, A, start, order, X, T, T2)
-    now[KEPT] = min(kept, 1.0)
-    return int(G)
-
-
-@part
-def flip(many: Array) -> None:
-    """The two tables of the past change places."""
-    many[FLIPPED] = 1 - many[FLIPPED]
-
-
-@part
-def plan(
-    B: Array, many: Array, now: Array, knobs: Array, bases: Array, links: Array, group: Array, slots: Array,
-    loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array, sensors: Array, phi: Array,
-    unknown: bool, na: int, stamps: Array, decided: Array, parts: Array, samples: Array, X: Array,
-) -> None:  # fmt: skip
-    """Which leaves go on."""
-    L, kind = many[LEAVES], int(knobs[KIND])
-    if kind == CUT:
-        if knobs[WAIT] > 0.0:  # the regressor to come is like the last one that no event held has been seen with
-            phi = samples[max(many[STORED] - 1 - many[HELD], 0) % len(samples), TIME + 1 :]
-        many[HELD] = decide(
-            B, L, many[HELD], knobs, loss, P, row, same, Q, maps, theta0, sensors, phi, now[LAST], now[R], unknown, na,
-            links[1], stamps, float(many[CLOCK]), decided, parts, group, X,
-        )  # fmt: skip
-        many[GROUPS] = number(group, L, links[3])
-    elif kind == MERGE:
-        many[GROUPS] = merge(B, L, group, slots)
-    elif kind == BEAM:
-        many[GROUPS] = beam(B, L, knobs, group, links[3], X)
-    elif kind == HYBRID:
-        many[GROUPS] = hybrid(B, L, knobs, bases, group, slots, links[3], X)
-
-
-@part
-def advance(
-    A: Array, B: Array, T: Array, T2: Array, X: Array, links: Array, group: Array, slots: Array, many: Array,
-    now: Array, prior: Array, phi: Array, Q: Array, sizes: Array, c: Array, factors: Array, maps: Array, theta0: Array,
-    sensors: Array, P: Array, initial: Array, given: Array, loss: Array, knobs: Array, bases: Array, stamps: Array,
-    decided: Array, parts: Array, root: Array, samples: Array, Qt: Array, news: Array, gap: Array, moving: Array,
-    path: Array, lag_prob: Array, theta: Array, cov: Array, judges: int, na: int, unknown: bool, same: bool,
-    plain: bool, walks: bool, apart: bool,
-) -> None:  # fmt: skip
-    """One sample. P[0] is the prior row where events are independent (``same``); ``given`` replaces it where finite, or
-    the chain of the changes.
-    The first row of ``theta0`` is the mean before all samples; its others, and ``maps``, are those of `forget`. Where
-    changes are independent events (``apart``) a gap is one floor, of which ``gap`` tells; ``path`` is that of a chain.
-    """
-    n, H, Hm, L = len(phi), len(initial), len(sensors), many[LEAVES]
-    tri = n * (n + 1) // 2
-    kind, parent, event = int(knobs[KIND]), links[0], links[1]
-    first_table, second_table = T, T2
-    T, T2 = (T2, T) if many[FLIPPED] > 0 else (T, T2)
-    noise, dt, used = now[IN_NOISE], now[IN_DT], now[IN_OK] > 0.0
-    told, first = given[0] == given[0], many[FLOORS] == 0
-    if given[H] == given[H]:
-        chained(given[H:], P, Hm, moving)
-        P, same = moving, False
-    wide = apart and (many[OPEN] > 0 or dt != 1.0 or not used)
-    expanded = many[EXPANDED] > 0
-    parted = len(path) > 0 and not first and (many[OPEN] + many[TAKEN] > 0 or not expanded)
-    parted = parted and (many[OPEN] > 0 or not used or further(dt) > 0)
-    plain = plain and many[OPEN] == 0 and not parted  # the mixture's covariance then has more in it than the leaves'
-    row = given[:H] if told else initial if first else P[0]
-    alike = same or told or first
-    now[EVIDENCE] = 0.0
-    for k in range(len(decided)):
-        decided[k, 0] = -1.0
-    each = now[IN_TIME] / dt if apart and dt > 0.0 else now[IN_TIME]
-    increments(Q, sizes, c, now[R], unknown, now[IN_TIME], each, factors, Qt)
-    settings, maps = maps[: len(Q)], maps[len(Q) :]
-    with_mean, Qt = Qt, Qt[: len(Q)]
-    if parted:
-        go_on(path, many, P, row, alike, Hm, dt, used, Qt, X)
-    if wide:
-        odds(gap, row, Hm, dt, told)
-        covariances(gap, dt, used, Qt)
-    ready(Qt, n)
-    if not walks:
-        for_interval(settings, now[IN_DT], maps)
-
-    # forecast: every leaf with all that may happen to it
-    C, m, Z, g = X[:tri], X[tri : tri + n], X[tri + n : tri + 2 * n], X[tri + 2 * n : tri + 3 * n]
-    expected, factor = X[tri + 3 * n : tri + 3 * n + 2], tri + 3 * n + 2
-    h, y_hat = expected[0], expected[1]
-    scratch = X[tri + 3 * n + 3 :]
-    asked = 1 if plain and alike and kind != INTERACT and used else L  # one stands for all
-    outlook(T, event, expanded, first, alike, asked, P, row, prior, dt, Hm, apart, wide, True, gap, scratch)
-    variance_factor(B, L, unknown, X, factor)
-    if plain:
-        now[Y_HAT], now[S2] = expect_together(
-            B, L, X, factor, prior, alike, phi, theta, cov, with_mean, sensors, now[R] * noise
-        )
-    if not plain or not used:
-        regressors(phi, B, L, min(L, 1), n, na, Z)
-        foresee(B, L, n, na, prior, Hm, Qt, maps, theta0, walks, used, C, m, Z, g, expected, scratch)
-        widen_by_lags(B, L, L, n, na, m, h)
-        if parted:
-            add_variance(h, L, n, na, Z, path, H, H // Hm, event)
-    if not plain:
-        now[Y_HAT], now[S2] = expect(
-            B[WEIGHT], L, y_hat, h, X[factor], prior, sensors, now[R], noise, now[LAST], scratch
-        )
-
-    if used and refused(now, many):
-        return
-
-    if used:
-        K = reduce(
-            A, B, T, T2, many, now, prior, row, knobs, bases, links, group, n, na, Hm, unknown, Q, sizes, c, factors,
-            maps, theta0, sensors, root, samples, Qt, news, X,
-        )  # fmt: skip
-        if kind == REFILTER:
-            increments(Q, sizes, c, now[R], unknown, now[IN_TIME], each, factors, Qt)
-            ready(Qt, n)
-        if kind == REFILTER or knobs[WAIT] > 0.0:
-            store(samples[many[STORED] % len(samples)], now, phi)
-            many[STORED] += 1
-        T, T2 = (second_table, first_table) if many[FLIPPED] > 0 else (first_table, second_table)
-        many[EXPANDED] = 0
-        own = kind == INTERACT
-        if own:
-            for e in range(H):
-                for l in range(K):
-                    prior[e, l] = 1.0 if e == l else 0.0
-        elif parted:
-            origins(B, L, group, K, event, prior)
-            K = split(A, K, T, many[OPEN], n, Hm, path, P, row, alike, dt == 0.0, prior, X)
-        elif not alike or kind == REFILTER:
-            outlook(T, event, True, first, alike, K, P, row, prior, dt, Hm, apart, wide, True, gap, X)
-        if many[OPEN] > 0 and apart:
-            take_back(T, K, many[OPEN], gap, H, Hm)
-        L = grow(
-            A, K, B, phi, now[IN_Y], now[LAST], noise, now[R], unknown, now[FADE], now[LEAST], now[MOST], na, Qt, maps,
-            theta0, sensors, prior, own, alike, bases, parent, event, judges, X,
-        )  # fmt: skip
-        gone = normalise(B, L)
-        many[PARENTS], many[LEAVES] = K, L
-        if gone == gone:
-            now[EVIDENCE] = gone - math.log(now[KEPT])
-            for i in range(n):
-                theta0[BEFORE, i] = phi[i]
-            if many[HELD] < len(stamps):
-                stamps[many[HELD]] = float(many[CLOCK])
-            many[HELD] += 1
-            if many[OPEN] > 0:
-                many[OPEN] = 0
-                close(gap)
-            many[TAKEN] = 0
-        else:  # no leaf allows what was seen: go on as if it had not been
-            many[IMPOSSIBLE] += 1
-            many[OPEN], many[TAKEN] = many[OPEN] if apart else 0, 0
-            L = recover(A, K, B, len(A))
-            many[LEAVES], many[EXPANDED] = L, 1
-            shift_covariance(B, L, B, slice(0, L), n, na, False, m, expected, now[R], now[MOST], X[len(X) - na :])
-            push(B, L, n, na, now[IN_Y], True, y_hat, now[MOST])
-            outlook(T, event, True, first, alike, L, P, row, prior, dt, Hm, apart, wide, False, gap, X)
-            shift(T, L, prior, Hm)
-        many[FLOORS] += 1
-        if wide and knobs[WAIT] > 0.0:  # the interval to come is a nominal one
-            increments(Q, sizes, c, now[R], unknown, 1.0, 1.0, factors, Qt)
-            ready(Qt, n)
-        plan(
-            B, many, now, knobs, bases, links, group, slots, loss, P, P[0], same, Qt, maps, theta0[0], sensors, phi,
-            unknown, na, stamps, decided, parts, samples, X,
-        )  # fmt: skip
-    else:
-        seen = now[IN_SEEN] > 0.0
-        shift_covariance(B, L, B, slice(0, L), n, na, not seen, m, expected, now[R], now[MOST], X[len(X) - na :])
-        push(B, L, n, na, now[IN_Y], seen, y_hat, now[MOST])
-        if dt != 0.0:
-            if not expanded:
-                write_out(T, L, H, Hm, parent, event, news, T2)
-                flip(many)
-                T, T2 = T2, T
-                many[EXPANDED] = 1
-            if apart:
-                outlook(T, event, True, first, alike, L, P, row, prior, dt, Hm, apart, wide, False, gap, scratch)
-            shift(T, L, prior, Hm)
-            if parted:
-                many[OPEN] += 1
-                many[TAKEN] = 0
-            if apart:  # leaves take in the ordinary course only
-                certain(prior, L)
-                foresee(
-                    B, L, n, na, prior, 1, Qt[:1], maps, theta0, walks, False, C, m, Z, g, expected, scratch
-                )  # fmt: skip
-                extend(gap)
-                many[OPEN] += 1
-            for k in range(n):
-                theta0[BEFORE, k] = 0.0
-                for l in range(L):
-                    B[FIRST + k, l] = m[k, l]
-            for k in range(0 if parted else tri):
-                for l in range(L):
-                    B[FIRST + n + k, l] = C[k, l]
-            many[FLOORS] += 1
-    many[CLOCK] += 1
-    mixture(n, B, L, unknown, X, theta, cov)
-    if many[OPEN] > 0 and parted:
-        add_covariance(cov, B, L, unknown, path, H, H // Hm, event, X)
-    elif many[OPEN] > 0:
-        variance_factor(B, L, unknown, X, 0)
-        widen(gap, weighted(B, L, X, 0), cov)
-    now[WINDOW] = marginals(B, L, T, many[EXPANDED] > 0, H, Hm, event, scratch, many[PARENTS], lag_prob)
-    if now[IN_SEEN] > 0.0:
-        now[LAST] = now[IN_Y]
-
-
-@part
-def outlook(
-    T: Array, event: Array, expanded: bool, first: bool, alike: bool, L: int, P: Array, row: Array, prior: Array,
-    dt: float, Hm: int, apart: bool, wide: bool, whole: bool, gap: Array, X: Array,
-) -> None:  # fmt: skip
-    """Probabilities of the events of this interval, or of the ``whole`` gap, for every leaf."""
-    priors(T, event, expanded, first, alike, L, P, row, prior)
-    if dt == 0.0:
-        standstill(prior, L, Hm)
-    elif dt > 1.0 and not apart and not alike:
-        later(prior, L, P, further(dt), X)
-    if wide:
-        chances(prior, L, Hm, gap, whole)
-
-
-@part
-def refused(now: Array, many: Array) -> bool:
-    """Whether a sample is so far from what was expected that it is taken for a fault code: it counts as missing.
-
-    What keeps coming is no fault code.
-    """
-    far = now[IN_Y] - now[Y_HAT]
-    if many[REFUSED] < FAULTS_IN_A_ROW and far * far > now[LIMIT] * now[LIMIT] * now[S2]:
-        now[IN_OK], now[IN_SEEN] = 0.0, 0.0
-        many[REFUSED] += 1
-        many[FAULTS] += 1
-        many[AGAIN] = 1
-        return True
-    many[REFUSED] = 0
-    return False
+@shared
+def copy(P: Array, to: Array) -> None:
+    """All entries of a matrix."""
+    for i in range(P.shape[0]):
+        for j in range(P.shape[1]):
+            to[i, j] = P[i, j]
 
 
 @shared
-def certain(prior: Array, L: int) -> None:
-    """The first event, for sure."""
-    for l in range(L):
-        prior[0, l] = 1.0
-
-
-@part
-def store(sample: Array, now: Array, phi: Array) -> None:
-    sample[Y], sample[NOISE], sample[TIME] = now[IN_Y], now[IN_NOISE], now[IN_TIME]
-    for i in range(len(phi)):
-        sample[TIME + 1 + i] = phi[i]
-
-
-@shared
-def recover(A: Array, K: int, B: Array, rows: int) -> int:
-    """The parents again, as if the sample had not come."""
-    for row in range(rows):
-        for l in range(K):
-            B[row, l] = A[row, l]
-    normalise(B, K)
-    return K
-
-
-@part
-def lone_density(now: Array) -> float:
-    """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none."""
-    far, s = now[IN_Y] - now[Y_HAT], now[S2]
-    if not (now[IN_OK] > 0.0 and 0.0 < s < math.inf):
-        return 0.0
-    return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
+def increments_now(t: Any) -> None:
+    """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
+    time, dt = t.sample[IN_TIME], t.sample[IN_DT]
+    increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
 
 
 @shared
@@ -439,50 +124,338 @@ def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
                     moving[i * Hm + j, k * Hm + to] = given[i * Hd + k] * share
 
 
-@part
-def note(ring: Array, clock: int, window: float, now: Array, lag_prob: Array) -> None:
+@shared
+def prepare(t: Any) -> None:
+    """What may happen in this interval: the prior of the events, and what changes add to a covariance."""
+    counters, dt, used, Hm = t.counters, t.sample[IN_DT], t.sample[IN_OK] > 0.0, len(t.sensors)
+    given = t.given[0] == t.given[0]
+    if t.given_chain[0] == t.given_chain[0]:
+        chained(t.given_chain, t.transition, Hm, t.chain)
+        counters[CHAINED] = 1
+    elif counters[CHAINED] > 0:
+        copy(t.transition, t.chain)
+        counters[CHAINED] = 0
+    source = t.given if given else t.initial if first(t) else t.chain[0]
+    for e in range(len(source)):
+        t.row[e] = source[e]
+    alike = given or first(t) or (t.independent > 0 and counters[CHAINED] == 0)
+    wide = t.apart > 0 and (counters[OPEN] > 0 or dt != 1.0 or not used)
+    parted = len(t.path) > 0 and not first(t) and (counters[OPEN] + counters[TAKEN] > 0 or counters[EXPANDED] == 0)
+    parted = parted and (counters[OPEN] > 0 or not used or further(dt) > 0)
+    counters[ALIKE], counters[WIDE], counters[PARTED] = 1 if alike else 0, 1 if wide else 0, 1 if parted else 0
+    increments_now(t)
+    if parted:
+        go_on(t, dt, used)
+    if wide:
+        odds(t.gap, t.row, Hm, dt, given)
+        covariances(t.gap, dt, used, t.Q)
+    ready(t)
+    if t.walks_only == 0:
+        for_interval(t.maps_nominal, dt, t.maps)
+
+
+@shared
+def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
+    """Probabilities of the events of this interval, or of the ``whole`` gap, for every leaf."""
+    dt, Hm, wide = t.sample[IN_DT], len(t.sensors), t.counters[WIDE] > 0
+    priors(t, L, expanded)
+    if dt == 0.0:
+        standstill(t.prior, L, Hm)
+    elif dt > 1.0 and t.apart == 0 and t.counters[ALIKE] == 0:
+        later(t.prior, L, t.chain, further(dt), t.spare)
+    if wide:
+        chances(t.prior, L, Hm, t.gap, whole)
+
+
+@shared
+def forecast(t: Any, L: int) -> None:
+    """Mean and variance of the output before it comes: every leaf with all that may happen to it.
+
+    Where leaves have one regressor and all changes walk, the mixture of the last sample says all of that.
+    """
+    counters, sample = t.counters, t.sample
+    used, interacts = sample[IN_OK] > 0.0, int(t.reduction[KIND]) == INTERACT
+    parted = counters[PARTED] > 0
+    plain = t.plain > 0 and counters[OPEN] == 0 and not parted  # in a gap the mixture has more in it than its leaves
+    one_for_all = plain and counters[ALIKE] > 0 and used and not interacts
+    outlook(t, 1 if one_for_all else L, counters[EXPANDED] > 0, True)
+    variance_factor(t, t.scores, 0, L)
+    if plain:
+        sample[Y_HAT], sample[S2] = expect_together(t, L)
+    if not plain or not used:
+        regressors(t.n, t, t.leaves, L, min(L, 1), t.phi)
+        foresee(t, L, len(t.walks), len(t.sensors), used)
+        widen_by_lags(t, t.leaves, L, L)
+        if parted:
+            add_variance(t, L)
+    if not plain:
+        sample[Y_HAT], sample[S2] = expect(t, L)
+
+
+@shared
+def accept(t: Any, gone: float) -> None:
+    """Some leaf allows the sample, whose log density under all of them is ``gone``."""
+    counters = t.counters
+    t.sample[EVIDENCE] = gone - math.log(t.sample[KEPT])
+    for i in range(t.n):
+        t.places[BEFORE, i] = t.phi[i]
+    if counters[HELD] < len(t.stamps):
+        t.stamps[counters[HELD]] = float(counters[CLOCK])
+    counters[HELD] += 1
+    if counters[OPEN] > 0:
+        counters[OPEN] = 0
+        close(t.gap)
+    counters[TAKEN] = 0
+
+
+@shared
+def recover(A: Array, K: int, B: Array, rows: int) -> int:
+    """The parents again, as if the sample had not come."""
+    for row in range(rows):
+        for l in range(K):
+            B[row, l] = A[row, l]
+    normalise(B, K)
+    return K
+
+
+@shared
+def reject(t: Any, K: int) -> None:
+    """No leaf allows what was seen: go on as if it had not been."""
+    counters = t.counters
+    counters[IMPOSSIBLE] += 1
+    counters[OPEN], counters[TAKEN] = counters[OPEN] if t.apart > 0 else 0, 0
+    L = recover(t.parents, K, t.leaves, len(t.parents))
+    counters[LEAVES], counters[EXPANDED] = L, 1
+    shift_covariance(t, t.leaves, L, 0, L, False)
+    push(t, L, True, t.expected[1], t.sample[MOST])
+    outlook(t, L, True, False)
+    shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
+
+
+@shared
+def choose(t: Any, L: int) -> None:
+    """Which leaves go on, spec section 5; `reduce` does it before the next sample that is used."""
+    counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
+    if kind == CUT:
+        phi = t.phi
+        if t.reduction[WAIT] > 0.0:  # the regressor to come is like the last one that no event held has been seen with
+            phi = samples[max(counters[STORED] - 1 - counters[HELD], 0) % len(samples), TIME + 1 :]
+        decide(t, L, phi)
+        counters[GROUPS] = number(t.group, L, t.order)
+    elif kind == MERGE:
+        counters[GROUPS] = merge(t, L)
+    elif kind == BEAM:
+        counters[GROUPS] = beam(t, L)
+    elif kind == HYBRID:
+        counters[GROUPS] = hybrid(t, L)
+
+
+@shared
+def reduce(t: Any) -> int:
+    """Carry out what `choose` said: the parents of the next floor, whose number is returned."""
+    counters, L, kind, order = t.counters, t.counters[LEAVES], int(t.reduction[KIND]), t.order
+    t.sample[KEPT] = 1.0
+    full = kind == REFILTER and counters[STORED] >= int(t.reduction[DEPTH])
+    alone = kind in (CUT, BEAM)  # every group is one leaf, and they are in order
+    if kind == REFILTER and not full:
+        for l in range(L):
+            order[l] = l
+        counters[GROUPS], alone = L, True
+    elif kind in (MERGE, HYBRID):
+        alone = sort(t.group, L, counters[GROUPS], t.start, order) == counters[GROUPS]
+    if not alone and counters[EXPANDED] == 0:
+        write_out(t, L)
+    if full:
+        counters[STORED] -= 1
+        L = refilter(t, L)
+        histories(t, L)
+        return int(L)
+    if kind == INTERACT:
+        return int(mix(t, L))
+    G = counters[GROUPS]
+    if alone:
+        pick(t, G)
+        kept = take(t, G)
+    else:
+        kept = combine(t, L, G)
+    t.sample[KEPT] = min(kept, 1.0)
+    return int(G)
+
+
+@shared
+def keep_sample(t: Any) -> None:
+    """Store the sample for growing the tree again, or for looking ahead."""
+    kept = t.samples[t.counters[STORED] % len(t.samples)]
+    kept[Y], kept[NOISE], kept[TIME] = t.sample[IN_Y], t.sample[IN_NOISE], t.sample[IN_TIME]
+    for i in range(t.n):
+        kept[TIME + 1 + i] = t.phi[i]
+    t.counters[STORED] += 1
+
+
+@shared
+def take_in(t: Any) -> None:
+    """A sample that is used: reduce, grow, weigh, and decide which leaves go on."""
+    counters, sample, prior, kind = t.counters, t.sample, t.prior, int(t.reduction[KIND])
+    waits, own, again = t.reduction[WAIT] > 0.0, kind == INTERACT, kind == REFILTER
+    K = reduce(t)
+    if again:
+        increments_now(t)
+        ready(t)
+    if again or waits:
+        keep_sample(t)
+    counters[EXPANDED] = 0
+    if own:
+        for e in range(len(prior)):
+            for l in range(K):
+                prior[e, l] = 1.0 if e == l else 0.0
+    elif counters[PARTED] > 0:
+        origins(t, counters[LEAVES], K)
+        K = split(t, K)
+    elif counters[ALIKE] == 0 or again:
+        outlook(t, K, True, True)
+    if counters[OPEN] > 0 and t.apart > 0:
+        take_back(
+            t.history_2 if counters[FLIPPED] > 0 else t.history,
+            K,
+            counters[OPEN],
+            t.gap,
+            len(t.initial),
+            len(t.sensors),
+        )
+    L = grow(t, K, own, t.phi, sample[IN_Y], sample[LAST], sample[IN_NOISE])
+    gone = normalise(t.leaves, L)
+    counters[PARENTS], counters[LEAVES] = K, L
+    if gone == gone:
+        accept(t, gone)
+    else:
+        reject(t, K)
+    counters[FLOORS] += 1
+    if counters[WIDE] > 0 and waits:  # the interval to come is a nominal one
+        increments(t, 1.0, 1.0)
+        ready(t)
+    choose(t, counters[LEAVES])
+
+
+@shared
+def certain(prior: Array, L: int) -> None:
+    """The first event, for sure."""
+    for l in range(L):
+        prior[0, l] = 1.0
+
+
+@shared
+def let_pass(t: Any, L: int) -> None:
+    """A sample that is not used: what time does to the leaves."""
+    counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
+    shift_covariance(t, B, L, 0, L, not seen)
+    push(t, L, seen, t.expected[1], t.sample[MOST])
+    if dt == 0.0:
+        return
+    if counters[EXPANDED] == 0:
+        write_out(t, L)
+    if apart:
+        outlook(t, L, True, False)
+    shift(t.history_2 if counters[FLIPPED] > 0 else t.history, L, t.prior, len(t.sensors))
+    if counters[PARTED] > 0:
+        counters[OPEN] += 1
+        counters[TAKEN] = 0
+    if apart:  # leaves take in the ordinary course only
+        certain(t.prior, L)
+        foresee(t, L, 1, 1, False)
+        extend(t.gap)
+        counters[OPEN] += 1
+    for k in range(n):
+        t.places[BEFORE, k] = 0.0
+        for l in range(L):
+            B[FIRST + k, l] = t.m[k, l]
+    for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
+        for l in range(L):
+            B[FIRST + n + k, l] = t.C[k, l]
+    counters[FLOORS] += 1
+
+
+@shared
+def refused(sample: Array, counters: Array) -> bool:
+    """Whether a sample is so far from what was expected that it is taken for a fault code: it counts as missing.
+
+    What keeps coming is no fault code.
+    """
+    far = sample[IN_Y] - sample[Y_HAT]
+    if counters[REFUSED] < FAULTS_IN_A_ROW and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
+        sample[IN_OK], sample[IN_SEEN] = 0.0, 0.0
+        counters[REFUSED] += 1
+        counters[FAULTS] += 1
+        counters[AGAIN] = 1
+        return True
+    counters[REFUSED] = 0
+    return False
+
+
+@shared
+def advance(t: Any) -> None:
+    """One sample of a tree that has begun."""
+    counters, sample = t.counters, t.sample
+    sample[EVIDENCE] = 0.0
+    for k in range(len(t.decided)):
+        t.decided[k, 0] = -1.0
+    prepare(t)
+    forecast(t, counters[LEAVES])
+    if sample[IN_OK] > 0.0:
+        if refused(sample, counters):
+            return
+        take_in(t)
+    else:
+        let_pass(t, counters[LEAVES])
+    counters[CLOCK] += 1
+    L = counters[LEAVES]
+    mixture(t.n, t, L)
+    if counters[OPEN] > 0 and counters[PARTED] > 0:
+        add_covariance(t, L)
+    elif counters[OPEN] > 0:
+        variance_factor(t, t.scratch, 0, L)
+        widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
+    sample[WINDOW] = marginals(t, L)
+    if sample[IN_SEEN] > 0.0:
+        sample[LAST] = sample[IN_Y]
+
+
+@shared
+def lone_density(sample: Array) -> float:
+    """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none."""
+    far, s = sample[IN_Y] - sample[Y_HAT], sample[S2]
+    if not (sample[IN_OK] > 0.0 and 0.0 < s < math.inf):
+        return 0.0
+    return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
+
+
+@shared
+def note(t: Any, window: float) -> None:
     """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
     known at last of the event W - 1 floors back.
     """
-    row = (clock - 1) % len(ring)
-    ring[row, 0], ring[row, 1], ring[row, 2] = window, now[IN_OK], now[ELAPSED]
+    row, ring, lag_prob = (t.counters[CLOCK] - 1) % len(t.ring), t.ring, t.lag_prob
+    ring[row, 0], ring[row, 1], ring[row, 2] = window, t.sample[IN_OK], t.sample[ELAPSED]
     for e in range(lag_prob.shape[1]):
         ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 @machine
-def bank(table: int) -> None:
-    """One sample, by the table of a bank. Only here, where Numba lets a function own memory, can arrays be made of
-    addresses; so they are handed to `advance`, into which this writes them.
-    """
-    t = wholes(table, ROWS, 3)
-    n = t[THETA, 1]
-    many, now = wholes(t[MANY, 0], 1, COUNT)[0], floats(t[NOW, 0], 1, SIZE)[0]
-    theta, cov = floats(t[THETA, 0], 1, n)[0], floats(t[COV, 0], n, n)
-    A, B, T, X = packed(t, AT.A), packed(t, AT.B), packed(t, AT.T), packed(t, AT.X)
-    theta0, root, lag_prob = packed(t, AT.theta0), packed(t, AT.root), packed(t, AT.lag_prob)
-    head = floats(t[REPORT, 0], 1, HEAD)[0]
-    begun = many[SETTLED] == 1
-    many[AGAIN] = 1 if begun else 0
-    while many[AGAIN] == 1:
-        many[AGAIN] = 0
-        advance(
-            A, B, T, packed(t, AT.T2), X, whole(t, AT.links), whole(t, AT.group)[0], whole(t, AT.slots)[0], many, now,
-            packed(t, AT.prior), floats(t[PHI, 0], 1, n)[0], packed(t, AT.Q), packed(t, AT.sizes),
-            floats(t[POWERS, 0], 1, n)[0], packed(t, AT.factors)[0], packed(t, AT.maps), theta0, packed(t, AT.sensors),
-            packed(t, AT.chain), packed(t, AT.initial)[0], packed(t, AT.given)[0], packed(t, AT.loss),
-            packed(t, AT.knobs)[0], packed(t, AT.bases)[0], packed(t, AT.stamps)[0], packed(t, AT.decided),
-            packed(t, AT.parts), root, packed(t, AT.samples), packed(t, AT.Qt), packed(t, AT.news), packed(t, AT.gap),
-            packed(t, AT.moving), packed(t, AT.path), lag_prob, theta, cov, t[OWNERS, 0], t[FLAGS, 0], t[FLAGS, 1] > 0,
-            t[FLAGS, 2] > 0, t[PLAIN, 0] > 0, t[PLAIN, 1] > 0, t[PLAIN, 2] > 0,
-        )  # fmt: skip
-        head[0], head[1], head[2], head[3] = now[EVIDENCE], now[WINDOW], now[KEPT], many[LEAVES]
+def bank(address: int) -> None:
+    """One sample, by the table of a bank. One that is refused as a fault code is done again, as missing."""
+    t = table_at(address)
+    counters, head = t.counters, t.report
+    begun = counters[SETTLED] == 1
+    counters[AGAIN] = 1 if begun else 0
+    while counters[AGAIN] == 1:
+        counters[AGAIN] = 0
+        advance(t)
+        head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
     if not begun:
-        theta0[CAP, 0] = GROWTH * trace(cov)
-        wait(B, T, many, now, theta, cov, lag_prob, t[FLAGS, 0])
-        for row in range(len(root)):
-            root[row, 0] = B[row, 0]
-        head[0], head[1], head[2], head[3] = lone_density(now), 0.0, 1.0, 1.0
-    now[ELAPSED] += now[IN_DT]
-    summary(lag_prob, packed(t, AT.brief))
-    note(packed(t, AT.ring), many[CLOCK], head[1], now, lag_prob)
+        t.places[CAP, 0] = GROWTH * trace(t.cov)
+        wait(t)
+        for row in range(len(t.root)):
+            t.root[row, 0] = t.leaves[row, 0]
+        head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
+    t.sample[ELAPSED] += t.sample[IN_DT]
+    summary(t.lag_prob, t.newest)
+    note(t, head[1])

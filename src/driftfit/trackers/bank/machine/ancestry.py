@@ -3,22 +3,26 @@
 Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k floors back | leaf), entry
 k (H + 1) + H is p(no change in the newest k + 1 floors | leaf). A leaf's memory is one piece, so that handing it on is
 one copy and a marginal one sum of rows; the last row of the table is for such sums. What an event adds is a row of
-`news`, after which come two rows of factors for what was remembered: where nothing changed, and where something did.
+`new_events`, after which come two rows of factors for what was remembered: where nothing changed, and where something
+did.
 After growth the table is still that of the parents; a sample that is not used writes it out for every leaf.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from driftfit.engine.kernel import Array, kernel, part, shared
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
+from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
 from driftfit.trackers.bank.leaves.leaves import WEIGHT
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:
     """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
-    is what an eight may reach into.
+    is what a SIMD vector may reach into.
     """
     news = np.zeros((H + 3, width))
     news[range(H), range(H)] = 1.0
@@ -42,10 +46,14 @@ def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, 
 
 
 @shared
-def write_out(T: Array, L: int, H: int, Hm: int, parent: Array, event: Array, news: Array, T2: Array) -> None:
-    """The table of the children, from that of their parents."""
+def write_out(t: Any, L: int) -> None:
+    """The histories of the children, from those of their parents."""
+    H, Hm = len(t.initial), len(t.sensors)
+    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     for l in range(L):
-        hand_on(T, parent[l], event[l], H, Hm, news, T2, l)
+        hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, l)
+    flip(t)
+    t.counters[EXPANDED] = 1
 
 
 @shared
@@ -66,19 +74,19 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
             T[l, k] *= quiet
 
 
-@part
-def pick(
-    T: Array, expanded: bool, H: int, Hm: int, parent: Array, event: Array, order: Array, G: int, news: Array,
-    T2: Array,
-) -> None:  # fmt: skip
-    """The table of leaves that were kept as they were."""
+@shared
+def pick(t: Any, G: int) -> None:
+    """The histories of leaves that were kept as they were, in `order`."""
+    H, Hm = len(t.initial), len(t.sensors)
+    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     for k in range(G):
-        l = order[k]
-        if expanded:
-            for at in range(T.shape[1]):
-                T2[k, at] = T[l, at]
+        l = t.order[k]
+        if t.counters[EXPANDED] > 0:
+            for at in range(now.shape[1]):
+                after[k, at] = now[l, at]
         else:
-            hand_on(T, parent[l], event[l], H, Hm, news, T2, k)
+            hand_on(now, t.parent[l], t.event[l], H, Hm, t.new_events, after, k)
+    flip(t)
 
 
 @shared
@@ -92,28 +100,30 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 
 @shared
-def summary(lags: Array, brief: Array) -> None:
+def summary(lags: Array, newest: Array) -> None:
     """The newest floors, and the oldest."""
-    last = len(brief) - 1
-    for k in range(len(brief)):
+    last = len(newest) - 1
+    for k in range(len(newest)):
         row = k if k < last else len(lags) - 1
         for e in range(lags.shape[1]):
-            brief[k, e] = lags[row, e]
+            newest[k, e] = lags[row, e]
 
 
-@part
-def marginals(
-    B: Array, L: int, T: Array, expanded: bool, H: int, Hm: int, event: Array, X: Array, K: int, lags: Array
-) -> float:
-    """lags[k, e] = p(event e, k floors back); returns the probability of a change among the floors of the table.
+@shared
+def marginals(t: Any, L: int) -> float:
+    """lag_prob[k, e] = p(event e, k floors back), spec section 4; returns the probability of a change among the floors
+    of the histories.
 
-    Leaves are blocks of the children of K parents, in their order. The first two rows of X are overwritten.
+    Leaves are blocks of the children of K parents, in their order. Two spare rows are overwritten.
     """
+    B, X, event, lags = t.leaves, t.spare, t.event, t.lag_prob
+    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    H, Hm, K, expanded = len(t.initial), len(t.sensors), t.counters[PARENTS], t.counters[EXPANDED] > 0
     block, W, sums, mass, steady = H + 1, len(lags), len(T) - 1, X[0], X[1]
     back, quiet, last = 1, 0.0, W * block - 1
     if expanded:
         K, back = L, 0
-    for l in range(0, K, WIDTH):
+    for l in range(0, K, WIDTH):  # the weight of all children of a parent, and of those without a change
         own, still = fill(0.0), fill(0.0)
         for at in range(l, L, K):
             p = load(B, WEIGHT, at)

@@ -1,6 +1,6 @@
 """A bank in the coordinates of its start: for offsets that a covariance cannot hold, and directions not seen yet.
 
-The machine is told x and z where it is otherwise told phi and theta (`driftfit.trackers.parts.coordinates`), and needs
+The compiled routine is given x and z in the place of phi and theta (`driftfit.trackers.parts.coordinates`), and needs
 to know no more: what it does to means and covariances is the same in all coordinates, as long as changes are walks and
 no leaf has output lags of its own. Change i then adds
 
@@ -11,7 +11,7 @@ its innovation; it moves no weight. What else may have happened since the last u
 same linear map of what they were: C_j. = -C x and C_jj = x' C x + v.
 
 A bank is run so where its start is not determined well enough for a covariance by the time there are residuals; the
-others are told phi and theta, at less cost. Cost per sample: O(n^3) for each change.
+others are given phi and theta, at less cost. Cost per sample: O(n^3) for each change.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
+from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
 from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
-from driftfit.trackers.bank.machine.layout import AT, LEAVES, ROWS
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
+
+FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
+WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
+"""Rows of the table."""
 
 
 @shared
@@ -67,7 +71,7 @@ def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, no
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
     """All leaves, and what may have happened since the last used sample; returns the mean noise variance."""
     n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
-    B, columns, mean = table[3 * AT.B] // 8, table[3 * AT.B + 2], 0.0
+    B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
     for leaf in range(many[LEAVES]):
         at, e = B + leaf, now[Y]
         for i in range(n):
@@ -76,11 +80,11 @@ def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unkn
         M[at + (FIRST + j) * columns] = sign * e
         each = M[at + S * columns] / (M[at + NU * columns] - 2.0) if unknown else 1.0
         mean += M[at + WEIGHT * columns] * each * noise
-    gap, columns = table[3 * AT.gap] // 8, table[3 * AT.gap + 2]
-    for i in range(1, table[3 * AT.gap + 1]):
+    gap, columns = table[3 * GAP] // 8, table[3 * GAP + 2]
+    for i in range(1, table[3 * GAP + 1]):
         enter_packed(M, gap + i * columns, 1, x, j, sign, 0.0, g)
-    path, columns, H = table[3 * AT.path] // 8, table[3 * AT.path + 2], table[3 * AT.prior + 1]
-    for i in range(2 * H, table[3 * AT.path + 1] - 1):
+    path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
+    for i in range(2 * H, table[3 * PATH + 1] - 1):
         enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
     return mean
 
@@ -106,10 +110,10 @@ def machine_walks(
 ) -> None:
     """Q of every change for lane l of L, from the addresses of fields."""
     t, m = wholes(table, 3 * ROWS, L)[:, l], floats(memory, size, L)[:, l]
-    wide, sizes = t[3 * AT.Q + 2], t[3 * AT.sizes + 2]
-    for i in range(t[3 * AT.Q + 1]):
-        of = t[3 * AT.sizes] // 8 + i * sizes if sizes > 0 else -1
-        places = t[3 * AT.Q] // 8 + i * wide, t[3 * AT.fixed] // 8 + i * wide, of
+    wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
+    for i in range(t[3 * WALKS + 1]):
+        of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
+        places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
         walk(m, places, cubes(M, n, n, L)[:, :, l], floats(c, n, L)[:, l], unit, cubes(W, n, n, L)[:, :, l])
 
 
@@ -133,7 +137,7 @@ FRAMED = (machine_walks, machine_enter)
 
 @kernel
 def begin_framed(s: State, l: int) -> None:
-    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance or of what it was told."""
+    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
     s.framed[l] = 1
     frame(s, l)
@@ -144,7 +148,7 @@ def begin_framed(s: State, l: int) -> None:
 
 
 @kernel
-def tell_walks(s: State, l: int) -> None:
+def write_walks(s: State, l: int) -> None:
     """What the changes of the next sample add, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
@@ -156,7 +160,7 @@ def tell_walks(s: State, l: int) -> None:
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Take a regressor in by the column by which it leaves the span; the machine has let time pass."""
+    """Take a regressor in by the column by which it leaves the span; the compiled routine has let time pass."""
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
@@ -165,9 +169,9 @@ def enter_bank(s: State, column: int, l: int) -> None:
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     machine_enter(
-        s.memory.ctypes.data, s.table.ctypes.data, s.many.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
+        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
         s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.memory.shape[0],
-        s.many.shape[0], n, L, l,
+        s.counters.shape[0], n, L, l,
     )  # fmt: skip
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from driftfit.engine.kernel import Array, shared
-from driftfit.trackers.bank.leaves.lags import push
-from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
-from driftfit.trackers.bank.machine.layout import (
+from driftfit.trackers.bank.layout import (
     CLOCK,
     EXPANDED,
     GROUPS,
@@ -23,29 +23,18 @@ from driftfit.trackers.bank.machine.layout import (
     TIMES,
     Y_HAT,
 )  # fmt: skip
+from driftfit.trackers.bank.leaves.lags import push
+from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
 
 GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
 
 
 @shared
-def wait(B: Array, T: Array, many: Array, now: Array, theta: Array, P: Array, lag_prob: Array, na: int) -> None:
-    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
-    n, H = len(theta), lag_prob.shape[1]
-    lag_prob[0, 0] = 1.0
-    y_hat = B[WEIGHT, :1]
-    y_hat[0] = now[Y_HAT] if abs(now[Y_HAT]) < np.inf else 0.0
-    push(B, 1, n, na, now[IN_Y], now[IN_SEEN] > 0.0, y_hat, np.inf)
-    now[LAST] = now[IN_Y] if now[IN_SEEN] > 0.0 else now[LAST]
-    many[CLOCK] += 1
-    if many[SETTLED] == READY:
-        begin(B, T, theta, P, now[TIMES], max(now[SQUARES], now[LEAST] * now[TIMES]), many, H)
-
-
-@shared
-def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float, many: Array, H: int) -> None:
+def begin(t: Any, nu: float, squares: float) -> None:
     """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
-    n = len(theta)
+    B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
+    n, H = len(theta), len(t.initial)
     at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0
     for row in range(LOG, FIRST):
         B[row, 0] = 0.0
@@ -56,9 +45,23 @@ def begin(B: Array, T: Array, theta: Array, P: Array, nu: float, squares: float,
             B[at, 0] = P[i, j]
             P[i, j] *= unit
             at += 1
-    for at in range(T.shape[1]):
-        T[0, at] = 1.0 if at % (H + 1) == H else 0.0
-    many[LEAVES], many[GROUPS], many[EXPANDED], many[SETTLED] = 1, 1, 1, 1
+    for at in range(history.shape[1]):
+        history[0, at] = 1.0 if at % (H + 1) == H else 0.0
+    counters[LEAVES], counters[GROUPS], counters[EXPANDED], counters[SETTLED] = 1, 1, 1, 1
+
+
+@shared
+def wait(t: Any) -> None:
+    """Before the tree grows there is one leaf and no event; the tracker runs its filter."""
+    counters, sample = t.counters, t.sample
+    t.lag_prob[0, 0] = 1.0
+    y_hat = t.leaves[WEIGHT, :1]
+    y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
+    push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
+    sample[LAST] = sample[IN_Y] if sample[IN_SEEN] > 0.0 else sample[LAST]
+    counters[CLOCK] += 1
+    if counters[SETTLED] == READY:
+        begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))
 
 
 @shared

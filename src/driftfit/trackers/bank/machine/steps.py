@@ -1,4 +1,4 @@
-"""The steps of a bank in the lane form: one filter until it can begin, then the machine of `advance`."""
+"""The steps of a bank in the lane form: one filter until it can begin, then the compiled routine of `advance`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,10 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
 from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
-from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
-from driftfit.trackers.bank.leaves.own_sensor import own_address
-from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, tell_walks
-from driftfit.trackers.bank.machine.grow import FLOOR
-from driftfit.trackers.bank.machine.layout import (
-    ADDRESSES,
-    BASE,
+from driftfit.trackers.bank.layout import (
     COUNT,
-    COV,
-    FACTORS,
-    GIVEN,
+    COUNTERS_AT,
+    COV_AT,
     IN_DT,
     IN_NOISE,
     IN_OK,
@@ -26,30 +18,43 @@ from driftfit.trackers.bank.machine.layout import (
     IN_TIME,
     IN_Y,
     LEAST,
-    MANY,
+    MEMORY_AT,
     MOST,
-    NOW,
-    OWNERS,
-    PHI,
-    PLACES,
-    POWERS,
+    PHI_AT,
+    POWERS_AT,
     READY,
-    REPORT,
+    REPORT_AT,
+    ROW,
     ROWS,
     S2,
+    SAMPLE_AT,
     SETTLED,
     SIZE,
     SQUARES,
-    THETA,
+    THETA_AT,
     TIMES,
     WAITING,
     Y_HAT,
     R,
-)  # fmt: skip
+)
+from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
+from driftfit.trackers.bank.leaves.own_sensor import own_address
+from driftfit.trackers.bank.machine.advance import bank
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, write_walks
+from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
+
+GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
+
+
+@kernel
+def keep(o: State, s: State, l: int) -> None:
+    """Store what tells of events."""
+    for k in range(s.report.shape[0]):
+        o.report[k, l] = s.report[k, l]
 
 
 @kernel
@@ -88,47 +93,41 @@ def only_drifted(s: State, l: int) -> None:
 @kernel
 def point(s: State) -> None:
     """Write where the arrays are into the table."""
-    s.table[BASE, 0, 0] = s.memory.ctypes.data
-    s.table[REPORT, 0, 0] = s.report.ctypes.data
     framed = s.framed[0] > 0
-    s.table[PHI, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
-    s.table[POWERS, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
-    s.table[THETA, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
-    s.table[COV, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
-    s.table[MANY, 0, 0] = s.many.ctypes.data
-    s.table[NOW, 0, 0] = s.now.ctypes.data
-    s.table[OWNERS, 0, 0] = own_address(s)
+    s.table[MEMORY_AT, 0, 0] = s.memory.ctypes.data
+    s.table[REPORT_AT, 0, 0] = s.report.ctypes.data
+    s.table[PHI_AT, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
+    s.table[POWERS_AT, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
+    s.table[THETA_AT, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
+    s.table[COV_AT, 0, 0] = s.Pz.ctypes.data if framed else s.P.ctypes.data
+    s.table[COUNTERS_AT, 0, 0] = s.counters.ctypes.data
+    s.table[SAMPLE_AT, 0, 0] = s.sample.ctypes.data
+    s.table[OWN_AT, 0, 0] = own_address(s)
 
 
 @kernel
-def run(s: State, l: int) -> None:
-    """The machine; addresses are no part of the state."""
-    if s.theta.shape[1] > 1:
-        among(s, l)
-    else:
-        point(s)
-        bank(s.table.ctypes.data)
-        for k in range(ADDRESSES):
-            s.table[PLACES + k, 0, 0] = 0
+def report(s: State, l: int) -> None:
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = s.P[i, i, l] * s.scale[l]
 
 
 @kernel
 def among(s: State, l: int) -> None:
-    """The machine for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
-    n, N, R, framed = s.theta.shape[0], s.memory.shape[0], s.report.shape[0], s.framed[l] > 0
+    """The same for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
+    n, N, size, framed = s.theta.shape[0], s.memory.shape[0], s.report.shape[0], s.framed[l] > 0
     memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
-    vectors = report + 8 * R
+    vectors = report + 8 * size
     P = vectors + 24 * n
-    now = P + 8 * n * n
-    many = now + 8 * SIZE
-    at = many + 8 * COUNT
+    sample = P + 8 * n * n
+    counters = sample + 8 * SIZE
+    at = counters + 8 * COUNT
     table = wholes(at, ROWS, 3)
     for k in range(ROWS):
         for i in range(3):
             table[k, i] = s.table[k, i, l]
-    table[BASE, 0], table[REPORT, 0], table[PHI, 0], table[POWERS, 0] = memory, report, vectors, vectors + 8 * n
-    table[THETA, 0], table[COV, 0], table[MANY, 0], table[NOW, 0] = vectors + 16 * n, P, many, now
-    table[OWNERS, 0] = own_address(s)
+    table[MEMORY_AT, 0], table[REPORT_AT, 0], table[PHI_AT, 0] = memory, report, vectors
+    table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
+    table[COUNTERS_AT, 0], table[SAMPLE_AT, 0], table[OWN_AT, 0] = counters, sample, own_address(s)
     for k in range(N):
         floats(memory, 1, N)[0, k] = s.memory[k, l]
     for i in range(n):
@@ -138,48 +137,77 @@ def among(s: State, l: int) -> None:
         for j in range(n):
             floats(P, n, n)[i, j] = s.Pz[i, j, l] if framed else s.P[i, j, l]
     for k in range(SIZE):
-        floats(now, 1, SIZE)[0, k] = s.now[k, l]
+        floats(sample, 1, SIZE)[0, k] = s.sample[k, l]
     for k in range(COUNT):
-        wholes(many, 1, COUNT)[0, k] = s.many[k, l]
+        wholes(counters, 1, COUNT)[0, k] = s.counters[k, l]
     bank(at)
     for k in range(N):
         s.memory[k, l] = floats(memory, 1, N)[0, k]
-    for k in range(R):
-        s.report[k, l] = floats(report, 1, R)[0, k]
-    for i in range(n):
-        if framed:
-            s.d[i, l] = floats(vectors, 3, n)[2, i]
-        else:
-            s.theta[i, l] = floats(vectors, 3, n)[2, i]
-        for j in range(n):
-            if framed:
-                s.Pz[i, j, l] = floats(P, n, n)[i, j]
-            else:
-                s.P[i, j, l] = floats(P, n, n)[i, j]
+    for k in range(size):
+        s.report[k, l] = floats(report, 1, size)[0, k]
     for k in range(SIZE):
-        s.now[k, l] = floats(now, 1, SIZE)[0, k]
+        s.sample[k, l] = floats(sample, 1, SIZE)[0, k]
     for k in range(COUNT):
-        s.many[k, l] = wholes(many, 1, COUNT)[0, k]
+        s.counters[k, l] = wholes(counters, 1, COUNT)[0, k]
+    for i in range(n):
+        theta = floats(vectors, 3, n)[2, i]
+        s.d[i, l], s.theta[i, l] = theta if framed else s.d[i, l], s.theta[i, l] if framed else theta
+        for j in range(n):
+            entry = floats(P, n, n)[i, j]
+            s.Pz[i, j, l], s.P[i, j, l] = entry if framed else s.Pz[i, j, l], s.P[i, j, l] if framed else entry
 
 
 @kernel
-def tell(s: State, l: int) -> None:
-    """What the machine is told of this sample."""
-    s.now[IN_Y, l], s.now[IN_NOISE, l], s.now[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
-    s.now[IN_TIME, l] = s.dt[l] * s.drift[l]
-    s.now[IN_OK, l], s.now[IN_SEEN, l] = s.ok[l], s.seen[l]
-    s.now[R, l], s.now[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
-    s.now[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+def run(s: State, l: int) -> None:
+    """The compiled routine; addresses are no part of the state."""
+    if s.theta.shape[1] > 1:
+        among(s, l)
+    else:
+        point(s)
+        bank(s.table.ctypes.data)
+        for k in range(MEMORY_AT, SAMPLE_AT + 1):
+            s.table[k, 0, 0] = 0
+        s.table[OWN_AT, 0, 0] = 0
+
+
+@kernel
+def hand_over(s: State, l: int) -> None:
+    """The numbers of this sample, for the compiled routine."""
+    s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
+    s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
+    s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
+    s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
+    s.sample[MOST, l] = PLAUSIBLE * s.power[l] if s.power[l] > 0.0 else np.inf
+
+
+@kernel
+def alone(s: State, l: int, counts: bool) -> None:
+    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    learn_scales(s, l)
+    if counts:
+        learn_start(s, l)
+    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
+    hand_over(s, l)
+    s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
+    s.sample[SQUARES, l], s.sample[TIMES, l] = s.squares[l], s.count[l]
+    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
+    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
+        begin_framed(s, l)
+    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
+    s.counters[SETTLED, l] = READY if ready else WAITING
+    run(s, l)
+    if ready:
+        s.scale[l] = 1.0
 
 
 @kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
-    if s.many[SETTLED, l] > 0:
-        tell(s, l)
+    if s.counters[SETTLED, l] > 0:
+        hand_over(s, l)
         run(s, l)
-        s.y_hat[l], s.s[l], s.e[l] = s.now[Y_HAT, l], s.now[S2, l], s.y[l] - s.now[Y_HAT, l]
-        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]  # a fault code counts as missing, in lags too
+        s.y_hat[l], s.s[l], s.e[l] = s.sample[Y_HAT, l], s.sample[S2, l], s.y[l] - s.sample[Y_HAT, l]
+        s.ok[l], s.seen[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]  # a fault code counts as missing, in lags too
         learn_scales(s, l)
     else:
         only_drift(s, l)
@@ -188,9 +216,30 @@ def correct(s: State, l: int) -> None:
 
 
 @kernel
+def in_coordinates(s: State, l: int) -> None:
+    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
+    column, y_hat = whiten_within(s, l), prediction(s, l)
+    write_walks(s, l)
+    hand_over(s, l)
+    if column >= 0:
+        s.sample[IN_OK, l] = 0.0
+    run(s, l)
+    if column >= 0:
+        s.y_hat[l], s.s[l] = y_hat, np.inf
+        if s.ok[l] > 0.0:
+            enter_bank(s, column, l)
+    else:
+        s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
+        s.ok[l], s.seen[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]
+    s.e[l] = s.y[l] - s.y_hat[l]
+    learn_scales(s, l)
+    read_framed(s, l)
+
+
+@kernel
 def begin(s: State, l: int) -> None:
     resolve(s, l)
-    if s.many[SETTLED, l] > 0:
+    if s.counters[SETTLED, l] > 0:
         in_coordinates(s, l)
     else:
         only_drifted(s, l)
@@ -203,69 +252,14 @@ def begin(s: State, l: int) -> None:
 
 
 @kernel
-def in_coordinates(s: State, l: int) -> None:
-    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
-    column, y_hat = whiten_within(s, l), prediction(s, l)
-    tell_walks(s, l)
-    tell(s, l)
-    if column >= 0:
-        s.now[IN_OK, l] = 0.0
-    run(s, l)
-    if column >= 0:
-        s.y_hat[l], s.s[l] = y_hat, np.inf
-        if s.ok[l] > 0.0:
-            enter_bank(s, column, l)
-    else:
-        s.y_hat[l], s.s[l] = s.now[Y_HAT, l], s.now[S2, l]
-        s.ok[l], s.seen[l] = s.now[IN_OK, l], s.now[IN_SEEN, l]
-    s.e[l] = s.y[l] - s.y_hat[l]
-    learn_scales(s, l)
-    read_framed(s, l)
-
-
-@kernel
-def alone(s: State, l: int, counts: bool) -> None:
-    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
-    learn_scales(s, l)
-    if counts:
-        learn_start(s, l)
-    s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
-    tell(s, l)
-    s.now[Y_HAT, l], s.now[S2, l] = s.y_hat[l], s.s[l]
-    s.now[SQUARES, l], s.now[TIMES, l] = s.squares[l], s.count[l]
-    ready = s.unknown[l] == 0 or s.count[l] >= RESIDUALS
-    if ready and s.root[l] > 0 and s.can_frame[l] > 0 and s.within[l] >= RESIDUALS:
-        begin_framed(s, l)
-    ready = ready and (s.root[l] == 0 or s.framed[l] > 0)
-    s.many[SETTLED, l] = READY if ready else WAITING
-    run(s, l)
-    if ready:
-        s.scale[l] = 1.0
-
-
-@kernel
-def report(s: State, l: int) -> None:
-    for i in range(s.theta.shape[0]):
-        s.var[i, l] = s.P[i, i, l] * s.scale[l]
-
-
-@kernel
-def keep(o: State, s: State, l: int) -> None:
-    """Store what tells of events."""
-    for k in range(s.report.shape[0]):
-        o.report[k, l] = s.report[k, l]
-
-
-@kernel
-def told(s: State, known: Array, t: int, l: int) -> None:
+def take_known(s: State, known: Array, t: int, l: int) -> None:
     """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
-    row = t if known.shape[0] > 1 else 0
-    given, factors = s.table[GIVEN, 0, l] // 8, s.table[FACTORS, 0, l] // 8
-    count, Hd = s.table[GIVEN, 2, l], s.table[FACTORS, 2, l]
-    for k in range(count):
-        s.memory[given + k, l] = known[row, 3 + k, l]
-    for i in range(Hd):
-        s.memory[factors + i, l] = known[row, 3 + count + i, l]
+    row, column = t if known.shape[0] > 1 else 0, 3
+    for field in (GIVEN, GIVEN_CHAIN, DRIFT):
+        start = s.table[field, 0, l] // 8
+        for k in range(s.table[field, 2, l]):
+            s.memory[start + k, l] = known[row, column, l]
+            column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, told, machines=(*FRAME, *FRAMED))
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED))

@@ -1,1 +1,1 @@
-"""What a bank is asked for beside parameters: probabilities, events and their dates, the decided path."""
+"""Results of a bank besides parameters: probabilities, events and their dates, the decided path."""

@@ -1,17 +1,17 @@
-"""The date of a jump, from all samples around it: its posterior distribution, given that there was one jump.
+"""The date of a jump from all samples around it: its posterior distribution, given that there was one jump.
 
-The leaves that a bank keeps are too few to say how uncertain a date is: their interval, meant to hold it in 95 per
-cent, held it in 77 where the jump was 1.5 standard deviations of the noise. Between an event and its neighbours, and
-for at most `REACH` samples to either side, let
+A bank keeps too few leaves to measure the uncertainty of a date: their interval with a nominal level of 95 per cent
+covered it in 77 for jumps of 1.5 standard deviations of the noise. Between an event and its neighbours, and for at most
+`REACH` samples to either side, let
 
     y_t = phi_t' theta + [t >= s] phi_t' delta + v_t,   v_t ~ N(0, w_t r),   delta ~ N(0, r Lambda^-1)
 
 with theta and r unknown, and delta of the parameters that the change moves. With Z_s the regressors of both, weighted
-by 1/w, and S_s the sum of squares that is left, the penalty delta' Lambda delta in it,
+by 1/w, and S_s the residual sum of squares, including the penalty delta' Lambda delta,
 
     p(s | y) proportional to |Z_s' Z_s + Lambda|^(-1/2) S_s^(-(N - n) / 2)
 
-for every used sample s, all being as likely before. Cost: O(n^3) for each.
+for every used sample s, all being equally probable a priori. Cost: O(n^3) for each.
 
 Source: the normal linear model under its reference prior (Zellner 1971, chapter 3), for a change point as in Chernoff
 and Zacks (1964).
@@ -31,22 +31,22 @@ if TYPE_CHECKING:
     from driftfit.trackers.bank.results.decided_path import Measured
 
 REACH = 200
-"""Samples to either side of an event that tell of its date."""
+"""Number of samples to either side of an event that are used for its date."""
 
 
 class Around(NamedTuple):
-    """The samples that tell of a date."""
+    """The samples that are used for a date."""
 
     phi: Array
     y: Array
     weight: Array
-    """(N,): one over the noise variance, 0 for what is not used."""
+    """(N,): one over the noise variance, 0 for samples that are not used."""
     Q: Array
     """(n, n): covariance of the jump."""
 
 
 def posterior(around: Around) -> Array:
-    """p(s | y) for every sample, (N,); zero where a sample is not used, and everywhere if nothing tells of it."""
+    """p(s | y) for every sample, (N,); zero for unused samples, and everywhere if there is no information."""
     phi, y, weight, Q = around
     N, n = phi.shape
     moved = np.flatnonzero(np.diag(Q) > 0.0)
@@ -71,7 +71,7 @@ def posterior(around: Around) -> Array:
     left = d @ d - np.einsum("ti,ti->t", right, np.linalg.solve(gram, right[..., None])[..., 0])
     left = np.maximum(left, 1e-12 * max(float(d @ d), np.finfo(float).tiny))
     logs = np.where(used, -0.5 * np.linalg.slogdet(gram)[1] - 0.5 * free * np.log(left), -np.inf)
-    logs[: int(np.argmax(used)) + 1] = -np.inf  # a change before the first sample is none
+    logs[: int(np.argmax(used)) + 1] = -np.inf  # a change before the first sample is not possible
     if not np.isfinite(logs).any():
         return np.zeros(N)
     p = np.exp(logs - logs.max())
@@ -79,7 +79,7 @@ def posterior(around: Around) -> Array:
 
 
 def dated(events: list[Event], measured: Measured, jumps: dict[str, Array]) -> list[Event]:
-    """The events with dates, and intervals that hold them with probability `LEVEL`; ``jumps`` are their covariances."""
+    """The events with dates, and intervals that contain them with probability `LEVEL`; ``jumps`` are covariances."""
     ok, result = np.isfinite(measured.r), list(events)
     at = [k for k, event in enumerate(events) if event.kind == "change"]
     ends = [0, *(events[k].span.date for k in at), len(measured.y)]

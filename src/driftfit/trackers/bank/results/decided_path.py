@@ -1,11 +1,11 @@
-"""The path of a complete record given the events that were found: Rauch, Tung and Striebel with Q of the decided event.
+"""The path of a complete record given the detected events: Rauch, Tung and Striebel with Q of the decided event.
 
     G = C(t|t) C(t+1|t)^-1,   m_s = m + G (m_s(t+1) - m(t+1|t)),   C_s = C + G (C_s(t+1) - C(t+1|t)) G'
     theta(t+1) - theta(t):  mean m_s(t+1) - m_s(t),  covariance C_s(t+1) + C_s(t) - G C_s(t+1) - C_s(t+1) G'
 
-Samples at which the sensor was at fault count with the noise of their fault, or not at all (additive outliers, a frozen
-sensor; in ARX then also the samples whose regressors hold them). Bands are conditional on the events. A diffuse start
-is a prior of 1e6 times what a sample tells. Cost: O(T n^3).
+Samples at which the sensor was at fault have the noise variance of their fault, or are not used (additive outliers, a
+frozen sensor; in ARX also later samples whose regressors contain them). Bands are conditional on the events. A diffuse
+start is a prior of 1e6 times the variance that a sample leaves. Cost: O(T n^3).
 
 The drift of a bank that was given no changes is a guess, too small where parameters walk all the time: between events
 the path would be taken for certain. So it is scaled, by the factor f >= 1 of greatest likelihood given the events
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, shared
+from driftfit.engine.kernel import Array, Driver
 from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth.problem import replay
@@ -33,11 +33,11 @@ from driftfit.trackers.bank.results.events import Event
 WIDER, CLOSE = 1e7, 0.05
 """Largest factor of a drift that is fitted, and how closely, in its natural logarithm."""
 WIDE = 1e6
-"""Variance of the start of a diffuse run, in units of what one sample tells."""
+"""Variance of the start of a diffuse run, in units of the variance that one sample leaves."""
 
 
 class Problem(NamedTuple):
-    """A regression whose coefficients walk with a covariance of its own before every sample."""
+    """A regression whose coefficients have a separate drift covariance before every sample."""
 
     phi: Array
     y: Array
@@ -52,7 +52,7 @@ class Problem(NamedTuple):
 
 
 class EventSmoothed:
-    """Parameters of a record, each from all of it, given the events.
+    """Parameters of a record given the events, each estimated from the whole record.
 
     ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on; ``widened`` is the
     factor of the drift between them, 1 where the changes of the bank were given.
@@ -81,7 +81,7 @@ class EventSmoothed:
 
 
 def problem_of(run: Track, events: list[Event]) -> Problem:
-    """The walk behind a run of a bank, with the covariances of the events."""
+    """The random walk behind a run of a bank, with the covariances of the events."""
     bank: Any = run.tracker
     if any(change.forgets for change in bank.all_changes):
         raise ValueError(
@@ -94,7 +94,7 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
     for event in events:
         if event.kind == "change":
             which[event.span.date] = bank.change_names.index(event.name)
-    drift = measured.drift * np.where(which > 0, 1.0, measured.dt)  # what happens once does not last
+    drift = measured.drift * np.where(which > 0, 1.0, measured.dt)  # an event happens once, whatever the interval
     steps = np.array(steps_of(run, measured))[which] * drift[:, None, None]
     C0 = np.diag(WIDE * measured.unit) if bank.p0 is None else np.asarray(_full(bank, n)) * measured.relative
     m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
@@ -120,7 +120,7 @@ def with_drift(problem: Problem, quiet: Array) -> Problem:
 
 
 class Measured(NamedTuple):
-    """What a run was told by its samples, and the units of what its bank was told."""
+    """The samples of a run, and the units of its bank's settings."""
 
     phi: Array
     y: Array
@@ -129,13 +129,13 @@ class Measured(NamedTuple):
     dt: Array
     drift: Array
     unit: Array
-    """(n,): what one sample tells of each parameter."""
+    """(n,): the variance that one sample leaves of each parameter."""
     relative: float
-    """What q and p0 are in units of."""
+    """The unit of q and p0."""
 
 
 def measurements(run: Track, events: list[Event]) -> Measured:
-    """The samples of a run; those of sensor faults count little or not."""
+    """The samples of a run; those of sensor faults have little or no weight."""
     bank: Any = run.tracker
     seen = replay(run)
     ok, phi = seen["ok"][:, 0] > 0.0, np.ascontiguousarray(seen["phi"][..., 0])
@@ -156,12 +156,12 @@ def steps_of(run: Track, measured: Measured) -> list[Array]:
 
 
 def noise_variance(bank: Bank, run: Track) -> float:
-    """The known one, or what the bank thinks of it at the end."""
+    """The known noise variance, or the bank's estimate at the end."""
     r = bank.all_sensors[0].r
     if r is not None:
         return float(r)
     lane = run.lane(-1)
-    B = bank.array(run.model, lane, "B")
+    B = bank.array(run.model, lane, "leaves")
     mass = B[WEIGHT] > 0.0
     if not mass.any():
         return float(lane["scale"])
@@ -169,7 +169,7 @@ def noise_variance(bank: Bank, run: Track) -> float:
 
 
 def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
-    """Factors of the noise variance, inf where the sensor said nothing."""
+    """Factors of the noise variance, inf where the output carries no information."""
     factor = np.ones(len(run))
     sensors = {sensor.name: sensor for sensor in bank.all_sensors}
     reach = run.model.output_lags or 0
@@ -206,7 +206,7 @@ def solve(problem: Problem) -> tuple[Array, Array, Array]:
     return m, C, gains
 
 
-@shared
+@Driver
 def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> float:
     """The filter; m (T, n) and C (T, n, n) after each sample. Returns the log-likelihood, but for its constant."""
     T, n = phi.shape

@@ -1,9 +1,9 @@
-"""Events: what the probabilities of a run add up to, dated and with what is plausible beside the date.
+"""Events: clusters of the probabilities of a run, with a date and an interval.
 
-The mass of one jump splits between neighbouring samples, so an event is a cluster of them: while the probability of a
-change in the window is above the threshold, samples with a share in it belong together. Its date is the likeliest of
-them, its interval the fewest neighbours that hold `LEVEL` of the mass of the leaves. Samples that were not used belong
-to the next one that was: a jump in an outage may have been at any of them.
+The probability of one jump is divided among neighbouring samples, so an event is a cluster of them: while the
+probability of a change in the window is above the threshold, samples with a share in it belong together. The date is
+the most likely of them, and the interval the smallest set of neighbours with `LEVEL` of the probability of the leaves.
+Samples that were not used belong to the next one that was: a jump in an outage may have been at any of them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class Shifts(Protocol):
 
 
 FAINT = 0.02
-"""Probability below which a sample does not count to a cluster."""
+"""Probability below which a sample does not belong to a cluster."""
 LEVEL = 0.95
-"""Share of the mass that the interval of a date holds, and its level where the whole record tells of it."""
+"""Share of the probability in the interval of a date, and its level if the whole record is used."""
 
 
 class Span(NamedTuple):
@@ -52,22 +52,22 @@ class Event:
     Attributes
     ----------
     date, first, last
-        When it is first visible, and the ends of the interval that holds the date with probability ``level`` (of a
-        fault: the ends of its duration): times where there are some, else sample numbers.
+        When it is first visible, and the ends of the interval that contains the date with probability ``level`` (of a
+        fault: the ends of its duration): times if there are any, otherwise sample numbers.
     known
-        When it was known at this threshold, likewise.
+        When it was detected at this threshold, likewise.
     span : Span
         The four as sample numbers.
     level : float
         Level of the interval: 0.95 for changes in a record, whose dates are those of
-        `driftfit.trackers.bank.results.dates`, simulated in `benchmarks/event_dates.py`. NaN for faults, and in a
-        stream, where the interval is only what the leaves that were kept leave open.
+        `driftfit.trackers.bank.results.dates`, checked by simulation in `benchmarks/event_dates.py`. NaN for faults,
+        and in a stream, where the interval contains only the dates of the leaves that were kept.
     prob : float
         Probability that it happened.
     name : str
-        The likeliest change, or the sensor fault.
+        The most likely change, or the sensor fault.
     names : mapping from names of changes to their share
-    shift, std, z : mappings from parameters to how far they moved, its standard error, and their ratio (changes only)
+    shift, std, z : mappings from parameters to their change, its standard error, and their ratio (changes only)
         From the smoothed path given the events: conditional on them.
     """
 
@@ -101,11 +101,11 @@ class Event:
         return self.times[k] if self.times else self.span[k]
 
     def timed(self, time: Callable[[int], Any]) -> Event:
-        """The same with times, from sample numbers to which."""
+        """The same event with times from sample numbers."""
         return replace(self, times=tuple(time(sample) for sample in self.span))
 
     def measured(self, smoothed: Shifts) -> Event:
-        """The same, with how far each parameter moved."""
+        """The same event with the change of each parameter."""
         mean, cov = smoothed.increment(self.span.date)
         std = np.sqrt(np.maximum(np.diag(cov), 0.0))
         names = smoothed.names
@@ -115,11 +115,11 @@ class Event:
 
     @property
     def z(self) -> dict[str, float]:
-        """How far each parameter moved in standard errors."""
+        """The change of each parameter in standard errors."""
         return {name: shift / self.std[name] if self.std[name] > 0.0 else 0.0 for name, shift in self.shift.items()}
 
     def row(self, names: tuple[str, ...]) -> dict[str, Any]:
-        """For a table, with shift and standard error of every parameter, None where there is none."""
+        """A row of a table, with change and standard error of every parameter, None if there is none."""
         told = {
             "kind": self.kind, "date": self.date, "first": self.first, "last": self.last, "known": self.known,
             "prob": self.prob, "name": self.name,
@@ -131,12 +131,12 @@ class Event:
 
 
 class Told(NamedTuple):
-    """What events are made of."""
+    """The probabilities from which events are made."""
 
     latest: Array
-    """(T, H): probabilities of the joint events of each sample, from as late as the bank remembers."""
+    """(T, H): probabilities of the joint events of each sample, from the latest sample that the bank remembers."""
     window: Array
-    """(T,): probability, at each sample, of a change in the newest W floors."""
+    """(T,): probability, at each sample, of a change in the newest W levels."""
     used: Array
     """(T,) bool"""
     W: int
@@ -165,7 +165,7 @@ def changes_of(told: Told, threshold: float) -> list[Event]:
 
 
 def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
-    """Groups of neighbouring samples with a share each; the whole where no group alone passes the threshold."""
+    """Groups of neighbouring samples with a share each; the whole if no group alone passes the threshold."""
     part = p[reach]
     found = [(reach.start + a, reach.start + b) for a, b in runs(part > FAINT) if part[a:b].sum() > threshold]
     if found or not len(part) or part.sum() <= threshold:
@@ -175,23 +175,25 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
 
 
 def back_to(first: int, start: int, used: Array) -> int:
-    """The first of the samples that were not used before this one: what happened then shows here."""
+    """The first of the unused samples before this one: what happened at them is visible here."""
     while first > start and not used[first - 1]:
         first -= 1
     return first
 
 
 def densest(mass: Array) -> tuple[int, int]:
-    """First and last of the fewest neighbours that hold `LEVEL` of all."""
+    """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
     wanted = LEVEL * total[-1] * (1.0 - 1e-12)
-    ends = np.searchsorted(total, total[:-1] + wanted)  # of the interval that begins at each
+    ends = np.searchsorted(
+        total, total[:-1] + wanted
+    )  # of the interval that begins at each sample sample sample sample sample sample
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1
 
 
 def faults_of(told: Told, threshold: float) -> list[Event]:
-    """Stretches at which the sensor was likely not nominal."""
+    """Intervals in which the sensor was probably not nominal."""
     Hm, T, events = len(told.sensor_names), len(told.latest), []
     by_sensor = np.nan_to_num(told.latest).reshape(T, -1, Hm).sum(axis=1)
     for j in range(1, Hm):
@@ -202,11 +204,11 @@ def faults_of(told: Told, threshold: float) -> list[Event]:
 
 
 def all_of(told: Told, threshold: float) -> list[Event]:
-    """Changes and faults in order of time."""
+    """Changes and faults, sorted by time."""
     return sorted(changes_of(told, threshold) + faults_of(told, threshold), key=lambda event: event.span.date)
 
 
 def runs(on: Array) -> list[tuple[int, int]]:
-    """Stretches [a, b) over which a condition holds."""
+    """Intervals [a, b) in which a condition holds."""
     edges = np.flatnonzero(np.diff(np.r_[False, on, False].astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""What a bank of hypotheses tells in a stream: probabilities now, events as they are decided, the mixture."""
+"""Results of a bank of hypotheses in a stream: present probabilities, decided events, the mixture."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.machine.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
+from driftfit.trackers.bank.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
 from driftfit.trackers.bank.memory import SINGLE
 from driftfit.trackers.bank.results.events import Event, Told, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
 
 
 class LiveHypotheses:
-    """What a stream with a `Bank` says of events now; `Live.hypotheses` makes it.
+    """The present results of a stream with a `Bank`; `Live.hypotheses` makes it.
 
     ``lag_prob`` (len(lags), H), ``window``, ``evidence``, ``leaves``, ``kept`` and ``impossible`` are those of
     `Hypotheses` after the last sample.
@@ -33,18 +33,18 @@ class LiveHypotheses:
         told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
         self.lag_prob: Array = told["lag_prob"].copy()
         self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
-        self.impossible = int(self._lane["many"][IMPOSSIBLE])
+        self.impossible = int(self._lane["counters"][IMPOSSIBLE])
 
     def mixture(self) -> Mixture:
-        """The leaves now: what control works with."""
+        """The present leaves, for use in control."""
         return mixture_of(self.tracker, self._live, self._lane)
 
     def events(self, threshold: float = 0.5) -> list[Event]:
-        """Events that were decided since this was asked last: all that can be known of them is known.
+        """Events that were decided since the last call; their information is final.
 
-        A stream remembers the last 256 samples, so ask more often than that.
+        A stream remembers the last 256 samples, so call this more often than that.
         """
-        many, bank = self._lane["many"], self.tracker
+        many, bank = self._lane["counters"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
         now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
@@ -61,7 +61,7 @@ class LiveHypotheses:
         return [event.timed(lambda sample: self._time(ring, sample)) for event in done]
 
     def _time(self, ring: Array, sample: int) -> Any:
-        """When a sample of the ring was; its number where the stream is given no times."""
-        back = float(self._lane["now"][ELAPSED] - ring[sample % len(ring), 2])
+        """The time of a sample of the ring; its number if the stream has no times."""
+        back = float(self._lane["sample"][ELAPSED] - ring[sample % len(ring), 2])
         time = self._live.before(back)
         return sample if time is None else time

@@ -1,4 +1,4 @@
-"""The leaves of a bank as they stand: the mixture that control works with, and what is still undecided."""
+"""The present leaves of a bank: the mixture that a controller uses, and the undecided events."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
+from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 from driftfit.trackers.bank.leaves.factored import product
 from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gaps.gap import SINCE
-from driftfit.trackers.bank.machine.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 
 if TYPE_CHECKING:
     from driftfit.trackers.bank.bank import Bank
 
 
 class Mixture(NamedTuple):
-    """The leaves after a sample: what control works with."""
+    """The leaves after a sample, for use in control."""
 
     weights: Array
     """(L,), summing to 1."""
@@ -28,7 +28,7 @@ class Mixture(NamedTuple):
     covs: Array
     """(L, n, n)"""
     ages: Array
-    """(L,): samples since the last change of each leaf; inf where there was none (of merged leaves, the heaviest's)."""
+    """(L,): samples since the last change of each leaf; inf if there was none (for merged leaves, the largest's)."""
 
     @property
     def mean(self) -> Array:
@@ -43,11 +43,11 @@ class Mixture(NamedTuple):
 
 
 def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
-    """The leaves in the fields of one lane; before the bank has begun, its one filter."""
+    """The leaves in the fields of one lane; before the tree starts, the single filter."""
     n = len(lane["theta"])
-    if lane["many"][SETTLED] != 1:
+    if lane["counters"][SETTLED] != 1:
         return Mixture(np.ones(1), lane["theta"][None].copy(), tracker.cov(lane)[None], np.full(1, np.inf))
-    B = tracker.array(place.model, lane, "B")[:, : lane["many"][LEAVES]]
+    B = tracker.array(place.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     i, j = np.tril_indices(n)
     C = B[FIRST + n : FIRST + n + len(i)]
     if tracker.form == "sqrt":
@@ -57,15 +57,16 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
         covs[:, i, j] = covs[:, j, i] = C.T
     gap = tracker.array(place.model, lane, "gap")
     since = gap[1:, gap.shape[1] - WIDTH + SINCE]
-    if since.any():  # what else may have happened since the last used sample
+    if since.any():  # further events that are possible since the last used sample
         more = np.zeros((n, n))
         more[i, j] = more[j, i] = since @ gap[1:, : len(i)]
         covs = covs + more
     path = tracker.array(place.model, lane, "path")
-    if len(path) and lane["many"][OPEN] > 0:
-        last = tracker.array(place.model, lane, "links")[1, : B.shape[1]]  # events before the gap
+    if len(path) and lane["counters"][OPEN] > 0:
+        last = tracker.array(place.model, lane, "event")[0, : B.shape[1]]  # events before the gap
         more = np.zeros((B.shape[1], n, n))
-        more[:, i, j] = more[:, j, i] = path[-1 - tracker._count :][last, : len(i)]
+        H = len(tracker.all_changes) * len(tracker.all_sensors)
+        more[:, i, j] = more[:, j, i] = path[-1 - H :][last, : len(i)]
         covs = covs + more
     if lane["unknown"]:
         covs *= (B[S] / (B[NU] - 2.0))[:, None, None]
@@ -75,12 +76,12 @@ def mixture_of(tracker: Bank, place: Any, lane: Any) -> Mixture:
 
 
 def undecided(tracker: Bank, place: Any, lane: Any, loss: Array) -> list[tuple[int, int, float]]:
-    """(sample, event, probability) of the events held, decided one after the other from the leaves at the end."""
-    held, H = int(lane["many"][HELD]), len(loss)
-    if lane["many"][SETTLED] != 1 or held == 0:
+    """(sample, event, probability) of the open events, decided one after the other from the leaves at the end."""
+    held, H = int(lane["counters"][HELD]), len(loss)
+    if lane["counters"][SETTLED] != 1 or held == 0:
         return []
-    L = int(lane["many"][LEAVES])
-    B, group, stamps = (tracker.array(place.model, lane, name) for name in ("B", "group", "stamps"))
+    L = int(lane["counters"][LEAVES])
+    B, group, stamps = (tracker.array(place.model, lane, name) for name in ("leaves", "group", "stamps"))
     here = group[0, :L] >= 0
     codes, w = B[CODE, :L][here].astype(int), B[WEIGHT, :L][here]
     found = []

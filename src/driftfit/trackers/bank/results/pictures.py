@@ -1,4 +1,4 @@
-"""Pictures of hypotheses: probabilities stacked under the parameters, events marked; the tree as it stands."""
+"""Plots of hypotheses: probabilities stacked below the parameters, with events marked; the present tree."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
 from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
+from driftfit.trackers.bank.layout import LEAVES
 from driftfit.trackers.bank.leaves.leaves import CODE, WEIGHT
-from driftfit.trackers.bank.machine.layout import LEAVES
 from driftfit.trackers.bank.reduction import GPB, Decide
 from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.mixture import mixture_of
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8c6d46", "#5fb5c4")
-"""Of events, the ordinary course first."""
+"""Colours of events, the normal course first."""
 
 
 def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: list[Event], level: float) -> Figure:
@@ -46,7 +46,7 @@ def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: l
 
 
 def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
-    """Probabilities of events, one upon the other; the ordinary course below."""
+    """Probabilities of events, stacked, with the normal course at the bottom."""
     colours = [COLOURS[k % len(COLOURS)] for k in range(len(names))]
     axis.stackplot(time, p.T, labels=names, colors=colours, step="mid", linewidth=0)
     axis.set_ylim(0.0, 1.0)
@@ -57,14 +57,14 @@ def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
 def plot_tree(live: Live, floors: int = 3) -> Figure:
     """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
 
-    The newest floors are drawn, oldest to the left; each leaf is labelled with its weight and its mean.
+    The newest levels are drawn, with the oldest on the left; each leaf is labelled with its weight and its mean.
     """
     bank: Any = live.tracker
     lane = live.lane()
     if not isinstance(getattr(bank, "reduction", None), Decide | GPB):
         raise ValueError("plot_tree: a tree has codes of its histories under Decide and GPB only.")
     H = len(bank.event_names)
-    B = bank.array(live.model, lane, "B")[:, : lane["many"][LEAVES]]
+    B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     means = mixture_of(bank, live, lane).means
     depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))

@@ -1,7 +1,7 @@
-"""What a bank of hypotheses tells beside parameters: probabilities, evidence, alarms, events, the mixture.
+"""Results of a bank of hypotheses besides parameters: probabilities, evidence, alarms, events, the mixture.
 
-Everything is causal unless it says otherwise: what stands in row t is what was known after sample t. Where events were
-decided, probabilities are conditional on the decisions.
+Everything is causal unless stated otherwise: row t contains what was known after sample t. Once events were decided,
+probabilities are conditional on the decisions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.machine.layout import IMPOSSIBLE
+from driftfit.trackers.bank.layout import IMPOSSIBLE
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.trackers.bank.results import dates
 from driftfit.trackers.bank.results.decided_path import EventSmoothed, measurements, steps_of
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Alarm(NamedTuple):
-    """A window alarm: the threshold of the probability, and the samples at which it went on."""
+    """A window alarm: the threshold of the probability, and the samples at which it began."""
 
     threshold: float
     at: Array
@@ -47,30 +47,30 @@ class Decision(NamedTuple):
     event: int
     """Joint event."""
     prob: float
-    """Its probability then."""
+    """Its probability at that time."""
 
 
 class Hypotheses:
-    """What a run of a `Bank` says of events; `Track.hypotheses` makes it.
+    """The events of a run of a `Bank`; `Track.hypotheses` makes it.
 
     Attributes
     ----------
     names : tuple of str
         Names of the joint events (change, sensor), H of them.
     lags : tuple of int
-        Floors back that are told of: all W that the reduction remembers, or where these are more than eight the
-        newest seven and the oldest.
+        Levels of the tree, counted back, whose probabilities are reported: all W that the reduction remembers, or, if
+        these are more than eight, the newest seven and the oldest.
     lag_prob : (T, len(lags), H)
-        lag_prob[t, k] are the probabilities of the events lags[k] floors before t, given the data up to t; NaN before
+        lag_prob[t, k] are the probabilities of the events lags[k] levels before t, given the data up to t; NaN before
         the first event.
     window : (T,)
-        Probability of at least one change in the newest W floors.
+        Probability of at least one change in the newest W levels.
     evidence : (T,)
-        Log density of each sample given those before it.
+        Log density of each sample given earlier ones.
     leaves : (T,)
         Leaves after growth.
     kept : (T,)
-        Weight of the leaves that went on from the sample before; what is missing to 1 was dropped.
+        Weight of the leaves that were kept from the previous sample; the remainder to 1 was dropped.
     """
 
     def __init__(self, run: Track) -> None:
@@ -99,9 +99,9 @@ class Hypotheses:
         return np.asarray(p)
 
     def prob(self, lag: int = 0) -> Array:
-        """(T, H): probabilities of the events at the samples themselves, seen from ``lag`` floors later.
+        """(T, H): probabilities of the events at the samples themselves, given ``lag`` further levels of the tree.
 
-        Row t is of the event first visible in sample t; NaN at the end, where the later samples are not there yet.
+        Row t belongs to the event first visible in sample t; NaN at the end, where later samples are missing.
         """
         if lag not in self.lags:
             said = ", ".join(str(k) for k in self.lags)
@@ -117,12 +117,12 @@ class Hypotheses:
 
     @property
     def change_prob(self) -> Array:
-        """(T,): probability of a change at each sample, from as many later samples as the bank remembers."""
+        """(T,): probability of a change at each sample, given as many later samples as the bank remembers."""
         return np.asarray(1.0 - self.latest[:, : self.sensors].sum(axis=1))
 
     @cached_property
     def latest(self) -> Array:
-        """(T, H): probabilities of the event of each sample, seen from as late as the bank remembers."""
+        """(T, H): probabilities of the event of each sample, given as many later samples as the bank remembers."""
         p, oldest = self.prob(self.lags[-1]), self.lags[-1]
         now = self.tracker.array(self.run.model, self.run.state, "lag_prob")
         for k in range(min(oldest, len(p))):
@@ -139,7 +139,7 @@ class Hypotheses:
 
     @property
     def log_evidence(self) -> float:
-        """Their sum: the log density of the record, under the approximations made."""
+        """The sum of the evidence: the log density of the record, under the approximations made."""
         return float(self.evidence.sum())
 
     @property
@@ -152,12 +152,12 @@ class Hypotheses:
 
     @property
     def impossible(self) -> int:
-        """Samples that no leaf allowed; they were not used."""
-        return int(self.run.state["many"][IMPOSSIBLE])
+        """Number of samples that no leaf allowed; they were not used."""
+        return int(self.run.state["counters"][IMPOSSIBLE])
 
     @cached_property
     def decisions(self) -> list[Decision]:
-        """Decided events, in order; empty for reductions that decide nothing."""
+        """Decided events, in order; empty for reductions that do not decide."""
         found = self._told("decided")
         return [
             Decision(int(t - found[t, k, 1]), int(t), int(found[t, k, 0]), float(found[t, k, 2]))
@@ -165,9 +165,9 @@ class Hypotheses:
         ]
 
     def finish(self) -> list[Decision]:
-        """What `Decide` would decide of the events still held, the oldest first, each given those before it.
+        """What `Decide` would decide about the open events, the oldest first, each given those before it.
 
-        Also where the record is shorter than the depth; empty for reductions that decide nothing.
+        It also works if the record is shorter than the depth; empty for reductions that do not decide.
         """
         reduce = self.tracker.reduction
         if not isinstance(reduce, Decide) or not len(self.run):
@@ -182,10 +182,10 @@ class Hypotheses:
         return EventSmoothed(self.run, self.dated(threshold))
 
     def events(self, threshold: float = 0.5) -> list[Event]:
-        """Changes and sensor faults whose probability exceeds the threshold, in order of time.
+        """Changes and sensor faults whose probability exceeds the threshold, sorted by time.
 
-        How far parameters moved at a change is said with the record's whole future in sight, by `smooth`; where a
-        change forgets or resets there is nothing to smooth, and it is not said.
+        The change of each parameter is estimated by `smooth` from the whole record. If a change forgets or resets,
+        there is nothing to smooth, and it is not given.
         """
         found = self.dated(threshold)
         if not any(event.kind == "change" for event in found) or any(c.forgets for c in self.tracker.all_changes):
@@ -194,7 +194,7 @@ class Hypotheses:
         return [event.measured(smoothed) if event.kind == "change" and event.span.date else event for event in found]
 
     def dated(self, threshold: float = 0.5) -> list[Event]:
-        """`found`, with the dates of changes from all samples around them (`driftfit.trackers.bank.results.dates`)."""
+        """`found`, with the dates of changes estimated from all samples around them (module ``dates``)."""
         found = self.found(threshold)
         if not any(event.kind == "change" for event in found):
             return found
@@ -203,7 +203,7 @@ class Hypotheses:
         return self._timed(dates.dated(found, measured, jumps))
 
     def found(self, threshold: float = 0.5) -> list[Event]:
-        """`events` as they were known when they were found: with the dates that the leaves say, and no shifts."""
+        """`events` as they were known when they were found: with the dates of the leaves, and without shifts."""
         bank = self.tracker
         told = Told(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
@@ -212,7 +212,7 @@ class Hypotheses:
         return self._timed(found)
 
     def _early(self, event: Event, threshold: float) -> Event:
-        """A fault may have been known sooner than when it was remembered for the last time."""
+        """A fault may have been detected earlier than the last sample at which it was remembered."""
         if event.kind == "change":
             return event
         j, date = self.tracker.sensor_names.index(event.name), event.span.date
@@ -222,12 +222,12 @@ class Hypotheses:
         return event
 
     def _timed(self, events: list[Event]) -> list[Event]:
-        """With times, where the record has some."""
+        """The events with times, if the record has them."""
         time = self.run.time
         return [event.timed(lambda sample: time[sample]) for event in events]
 
     def table(self, threshold: float = 0.5) -> Any:
-        """`events` as a polars table: for every parameter how far it moved, with its standard error."""
+        """`events` as a polars table, with the change of every parameter and its standard error."""
         import polars as pl
 
         names = self.run.names
@@ -237,9 +237,9 @@ class Hypotheses:
     def alarm(self, threshold: float | None = None, rate: float | None = None, reference: Track | None = None) -> Alarm:
         """Alarm while the window probability exceeds a threshold.
 
-        Give the threshold, or the rate of false alarms per sample that is allowed. With ``reference``, a run of the
-        same bank over a record without changes, the threshold is the least that alarms there no more often; without
-        one it is the least at which the bank itself expects no more, sum (1 - p) over its alarms.
+        Give the threshold, or the allowed rate of false alarms per sample. With ``reference``, a run of the same bank
+        over a record without changes, the threshold is the smallest one with at most that rate there. Without one it is
+        the smallest one at which the bank itself expects at most that rate, sum (1 - p) over its alarms.
         """
         if (threshold is None) == (rate is None):
             raise ValueError("alarm: give either threshold= or rate= (false alarms per sample).")
@@ -264,10 +264,10 @@ class Hypotheses:
         return mixture_of(self.tracker, self.run, lane)
 
     def plot(self, threshold: float = 0.5, level: float = 0.95) -> Figure:
-        """Parameters with bands, probabilities of events stacked under them, events marked."""
+        """Parameters with bands, the probabilities of events stacked below them, events marked."""
         return plot_hypotheses(self.run, self.latest, self.names, self.found(threshold), level)
 
 
 def onsets(on: Array) -> Array:
-    """Where a condition begins to hold."""
+    """Samples at which a condition begins to hold."""
     return np.flatnonzero(on & ~np.r_[False, on[:-1]])

@@ -1,4 +1,4 @@
-"""K random-walk filters side by side: what each does with a sample, and what they say together.
+"""K random-walk filters in parallel: the update of each by a sample, and their mixture.
 
     e_k = y - x' m_k,     g_k = C_k x,     h_k = x' g_k,     s_kj = h_k + v_j
     p_kj  proportional to c_k nu_j N(e_k; 0, s_kj),
@@ -6,16 +6,16 @@
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
 with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
-levels. An outlier's level is as wide as the innovation where that is more than it would be: however far off, its
-influence does not grow. The filters stand in the coordinates z = M theta of their start, in which the regressor is x
-(`driftfit.trackers.parts.coordinates`): any units, any offset, and directions that nothing is known of yet. A regressor
-that enters one of those is taken in by all filters, and says nothing about which one is right.
+levels. An outlier's level is as wide as the innovation if that is larger than the level itself: its influence does not
+grow with its distance. The filters use the coordinates z = M theta of their start, in which the regressor is x
+(`driftfit.trackers.parts.coordinates`): any units, any offset, and directions without information. A regressor
+in such a direction is used by all filters, and does not change their probabilities.
 
-The log density of a sample given those before it is that of the mixture as it was predicted,
+The log density of a sample given earlier ones is that of the predicted mixture,
 
     log sum_k c_k (sum_{j<J} nu_j N(e_k; 0, s_kj) + nu_J Cauchy(e_k; s_kJ^(1/2)))
 
-The Cauchy distribution stands for an outlier, since the level that fits each one best has no density that integrates
+The Cauchy distribution represents an outlier, since the level that fits each one best has no density that integrates
 to 1. Cost per sample: O(K n^2 + K J) for K filters and J levels, and O(K n^3 / 6) for the drift.
 """
 
@@ -110,19 +110,22 @@ def likelihoods(s: State, l: int) -> float:
 
 @kernel
 def predictive_density(s: State, nearest: float, l: int) -> None:
-    """The log density of the sample as it was predicted: without a leap, and with a tail that integrates to 1."""
+    """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
+    repeat, and with a tail that integrates to 1."""
     K, J = s.mu.shape[0], s.nu.shape[0]
-    factor, more = s.noise[l] * s.leverage[l], lasting(s, l)
-    leapt = s.rare[l] < 1.0
+    factor = s.noise[l] * s.leverage[l]
+    leapt, again = s.rare[l] < 1.0, lasting(s, l) > 0.0
     ordinary, outlier = 0.0, 0.0
     for j in range(J - 1):
+        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
         for k in range(K):
-            ordinary += s.joint[j, k, l] if k != TOP or not leapt else 0.0
-        if leapt:
-            v = s.h[TOP, l] - s.gained[l] + factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
-            far = s.e_k[TOP, l] * s.e_k[TOP, l] / v - nearest
-            ordinary += s.prior[TOP, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
-    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l]) + more
+            if again or (leapt and k == TOP):
+                v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+                far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
+                ordinary += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
+            else:
+                ordinary += s.joint[j, k, l]
+    noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
     for k in range(K):
         v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
         outlier += s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])

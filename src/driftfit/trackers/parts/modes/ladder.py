@@ -4,16 +4,16 @@
     m_j = sum_i (mu_i T_ij / c_j) m_i
     C_j = sum_i (mu_i T_ij / c_j) (C_i + (m_i - m_j)(m_i - m_j)')
 
-T moves one rung up or down, and from every rung straight to the top, which is how a jump is caught. It never leads from
-the top straight back to the bottom: mixing the wide covariance of the top filter into the filter without drift costs
-more than all else when nothing moves (measured: 1.8 times the error of least squares instead of 1.15).
+T moves one rung up or down, and from every rung directly to the top, which is how a jump is detected. It never leads
+from the top directly to the bottom: mixing the wide covariance of the top filter into the filter without drift costs
+more than anything else when nothing changes (measured: 1.8 times the error of least squares instead of 1.15).
 
-The top filter may also *leap*: where a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
+The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
 deviations of the output (times patience, `driftfit.trackers.parts.disproportion`), explains the sample better by more
 than a factor 1 / RARE, its covariance grows by that move.
 
 Source: Blom and Bar-Shalom (1988); the ladder and its transitions are ours. Cost per sample: O(K^2 n^2) for K modes,
-vectorised over the modes that receive.
+vectorised over the destination modes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LEAP, RARE = 3.0, 0.02
 
 
 def ladders(n: int, groups: Any) -> tuple[Array, Array]:
-    """Ratios (n, K) and transitions (K, K): one ladder that all parameters climb, and one more for every group."""
+    """Ratios (n, K) and transitions (K, K): one ladder for all parameters, and one more for every group."""
     masks = [np.ones(n), *(np.isin(np.arange(n), group).astype(float) for group in groups or ())]
     ratios = [np.zeros(n)] + [rung * mask for mask in masks for rung in LADDER[1:]]
     K, rungs = len(ratios), len(LADDER) - 1
@@ -76,7 +76,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
 
 @kernel
 def mix(s: State, l: int) -> None:
-    """Interaction: every filter goes on from the mixture of those that may lead to it, mu to the next sample's."""
+    """Interaction: every filter continues from the mixture of its predecessors; mu becomes that of the next sample."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     for j in range(K):
         s.prior[j, l] = 0.0
@@ -111,7 +111,7 @@ def mix(s: State, l: int) -> None:
 
 @kernel
 def leap(s: State, l: int, noise: float) -> None:
-    """Let the top filter explain the innovation by a move as large as it takes, where that is the likelier."""
+    """Let the top filter explain the innovation by a move of any necessary size, if that is more likely."""
     most = LEAP * s.patience[l]
     square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):

@@ -1,13 +1,13 @@
-"""The random walk that the adaptive filters come to believe in, once the whole record is known.
+"""The random walk that the adaptive filters have estimated, given the whole record.
 
     w_t(i) = f_t(i) sum_j T_ij w_{t+1}(j) / sum_h f_t(h) T_hj         probability of mode i at t, given all samples
     q_t    = sum_k w_t(k) q_tk,    1 / r_t = (1 - o_t) / sum_j w_t(j) v_tj + o_t / max(f_J r, e_t^2)
 
-with f_t the probabilities after sample t and T their transitions, of drift modes and, likewise, of noise levels v_tj,
-and o_t the probability that sample t was an outlier. A smoother of that walk (`driftfit.smooth.exact`) gives theta
-from all samples, with drift and noise as they turned out to be. Before the filters start nothing drifts.
+with f_t the probabilities after sample t and T their transitions, for drift modes and likewise for noise levels v_tj,
+and o_t the probability that sample t was an outlier. A smoother of that random walk (`driftfit.smooth.exact`) estimates
+theta from all samples, with the averaged drift and noise. Before the filters start nothing drifts.
 
-Source: the backward pass is Kim's (1994), eq. 2.20; to smooth one walk given its result, in the place of one for each
+Source: the backward pass is Kim's (1994), eq. 2.20; smoothing one random walk given its result, instead of one for each
 mode, is ours.
 """
 

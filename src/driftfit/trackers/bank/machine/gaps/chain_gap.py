@@ -25,10 +25,11 @@ that ends the gap.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
+from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
 from driftfit.trackers.bank.leaves.leaves import FIRST, LOG, WEIGHT, variance_factor
-from driftfit.trackers.bank.machine.layout import OPEN, TAKEN
 
 SURE = 1e-12
 """A course less likely than this is left out."""
@@ -43,26 +44,6 @@ def further(dt: float) -> int:
 
 
 @shared
-def go_on(
-    path: Array, many: Array, P: Array, row: Array, alike: bool, Hm: int, dt: float, used: bool, Q: Array, X: Array
-) -> None:  # fmt: skip
-    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
-
-    A sample that is refused after all comes here twice.
-    """
-    if many[OPEN] == 0 and many[TAKEN] == 0:
-        open_gap(path, len(row))
-    steps = further(dt) + 1 if dt > 0.0 else 0
-    share = 1.0 / max(steps, 1)
-    for _ in range(steps - many[TAKEN] - (1 if used and steps > 0 else 0)):
-        lengthen(path, P, row, alike, Hm, Q, share, X)
-    many[TAKEN] = steps - 1 if used and steps > 0 else 0
-    for c in range(len(Q)):
-        for k in range(Q.shape[1]):
-            Q[c, k] *= share if used else 0.0
-
-
-@shared
 def open_gap(path: Array, H: int) -> None:
     """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare, whose last entry
     says how many leaves there is room for.
@@ -73,21 +54,20 @@ def open_gap(path: Array, H: int) -> None:
 
 
 @shared
-def step(P: Array, row: Array, alike: bool, e: int, to: int) -> float:
-    """p(next event is ``to`` | e): a row for all where they are ``alike``."""
-    return row[to] if alike else P[e, to]  # type: ignore[no-any-return]
+def step(t: Any, e: int, to: int) -> float:
+    """p(next event is ``to`` | e): one row for all where they are alike."""
+    return t.row[to] if t.counters[ALIKE] > 0 else t.chain[e, to]  # type: ignore[no-any-return]
 
 
 @shared
-def lengthen(path: Array, P: Array, row: Array, alike: bool, Hm: int, Q: Array, share: float, X: Array) -> None:
+def lengthen(t: Any, share: float) -> None:
     """One more sample of which nothing is known, in which change c adds ``share`` of Q[c]."""
-    H = len(row)
-    Hd = H // Hm
+    path, Q, X, H, Hd, Hm = t.path, t.Q, t.scratch, len(t.row), len(t.walks), len(t.sensors)
     for s in range(H):
         for e in range(H):
             total, same = 0.0, 0.0
             for last in range(H):
-                p = step(P, row, alike, last, e)
+                p = step(t, last, e)
                 total += path[s, last] * p
                 same += path[H + s, last] * p if last // Hm == e // Hm or path[2 * H, path.shape[1] - 1] == 0.0 else 0.0
             X[0, e], X[1, e] = total, same
@@ -106,26 +86,45 @@ def lengthen(path: Array, P: Array, row: Array, alike: bool, Hm: int, Q: Array, 
 
 
 @shared
-def add_variance(h: Array, L: int, n: int, na: int, Z: Array, path: Array, H: int, Hd: int, event: Array) -> None:
+def go_on(t: Any, dt: float, used: bool) -> None:
+    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
+
+    A sample that is refused after all comes here twice.
+    """
+    counters, Q = t.counters, t.Q
+    if counters[OPEN] == 0 and counters[TAKEN] == 0:
+        open_gap(t.path, len(t.row))
+    steps = further(dt) + 1 if dt > 0.0 else 0
+    share = 1.0 / max(steps, 1)
+    for _ in range(steps - counters[TAKEN] - (1 if used and steps > 0 else 0)):
+        lengthen(t, share)
+    counters[TAKEN] = steps - 1 if used and steps > 0 else 0
+    for c in range(len(t.walks)):
+        for k in range(Q.shape[1]):
+            Q[c, k] *= share if used else 0.0
+
+
+@shared
+def add_variance(t: Any, L: int) -> None:
     """h <- h + z' mean[s] z, for leaves whose last events are s."""
+    h, z, path, first = t.expected[0], t.z, t.path, 2 * len(t.row) + len(t.walks)
     for l in range(L):
-        k, at, row = l if na > 0 else 0, 0, 2 * H + Hd + event[l]
-        for i in range(n):
+        k, at, row = l if t.output_lags > 0 else 0, 0, first + t.event[l]
+        for i in range(t.n):
             for j in range(i + 1):
-                h[l] += (1.0 if i == j else 2.0) * Z[i, k] * Z[j, k] * path[row, at]
+                h[l] += (1.0 if i == j else 2.0) * z[i, k] * z[j, k] * path[row, at]
                 at += 1
 
 
 @shared
-def add_covariance(
-    P: Array, B: Array, L: int, unknown: bool, path: Array, H: int, Hd: int, event: Array, X: Array
-) -> None:  # fmt: skip
+def add_covariance(t: Any, L: int) -> None:
     """The covariance of the mixture with what the gap adds on average."""
-    variance_factor(B, L, unknown, X, 0)
+    P, B, X, path, H, Hd = t.cov, t.leaves, t.scratch, t.path, len(t.row), len(t.walks)
+    variance_factor(t, X, 0, L)
     for s in range(H):
         weight, at = 0.0, 0
         for l in range(L):
-            weight += B[WEIGHT, l] * X[0, l] if event[l] == s else 0.0
+            weight += B[WEIGHT, l] * X[0, l] if t.event[l] == s else 0.0
         if weight > 0.0:
             for i in range(len(P)):
                 for j in range(i + 1):
@@ -134,21 +133,22 @@ def add_covariance(
 
 
 @shared
-def widen_leaf(A: Array, n: int, k: int, q: Array, X: Array) -> None:
-    """C + q of one leaf, q being a lower triangle; X is spare."""
-    for i in range(n * (n + 1) // 2):
-        A[FIRST + n + i, k] += q[i]
+def widen_leaf(t: Any, k: int, q: Array) -> None:
+    """C + q of one parent, q being a lower triangle."""
+    for i in range(t.n * (t.n + 1) // 2):
+        t.parents[FIRST + t.n + i, k] += q[i]
 
 
 @shared
-def origins(B: Array, L: int, group: Array, K: int, event: Array, origin: Array) -> None:
-    """origin[s, k]: share of the weight of group k that had s as its last event before the gap."""
+def origins(t: Any, L: int, K: int) -> None:
+    """prior[s, k]: share of the weight of group k that had s as its last event before the gap."""
+    group, event, origin = t.group, t.event, t.prior
     for s in range(len(origin)):
         for k in range(K):
             origin[s, k] = 0.0
     for l in range(L):
         if group[l] >= 0:
-            origin[event[l], group[l]] += B[WEIGHT, l]
+            origin[event[l], group[l]] += t.leaves[WEIGHT, l]
     for k in range(K):
         total = 0.0
         for s in range(len(origin)):
@@ -158,76 +158,15 @@ def origins(B: Array, L: int, group: Array, K: int, event: Array, origin: Array)
 
 
 @shared
-def split(
-    A: Array, K: int, T: Array, floors: int, n: int, Hm: int, path: Array, P: Array, row: Array, alike: bool,
-    standing: bool, prior: Array, X: Array,
-) -> int:  # fmt: skip
-    """The leaves of A twice; returns how many there are now.
-
-    ``prior`` has for every leaf the shares of the events before the gap, and takes those of the floor to come. T tells
-    of the last ``floors`` floors of the gap.
-    """
-    H, last, wide, count = len(row), len(path) - 1, path.shape[1] - 1, K
-    Hd, room = H // Hm, int(path[last, wide])
-    reach, stay, q = X[0], X[1], path[last]
-    for k in range(K):
-        for e in range(H):
-            reach[e], stay[e] = 0.0, 0.0
-            for s in range(H):
-                reach[e] += prior[s, k] * path[s, e]
-                stay[e] += prior[s, k] * path[H + s, e]
-        best, kappa = 0, -1.0
-        for c in range(Hd):
-            mass = 0.0
-            for e in range(c * Hm, (c + 1) * Hm):
-                mass += stay[e]
-            best, kappa = (c, mass) if mass > kappa else (best, kappa)
-        rest = 1.0 - kappa
-        both = rest > SURE and kappa > SURE and count < room
-        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
-        for i in range(wide):
-            mean = 0.0
-            for s in range(H):
-                mean += prior[s, k] * path[2 * H + Hd + s, i]
-            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
-        for e in range(H):
-            own = stay[e] if e // Hm == best else 0.0
-            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
-            stay[e] = own / kappa if kappa > 0.0 else 0.0
-        if both:
-            for i in range(len(A)):
-                A[i, count] = A[i, k]
-            for i in range(T.shape[1]):
-                T[count, i] = T[k, i]
-            A[LOG, count] += math.log(rest)
-            widen_leaf(A, n, count, q, X[2:])
-            remember_other(T, count, floors, H, Hm, best, kappa)
-            remember_one(T, k, floors, H, Hm, best)
-            next_event(P, row, alike, standing, Hm, reach, prior, count)
-            next_event(P, row, alike, standing, Hm, stay, prior, k)
-            A[LOG, k] += math.log(kappa)
-            for i in range(wide):
-                q[i] = path[2 * H + best, i]
-            widen_leaf(A, n, k, q, X[2:])
-            count += 1
-        else:
-            next_event(P, row, alike, standing, Hm, reach if rest > 0.0 else stay, prior, k)
-            widen_leaf(A, n, k, q, X[2:])
-    return count
-
-
-@shared
-def next_event(
-    P: Array, row: Array, alike: bool, standing: bool, Hm: int, p: Array, prior: Array, k: int
-) -> None:  # fmt: skip
+def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
     """The prior of the floor to come of a leaf whose last event has the probabilities p. Where no time passes
     (``standing``) nothing changes.
     """
-    H = len(row)
+    prior, H, Hm = t.prior, len(t.row), len(t.sensors)
     for e in range(H):
         prior[e, k] = 0.0
         for last in range(H):
-            prior[e, k] += p[last] * step(P, row, alike, last, e)
+            prior[e, k] += p[last] * step(t, last, e)
     if standing:
         for j in range(Hm):
             for e in range(Hm + j, H, Hm):
@@ -275,3 +214,59 @@ def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, ka
                 T[k, at + e] /= total
         if best == 0 and at >= (floors - 1) * block:
             T[k, at + H] = 0.0  # something changed
+
+
+@shared
+def split(t: Any, K: int) -> int:
+    """The parents twice; returns how many there are now.
+
+    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
+    """
+    A, T, path, prior = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history, t.path, t.prior
+    H, Hd, Hm, last, wide, count = len(t.row), len(t.walks), len(t.sensors), len(path) - 1, path.shape[1] - 1, K
+    room, floors, standing = int(path[last, wide]), t.counters[OPEN], t.sample[IN_DT] == 0.0
+    reach, stay, q = t.scratch[0], t.scratch[1], path[last]
+    for k in range(K):
+        for e in range(H):
+            reach[e], stay[e] = 0.0, 0.0
+            for s in range(H):
+                reach[e] += prior[s, k] * path[s, e]
+                stay[e] += prior[s, k] * path[H + s, e]
+        best, kappa = 0, -1.0
+        for c in range(Hd):
+            mass = 0.0
+            for e in range(c * Hm, (c + 1) * Hm):
+                mass += stay[e]
+            best, kappa = (c, mass) if mass > kappa else (best, kappa)
+        rest = 1.0 - kappa
+        both = rest > SURE and kappa > SURE and count < room
+        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
+        for i in range(wide):
+            mean = 0.0
+            for s in range(H):
+                mean += prior[s, k] * path[2 * H + Hd + s, i]
+            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
+        for e in range(H):
+            own = stay[e] if e // Hm == best else 0.0
+            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
+            stay[e] = own / kappa if kappa > 0.0 else 0.0
+        if both:
+            for i in range(len(A)):
+                A[i, count] = A[i, k]
+            for i in range(T.shape[1]):
+                T[count, i] = T[k, i]
+            A[LOG, count] += math.log(rest)
+            widen_leaf(t, count, q)
+            remember_other(T, count, floors, H, Hm, best, kappa)
+            remember_one(T, k, floors, H, Hm, best)
+            next_event(t, standing, reach, count)
+            next_event(t, standing, stay, k)
+            A[LOG, k] += math.log(kappa)
+            for i in range(wide):
+                q[i] = path[2 * H + best, i]
+            widen_leaf(t, k, q)
+            count += 1
+        else:
+            next_event(t, standing, reach if rest > 0.0 else stay, k)
+            widen_leaf(t, k, q)
+    return count

@@ -33,14 +33,14 @@ and in the first row how many changes follow the first of an interval on average
 
 
 @shared
-def odds(gap: Array, row: Array, Hm: int, dt: float, told: bool) -> None:
-    """The chances of this interval; those that were ``told`` are of the interval, whatever its length."""
+def odds(gap: Array, row: Array, Hm: int, dt: float, given: bool) -> None:
+    """The chances of this interval; those that the user has ``given`` are of the interval, whatever its length."""
     at = gap.shape[1] - WIDTH
     none, rest = 0.0, 0.0
     for e in range(len(row)):
         none, rest = (none + row[e], rest) if e < Hm else (none, rest + row[e])
     quiet, scale, more = none, 1.0, 0.0
-    if dt != 1.0 and not told and rest > 0.0:
+    if dt != 1.0 and not given and rest > 0.0:
         quiet = exp(dt * log(none)) if none > 0.0 else 0.0
         scale = (1.0 - quiet) / rest
         more = max(dt / scale - 1.0, 0.0) if scale > 0.0 else 0.0
@@ -126,7 +126,7 @@ def widen(gap: Array, unit: float, P: Array) -> None:
 
 @shared
 def take_back(T: Array, L: int, floors: int, gap: Array, H: int, Hm: int) -> None:
-    """The floors of a gap, whose changes are told of by the floor that ends it: they changed nothing themselves."""
+    """The floors of a gap, whose changes the floor that ends it stands for: they changed nothing themselves."""
     block, width = H + 1, T.shape[1]
     quiet = gap[0, gap.shape[1] - WIDTH + SINCE]
     for l in range(L):

@@ -13,11 +13,14 @@ used only while a decision is open.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
+from driftfit.trackers.bank.layout import CHAINED, LAST, R
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
+from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
 from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
 
 NODES = 33
@@ -40,26 +43,24 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 
 
 @shared
-def density_parts(
-    B: Array, L: int, top: float, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
-    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array,
-    mass: float, out: Array,
-) -> int:  # fmt: skip
-    """Components of the predictive density as columns of out: oldest event, weight, mean, standard deviation."""
-    n, Hm, count = len(phi), len(sensors), 0
+def density_parts(t: Any, L: int, top: float, mass: float, phi: Array) -> int:
+    """Components of the predictive density as columns: oldest event, weight, mean, standard deviation."""
+    B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
+    n, na, Hm, count, last, r = t.n, t.output_lags, len(t.sensors), 0, t.sample[LAST], t.sample[R]
+    P, same = t.chain, t.independent > 0 and t.counters[CHAINED] == 0
     lags = FIRST + n + n * (n + 1) // 2
     for l in range(L):
-        if group[l] < 0:
+        if t.group[l] < 0:
             continue
-        unit = B[S, l] / (B[NU, l] - 2.0) if unknown else 1.0
-        for c in range(len(Q)):
-            mean, wide = 0.0, width(B, l, n, na, phi, maps[c, 0], Q[c])
+        unit = B[S, l] / (B[NU, l] - 2.0) if t.unknown > 0 else 1.0
+        for c in range(len(t.walks)):
+            mean, wide = 0.0, width(B, l, n, na, phi, maps[c, KEEP], Q[c])
             for i in range(n):
                 z = B[lags + i, l] if i < na else phi[i]
-                mean += z * (theta0[i] if maps[c, 1] > 0.0 else B[FIRST + i, l])
+                mean += z * (theta0[i] if maps[c, RESET] > 0.0 else B[FIRST + i, l])
             for j in range(Hm):
                 e = c * Hm + j
-                chance = (row[e] if same else P[event[l], e]) * B[WEIGHT, l] / mass
+                chance = (P[0, e] if same else P[t.event[l], e]) * B[WEIGHT, l] / mass
                 frozen = sensors[j, FROZEN] > 0.0
                 if chance <= 0.0 or count >= out.shape[1] or (frozen and not abs(last) < np.inf):
                     continue
@@ -122,13 +123,8 @@ def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> 
 
 
 @shared
-def expected_risk(
-    B: Array, L: int, top: float, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array, theta0: Array,
-    sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array, group: Array, mass: float,
-    parts: Array, X: Array,
-) -> float:  # fmt: skip
-    """ER for the oldest event held; ``parts`` has 4 rows and then NODES for the nodes."""
-    count = density_parts(
-        B, L, top, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event, group, mass, parts
-    )
-    return float(integrate(parts, count, loss, X[0], parts[4:].reshape(NODES * parts.shape[1])))
+def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array) -> float:
+    """ER for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
+    components = t.components
+    nodes = components[4:].reshape(NODES * components.shape[1])
+    return float(integrate(components, density_parts(t, L, top, mass, phi), t.loss, t.scratch[2], nodes))

@@ -14,11 +14,13 @@ which keeps the expectations of 1/s2, log s2, theta/s2 and theta theta'/s2. A gr
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, part, shared
+from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
+from driftfit.trackers.bank.layout import FLIPPED, flip
 from driftfit.trackers.bank.leaves.lags import merge_covariance
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.trackers.bank.machine.ancestry import average
@@ -62,8 +64,9 @@ def freedom(t: float, start: float) -> float:
 
 
 @shared
-def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
-    """The covariance of column ``to`` of A, whose mean stands there already; X is spare."""
+def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
+    """The covariance of parent ``to``, whose mean stands there already: sum w (C_l + g_l d_l d_l'); X is spare."""
+    B, A, n, unknown = t.leaves, t.parents, t.n, t.unknown > 0
     for k in range(len(members)):
         l = members[k]
         pull = B[NU, l] / B[S, l] if unknown else 1.0
@@ -76,10 +79,11 @@ def pool(B: Array, members: Array, n: int, unknown: bool, share: Array, A: Array
 
 
 @shared
-def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array, A: Array, to: int, X: Array) -> None:
-    """Column ``to`` of A from the members, which have the given shares, summing to 1; X is spare."""
-    C, tri = FIRST + n, n * (n + 1) // 2
-    heaviest, g, t = 0, 0.0, 0.0
+def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
+    """Parent ``to`` from the members, which have the given shares, summing to 1; X is spare."""
+    B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
+    lags = FIRST + n + n * (n + 1) // 2
+    heaviest, g, s = 0, 0.0, 0.0
     for k in range(len(members)):
         heaviest = k if share[k] > share[heaviest] else heaviest
     best = members[heaviest]
@@ -87,22 +91,22 @@ def match(B: Array, members: Array, n: int, na: int, unknown: bool, share: Array
         A[row, to] = B[row, best]
     for row in range(FIRST, len(A)):
         A[row, to] = 0.0
-    for k in range(len(members)):
+    for k in range(len(members)):  # g = sum w g_l
         l = members[k]
         g += share[k] * (B[NU, l] / B[S, l] if unknown else 1.0)
-    for k in range(len(members)):
+    for k in range(len(members)):  # m = sum w g_l m_l / g
         l = members[k]
         pull = share[k] * (B[NU, l] / B[S, l] if unknown else 1.0) / g
         for i in range(n):
             A[FIRST + i, to] += pull * B[FIRST + i, l]
         for i in range(na):
-            A[C + tri + i, to] += share[k] * B[C + tri + i, l]
+            A[lags + i, to] += share[k] * B[lags + i, l]
         if unknown:
-            t += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
-    pool(B, members, n, unknown, share, A, to, X)
-    merge_covariance(B, members, n, na, share, A, to)
+            s += share[k] * (digamma(0.5 * B[NU, l]) - math.log(0.5 * B[S, l]))
+    pool(t, members, share, to, X)
+    merge_covariance(t, members, share, to)
     if unknown:
-        A[NU, to] = freedom(t - math.log(g), B[NU, best])
+        A[NU, to] = freedom(s - math.log(g), B[NU, best])
         A[S, to] = A[NU, to] / g
 
 
@@ -127,13 +131,10 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 
 
 @shared
-def combine(
-    B: Array, group: Array, L: int, G: int, n: int, na: int, unknown: bool, A: Array, start: Array, order: Array,
-    X: Array, T: Array, T2: Array,
-) -> float:  # fmt: skip
-    """A leaf in A, and a row of the table, for every group that `sort` put in order; T is that of the leaves. Returns
-    the mass that is left.
-    """
+def combine(t: Any, L: int, G: int) -> float:
+    """A parent, and its history, for every group that `sort` put in order; returns the mass that is left."""
+    A, B, start, order, X = t.parents, t.leaves, t.start, t.order, t.scratch
+    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     kept, share = 0.0, X[0]
     for k in range(G):
         members, part = order[start[k] : start[k + 1]], share[start[k] : start[k + 1]]
@@ -147,15 +148,17 @@ def combine(
             for row in range(len(A)):
                 A[row, k] = B[row, members[0]]
         else:
-            match(B, members, n, na, unknown, part, A, k, X[1:])
+            match(t, members, part, k, X[1:])
             A[LOG, k] = math.log(mass)
-        average(T, members, part, T2, k)
+        average(now, members, part, after, k)
+    flip(t)
     return kept
 
 
-@part
-def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array, A: Array) -> float:
-    """Leaves that are kept as they are, of which only the rows that are in use; returns their mass."""
+@shared
+def take(t: Any, G: int) -> float:
+    """Leaves that are kept as they are, in `order`, of which only the rows that are in use; returns their mass."""
+    A, B, order, bases, unknown = t.parents, t.leaves, t.order, t.bases, t.unknown > 0
     for k in range(0, G, WIDTH):
         for row in range(LOG, CODE):
             if unknown or row < NU:
@@ -165,7 +168,7 @@ def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array,
             if bases[i] > 1.0:
                 row = (CODE, SENSORS, CHANGES)[i]
                 store(A, row, k, gathered(B, row, order, k))
-        for row in range(FIRST, rows):
+        for row in range(FIRST, len(A)):
             store(A, row, k, gathered(B, row, order, k))
     kept = 0.0
     for k in range(G):
@@ -174,11 +177,12 @@ def take(B: Array, order: Array, G: int, rows: int, unknown: bool, bases: Array,
 
 
 @shared
-def mix(
-    B: Array, L: int, prior: Array, n: int, na: int, unknown: bool, A: Array, order: Array, X: Array, T: Array,
-    T2: Array,
-) -> int:  # fmt: skip
-    """Interaction: leaf e of A goes on from all leaves that may lead to event e; returns the number of events."""
+def mix(t: Any, L: int) -> int:
+    """Interaction (IMM), spec section 5: parent e goes on from all leaves that may lead to event e, with the weights
+    W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
+    """
+    A, B, prior, order, X = t.parents, t.leaves, t.prior, t.order, t.scratch
+    now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     H, share = len(prior), X[0]
     for e in range(H):
         mass, count = 0.0, 0
@@ -193,7 +197,8 @@ def mix(
             order[0], share[0], mass, count = 0, 1.0, 1.0, 1
         for k in range(count):
             share[k] /= mass
-        match(B, order[:count], n, na, unknown, share[:count], A, e, X[1:])
-        average(T, order[:count], share[:count], T2, e)
+        match(t, order[:count], share[:count], e, X[1:])
+        average(now, order[:count], share[:count], after, e)
         A[LOG, e] = math.log(possible) if possible > 0.0 else -np.inf
+    flip(t)
     return H

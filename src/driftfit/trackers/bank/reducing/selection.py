@@ -1,17 +1,20 @@
 """Which leaves go on, and which of them become one: a group for every leaf, -1 for those that are dropped.
 
-The plan is made when a sample has been taken in and carried out before the next one that can be used: a sample that is
-not used leaves the mixture as it is.
+Groups are chosen when a sample has been taken in, and carried out before the next one that can be used: a sample that
+is not used leaves the mixture as it is.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from driftfit.engine.kernel import Array, kernel, part, shared
+from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
+from driftfit.trackers.bank.layout import CLOCK, HELD
 from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
-from driftfit.trackers.bank.machine.lookahead import expected_risk
+from driftfit.trackers.bank.reducing.lookahead import expected_risk
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
@@ -52,10 +55,10 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
     return float(np.int64(low).view(np.float64))
 
 
-@part
+@shared
 def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. What follows in the row, up to the next eight, must be zero; ``ranks`` (1, count) is overwritten.
+    many. What follows in the row, up to the end of a SIMD vector, must be zero; ``ranks`` (1, count) is overwritten.
     """
     value, over, G = V[row], 0, 0
     if count <= FEW:
@@ -86,21 +89,21 @@ def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array,
 
 @kernel
 def clear(V: Array, row: int, count: int) -> None:
-    """Zeros after the first entries, up to the next eight."""
+    """Zeros after the first entries, up to the end of a SIMD vector."""
     for l in range(count, min(count + WIDTH, V.shape[1])):
         V[row, l] = 0.0
 
 
-@part
-def beam(B: Array, L: int, knobs: Array, group: Array, order: Array, X: Array) -> int:
+@shared
+def beam(t: Any, L: int) -> int:
     """The heaviest leaves."""
-    return int(heaviest(B, WEIGHT, L, int(knobs[LEAVES]), group, order, X[2:3]))
+    return int(heaviest(t.leaves, WEIGHT, L, int(t.reduction[LEAVES]), t.group, t.order, t.scratch[2:3]))
 
 
 @shared
-def merge(B: Array, L: int, group: Array, slots: Array) -> int:
+def merge(t: Any, L: int) -> int:
     """Leaves of one code become one; codes are numbered as they come."""
-    G = 0
+    B, group, slots, G = t.leaves, t.group, t.slots, 0
     for l in range(L):
         slots[int(B[CODE, l])] = -1
     for l in range(L):
@@ -115,19 +118,19 @@ def merge(B: Array, L: int, group: Array, slots: Array) -> int:
 
 
 @shared
-def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Array, order: Array, X: Array) -> int:
+def hybrid(t: Any, L: int) -> int:
     """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
-    cap, size = knobs[CAP], len(slots)
+    B, group, slots, X, bases = t.leaves, t.group, t.slots, t.scratch, t.bases
+    cap, M, size, G = t.reduction[CAP], int(t.reduction[LEAVES]), len(t.slots), 0
     mass, key, renumber = X[0], X[1], X[3]
     for k in range(size):
         slots[k] = -1
-    G = 0
     for l in range(L):
         group[l] = -1
         if B[WEIGHT, l] <= 0.0:
             continue
         mine = (B[CHANGES, l] * bases[1] + B[SENSORS, l]) * (cap + 1.0) + min(B[AGE, l], cap)
-        place = int(mine) * 2654435761 % size
+        place = int(mine) * 2654435761 % size  # a table of hashes with open addresses
         while slots[place] >= 0 and key[slots[place]] != mine:
             place = (place + 1) % size
         if slots[place] < 0:
@@ -135,68 +138,83 @@ def hybrid(B: Array, L: int, knobs: Array, bases: Array, group: Array, slots: Ar
             G += 1
         group[l] = slots[place]
         mass[slots[place]] += B[WEIGHT, l]
-    M = int(knobs[LEAVES])
     if G > M:
         for k in range(G):
             slots[k] = 0
         clear(X, 0, G)
-        G2 = heaviest(X, 0, G, M, slots, order, X[2:3])
+        kept = heaviest(X, 0, G, M, slots, t.order, X[2:3])
         for k in range(G):
             renumber[k] = slots[k]
         for l in range(L):
             group[l] = int(renumber[group[l]]) if group[l] >= 0 else -1
-        return int(G2)
+        return int(kept)
     return G
 
 
 @shared
-def decide(
-    B: Array, L: int, held: int, knobs: Array, loss: Array, P: Array, row: Array, same: bool, Q: Array, maps: Array,
-    theta0: Array, sensors: Array, phi: Array, last: float, r: float, unknown: bool, na: int, event: Array,
-    stamps: Array, now: float, decided: Array, parts: Array, group: Array, X: Array,
-) -> int:  # fmt: skip
-    """Resolve the oldest events while the rule says so; returns how many floors are still held.
+def oldest(t: Any, L: int, top: float, p: Array) -> float:
+    """The weights of the oldest events in p, whose digit in the codes counts ``top``; returns their sum."""
+    mass = 0.0
+    for e in range(len(t.loss)):
+        p[e] = 0.0
+    for l in range(L):
+        if t.group[l] >= 0:
+            p[int(t.leaves[CODE, l] // top)] += t.leaves[WEIGHT, l]
+            mass += t.leaves[WEIGHT, l]
+    return mass
 
-    A leaf that loses a decision has its weight set to 0. ``decided[k]`` is the event, how many samples ago it was first
-    visible, and its probability.
+
+@shared
+def least_risk(loss: Array, p: Array, mass: float, risk: Array) -> int:
+    """The event of least risk R_k = sum_e L[e, k] p_e among those with p_k > 0, the lowest on ties; p becomes p / mass,
+    and risk R.
     """
-    H = len(loss)
-    p, risk = X[0], X[1]
-    count = 0
+    best, H = -1, len(loss)
+    for k in range(H):
+        p[k] /= mass
+    for k in range(H):
+        risk[k] = 0.0
+        for e in range(H):
+            risk[k] += loss[e, k] * p[e]
+        if p[k] > 0.0 and (best < 0 or risk[k] < risk[best]):
+            best = k
+    return best
+
+
+@shared
+def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi: Array) -> bool:
+    """Whether the oldest event is decided now: at full depth, where its risk is small, or where waiting does not pay,
+    R* <= c + ER.
+    """
+    reduction = t.reduction
+    if held >= reduction[DEPTH]:
+        return True
+    if reduction[TAU] < 0.0:
+        return False
+    if risk <= reduction[TAU]:
+        return True
+    wait = reduction[WAIT]
+    return wait > 0.0 and (risk <= wait or risk <= wait + expected_risk(t, L, top, mass, phi))  # type: ignore[no-any-return]
+
+
+@shared
+def decide(t: Any, L: int, phi: Array) -> None:
+    """Resolve the oldest events while the rule says so, spec section 5.
+
+    A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
+    visible, and its probability. ``phi`` stands for the next regressor.
+    """
+    B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
+    p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0
     for l in range(L):
         group[l] = 0 if B[WEIGHT, l] > 0.0 else -1
     while held > 0:
         top = float(H) ** (held - 1)
-        mass = 0.0
-        for e in range(H):
-            p[e] = 0.0
-        for l in range(L):
-            if group[l] >= 0:
-                p[int(B[CODE, l] // top)] += B[WEIGHT, l]
-                mass += B[WEIGHT, l]
-        best = -1
-        for k in range(H):
-            p[k] /= mass
-        for k in range(H):
-            risk[k] = 0.0
-            for e in range(H):
-                risk[k] += loss[e, k] * p[e]
-            if p[k] > 0.0 and (best < 0 or risk[k] < risk[best]):
-                best = k
-        stop = held >= knobs[DEPTH]
-        if not stop and knobs[TAU] >= 0.0:
-            stop = risk[best] <= knobs[TAU]
-            if not stop and knobs[WAIT] > 0.0:
-                stop = risk[best] <= knobs[WAIT]
-                if not stop:
-                    later = expected_risk(
-                        B, L, top, loss, P, row, same, Q, maps, theta0, sensors, phi, last, r, unknown, na, event,
-                        group, mass, parts, X[2:],
-                    )  # fmt: skip
-                    stop = risk[best] <= knobs[WAIT] + later
-        if not stop:
+        mass = oldest(t, L, top, p)
+        best = least_risk(t.loss, p, mass, risk)
+        if not settled(t, L, held, risk[best], top, mass, phi):
             break
-        decided[count, 0], decided[count, 1], decided[count, 2] = best, now - stamps[0], p[best]
+        decided[count, 0], decided[count, 1], decided[count, 2] = best, float(t.counters[CLOCK]) - stamps[0], p[best]
         count += 1
         for k in range(held - 1):
             stamps[k] = stamps[k + 1]
@@ -207,7 +225,7 @@ def decide(
                 else:
                     group[l] = -1
         held -= 1
-    return held
+    t.counters[HELD] = held
 
 
 @shared

@@ -1,0 +1,99 @@
+"""First-floor approximation: the mixture over the oldest event becomes one density, and the tree is grown again.
+
+    C' = C + sum_i w_i Q_i,   w_i the prior p_i, or the posterior p(c_i | data)
+
+The components of the first floor share their mean, so with prior weights this is one Kalman filter with
+Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered again and so count twice; merging leaves
+(GPB) uses each once and is better. It is here to show that. One sensor, independent events.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from driftfit.engine.kernel import Array, shared
+from driftfit.trackers.bank.layout import FLIPPED
+from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
+from driftfit.trackers.bank.machine.grow import grow
+from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
+
+Y, NOISE, TIME = 0, 1, 2
+"""Columns of a stored sample before its regressor."""
+
+
+@shared
+def widen(t: Any, weight: Array, X: Array) -> None:
+    """C + sum w_i Q_i of the root; X is spare."""
+    root, n, Q = t.root, t.n, t.Q
+    for k in range(n * (n + 1) // 2):
+        for e in range(len(t.walks)):
+            root[FIRST + n + k, 0] += weight[e] * Q[e, k]
+
+
+@shared
+def floor(t: Any, K: int, sample: Array) -> int:
+    """One floor of the new tree, with a stored sample."""
+    return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))
+
+
+@shared
+def refilter(t: Any, L: int) -> int:
+    """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
+    among the parents.
+    """
+    A, B, Q, root, samples, prior, row = t.parents, t.leaves, t.Q, t.root, t.samples, t.prior, t.row
+    H, D, weight = len(row), int(t.reduction[DEPTH]), t.scratch[0]
+    top, by_prior = float(H) ** (D - 1), t.reduction[PRIOR] > 0.0
+    for e in range(H):
+        weight[e] = row[e] if by_prior else 0.0
+    if not by_prior:
+        for l in range(L):
+            weight[int(B[CODE, l] // top)] += B[WEIGHT, l]
+    increments(t, samples[0, TIME], samples[0, TIME])
+    ready(t)
+    widen(t, weight, t.scratch[1:])
+    for e in range(H):  # the change is in the root: the oldest sample is one of no change and no increment
+        prior[e, 0] = 0.0
+        for k in range(Q.shape[1]):
+            Q[e, k] = 0.0
+    prior[0, 0] = 1.0
+    for k in range(len(root)):
+        A[k, 0] = root[k, 0]
+    A[LOG, 0] = 0.0
+    L = min(D, 1)
+    floor(t, L, samples[0])
+    for k in range(len(root)):
+        root[k, 0] = A[k, 0] = B[k, 0]
+    root[LOG, 0] = A[LOG, 0] = A[CODE, 0] = 0.0
+    for at in range(1, D):
+        for e in range(H):
+            for l in range(L):
+                prior[e, l] = row[e]
+        increments(t, samples[at, TIME], samples[at, TIME])
+        ready(t)
+        L = floor(t, L, samples[at])
+        normalise(B, L)
+        for k in range(len(root)):
+            for l in range(L):
+                A[k, l] = B[k, l]
+    for at in range(1, D):
+        for k in range(samples.shape[1]):
+            samples[at - 1, k] = samples[at, k]
+    return L
+
+
+@shared
+def histories(t: Any, L: int) -> None:
+    """The histories of the new tree: what happened in the D - 1 floors that it has."""
+    A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
+    T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    block, width = H + 1, T.shape[1]
+    for l in range(L):
+        for at in range(width):
+            T[l, at] = 0.0
+        code, quiet = int(A[CODE, l]), 1.0
+        for k in range(min(D - 1, width // block)):
+            e = code % H
+            code //= H
+            quiet *= 1.0 if e < Hm else 0.0
+            T[l, k * block + e], T[l, k * block + H] = 1.0, quiet

@@ -1,0 +1,102 @@
+"""No function is so long, or takes so much one by one, that nobody reads it: computed from the source."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import driftfit
+
+HOME = Path(driftfit.__file__).parent
+LINES, ARGUMENTS = 60, 8
+SOURCES = sorted(HOME.rglob("*.py"))
+KNOWN = {
+    "engine/callback.py": ["_call"],
+    "engine/drivers.py": ["drivers"],
+    "judge/statistics/noise.py": ["_segments"],
+    "models/hammerstein_wiener/separation/least_squares.py": ["refine"],
+    "models/hammerstein_wiener/trackers/output_error_steps.py": ["absorb", "output_error_work", "machine_output_error"],
+    "run/fleet.py": ["_gather"],
+    "run/track_outputs.py": ["track_outputs"],
+    "smooth/parts/elimination.py": ["forwards", "backwards", "residuals"],
+    "smooth/parts/two_filters.py": ["compiled", "filters", "meet"],
+    "trackers/bank/machine/framed.py": ["machine_walks", "machine_enter"],
+    "trackers/parts/diffuse.py": ["machine_learn"],
+}
+"""Functions that are too large and should not be. Nothing may be added; what is mended is taken off."""
+
+
+def functions(text):
+    """All functions in a text, those inside of others too."""
+    return [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def length(function):
+    """Lines from ``def`` to the last statement, without the docstring."""
+    lines = function.end_lineno - function.lineno + 1
+    first = function.body[0]
+    documented = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    return lines - (first.end_lineno - first.lineno + 1 if documented else 0)
+
+
+def positional(function):
+    """How many arguments can be given by their places; ``self`` and ``cls`` are not counted."""
+    given = [one.arg for one in (*function.args.posonlyargs, *function.args.args)]
+    return len(given) - (given[:1] in (["self"], ["cls"]))
+
+
+def too_large(text):
+    """Names of the functions that are too long or take too much."""
+    found = functions(text)
+    return [one.name for one in found if length(one) > LINES or (positional(one) > ARGUMENTS and not command(one))]
+
+
+def command(function):
+    """Whether arguments are options of a command line, which a user gives by name: each has an annotation for that."""
+    return all(isinstance(one.annotation, ast.Name | ast.Subscript) for one in function.args.args) and any(
+        isinstance(one, ast.Call) and isinstance(one.func, ast.Attribute) and one.func.attr == "command"
+        for one in function.decorator_list
+    )
+
+
+def test_what_is_too_large_is_found():
+    long = "def f():\n" + "    x = 1\n" * (LINES + 1)
+    many = f"def f({', '.join(f'x{i}' for i in range(ARGUMENTS + 1))}):\n    pass\n"
+    assert too_large(long) == too_large(many) == ["f"]
+    assert too_large("def f():\n" + "    x = 1\n" * (LINES - 1)) == []
+    assert too_large(many.replace("x0", "self")) == []
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(HOME).as_posix())
+def test_functions_are_short_and_take_few_arguments(path):
+    assert too_large(path.read_text()) == KNOWN.get(path.relative_to(HOME).as_posix(), [])
+
+
+COMPILED = {"kernel", "shared", "part", "machine", "Driver"}
+
+
+def called_too_early(text):
+    """Compiled functions that call one that the file defines below them: what that one does is then no part of the name
+    by which their code is found on disk, and after an edit the old code would run."""
+    compiled = [one for one in ast.parse(text).body if isinstance(one, ast.FunctionDef) and decorators(one) & COMPILED]
+    place = {one.name: k for k, one in enumerate(compiled)}
+    called = {
+        (one.name, call.func.id) for one in compiled for call in ast.walk(one)
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+    }  # fmt: skip
+    return sorted((one, other) for one, other in called if place.get(other, -1) > place[one])
+
+
+def decorators(function):
+    return {getattr(getattr(one, "func", one), "id", None) for one in function.decorator_list}
+
+
+def test_compiled_functions_stand_below_those_that_they_call():
+    assert called_too_early("@kernel\ndef f(x):\n    return g(x)\n\n\n@kernel\ndef g(x):\n    return x\n") == [
+        ("f", "g")
+    ]
+    found = {path.relative_to(HOME).as_posix(): called_too_early(path.read_text()) for path in SOURCES}
+    found.pop("engine/simd.py")  # the whole file is part of every name
+    assert {name for name, early in found.items() if early} <= {
+        "models/hammerstein_wiener/trackers/output_error_steps.py"
+    }
