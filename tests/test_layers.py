@@ -1,6 +1,7 @@
 """The house: imports point one way, counted from the source, lazy and typing-only ones included."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -105,3 +106,13 @@ def test_the_graph_is_read_whole():
     assert "show.export" in GRAPH["results"]
     assert rank("models.hammerstein_wiener.trackers.output_error") == rank("trackers.kalman") > rank("models.arx")
     assert rank("trackers.bank.results.events") == rank("judge.verdict") > rank("run.result")
+
+
+PAGES = [*(SOURCE.parent.parent / "docs").rglob("*.md"), SOURCE.parent.parent / "README.md"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_import_what_is_public(page):
+    """From the library itself or one level below it; systems and bridges are modules of their own."""
+    found = re.findall(r"^from driftfit\.([\w.]+) import", page.read_text(encoding="utf-8"), re.MULTILINE)
+    assert [one for one in found if "." in one and one.split(".")[0] not in ("systems", "bridges")] == []
