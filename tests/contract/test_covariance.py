@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import arx_record, damaged, same
 
-from driftfit import Live, track
+from driftfit import Bank, Live, track
 
 LONG = 100_000
 
@@ -57,7 +57,9 @@ def test_no_excitation_stays_within_the_promise(model, tracker):
     """A random walk grows by exactly q a sample; exponential forgetting stops at its cap."""
     y, u = RECORDS["silent"]
     run = track(model, tracker, y, u)
-    assert same(run.theta[600:], np.tile(run.theta[600], (LONG - 600, 1)))  # regressors of zero say nothing
+    # regressors of zero say nothing; the leaves of a bank only change in weight, back to their prior probabilities
+    unit = np.where(np.isfinite(run.std[600]), run.std[600], 1.0)
+    assert np.max(np.abs(run.theta[600:] - run.theta[600]) / unit) < (0.1 if isinstance(tracker, Bank) else 1e-9)
     P = np.diagonal([run.cov(t) for t in (600, LONG - 1)], axis1=1, axis2=2)
     if hasattr(tracker, "q"):
         expected = P[0] + (LONG - 601) * tracker.q

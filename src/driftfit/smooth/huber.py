@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.stats import median_abs_deviation
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
@@ -95,7 +94,8 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
 
 def spread_of(smoothed: Smoothed) -> float:
     """Standard deviation of the noise from leave-one-out residuals, half of which may be arbitrary."""
-    return float(median_abs_deviation(smoothed.loo, scale="normal", nan_policy="omit"))
+    loo = smoothed.loo
+    return float(np.nanmedian(np.abs(loo - np.nanmedian(loo))) / special.ndtri(0.75))
 
 
 def certificate(walk: Walk, path: Path, delta: float) -> float:

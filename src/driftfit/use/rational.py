@@ -25,7 +25,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from driftfit.data.signals import as_inputs, as_output
 from driftfit.engine.drivers import LARGEST
@@ -83,6 +82,8 @@ def rational_model(y: Any, phi: Any, psi: Any) -> Rational:
     def slope(theta: Array) -> Array:
         g = 1.0 + below @ theta[n:]
         return np.column_stack([-top / g[:, None], (top @ theta[:n] / g**2)[:, None] * below])
+
+    from scipy import optimize  # a tenth of a second to import
 
     fitted = optimize.least_squares(residual, start, slope, x_scale="jac")
     variance = 2.0 * fitted.cost / (len(output) - n - m)

@@ -27,7 +27,6 @@ from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import optimize
 
 from driftfit.data.signals import as_output
 from driftfit.engine.kernel import Array
@@ -190,6 +189,8 @@ def exp_autoregression(y: Any, n: int, delay: int = 1, level: float = 0.95) -> E
     grid = np.linspace(low, high, 81)
     at = int(np.argmin([project(x)[0] for x in grid]))
     bracket = (grid[max(at - 1, 0)], grid[min(at + 1, 80)])
+    from scipy import optimize  # a tenth of a second to import
+
     best = float(optimize.minimize_scalar(lambda x: project(x)[0], bounds=bracket, method="bounded").x)
     cost, constants = project(best)
     limit = cost * float(np.exp(NormalDist().inv_cdf(0.5 + level / 2.0) ** 2 / len(output)))
@@ -240,6 +241,8 @@ def _profile_end(
     project: Callable[[float], tuple[float, Array]], x: float, end: float, limit: float, nowhere: float
 ) -> float:
     """Where the cost first reaches a limit between x and an end of the range; ``nowhere`` if it does not."""
+    from scipy import optimize
+
     for inner, outer in pairwise(np.linspace(x, end, 81)):
         if project(outer)[0] > limit:
             return float(optimize.brentq(lambda value: project(value)[0] - limit, inner, outer))

@@ -25,7 +25,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from driftfit.engine.kernel import Array
 
@@ -109,6 +109,8 @@ def _solve(begins: Rate, start: float, high: float, every: float) -> float:
     most = int(np.argmax(rates))
     if rates[most] <= 1.0 / every:
         return float(grid[most])
+    from scipy import optimize  # a tenth of a second to import
+
     return float(optimize.brentq(lambda c: begins(c) - 1.0 / every, grid[most], high, xtol=1e-8))
 
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from driftfit.data.signals import as_inputs, as_output
 from driftfit.engine.drivers import LARGEST
@@ -126,6 +125,8 @@ def _separated(model: HammersteinWiener, theta: Array, f: Array, y: Array) -> Co
     a, b, c, d = (part[0] for part in split(model, theta[None], "svd-joint")[:4])
     rest = theta[-1:] if model.intercept else None
     v = np.nan_to_num(f @ c)
+    from scipy.signal import lfilter  # half a second to import
+
     w = lfilter(np.concatenate([np.zeros(model.nk), b]), np.concatenate([[1.0], a]), v)
     w = w - (0.0 if rest is None else float(rest[0]) / (1.0 + a.sum()))
     seen = y[np.abs(y) < LARGEST]
