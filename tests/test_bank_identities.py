@@ -11,7 +11,7 @@ from test_bank import P3, PROBS, N, Q, R, changes, record, state, told
 
 from driftfit import Bank, Regression, track
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.reducing import lookahead, merge
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide
 from driftfit.trackers.bank.sensor import Sensor

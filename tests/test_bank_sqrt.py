@@ -12,10 +12,10 @@ from test_bank import N, R, changes, record
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
 from driftfit.engine.substitute import substituted
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.leaves import leaves
+from driftfit.trackers.bank.leaves import leaf_matrix
 from driftfit.trackers.bank.leaves.factored import factorise, widened
 from driftfit.trackers.bank.leaves.factored import product as multiplied
-from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine import start
 from driftfit.trackers.bank.reducing import merge
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
@@ -271,7 +271,7 @@ def test_the_form_is_named():
 
 def test_parts_that_nothing_calls_are_named():
     with pytest.raises(ValueError, match="nothing calls match"):
-        substituted([start.begin], {merge.match: leaves.spread})
+        substituted([start.begin], {merge.match: leaf_matrix.spread})
 
 
 @pytest.mark.parametrize("form", ["covariance", "sqrt"])

@@ -26,8 +26,8 @@ from driftfit import (
 )
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.parts.disproportion import LEVERAGE
 from driftfit.trackers.parts.noise_levels import OUTLIER, level_chain
+from driftfit.trackers.parts.outlying_readings import LEVERAGE
 
 T = 1500
 MODEL, PLANT = Regression(3), ARX(2, 2)

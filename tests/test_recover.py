@@ -5,7 +5,7 @@ import pytest
 
 from driftfit import FLS, Regression, track, tune
 from driftfit.systems.time_varying import example, exp_ar, hammerstein, rational
-from driftfit.use.recover import exp_autoregression, rational_constants, static_curve, switching_times
+from driftfit.use.system_from_path import exp_autoregression, rational_constants, static_curve, switching_times
 
 pytestmark = pytest.mark.filterwarnings("ignore:tune:UserWarning")
 

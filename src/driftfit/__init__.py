@@ -51,7 +51,7 @@ from driftfit.tune.frontier import frontier
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
 from driftfit.use.rational import rational_model
-from driftfit.use.recover import static_curve
+from driftfit.use.system_from_path import static_curve
 
 __all__ = [
     "ARX",

@@ -7,9 +7,9 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.many import ManyAlarms, alarms
+from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
-from driftfit.judge.many import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
 from driftfit.run import fleet, outputs, result, shared_outputs, track_outputs
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Judged(fleet.Many):
-    """Methods of many runs with keys; see `driftfit.judge.many`."""
+    """Methods of many runs with keys; see `driftfit.judge.fleet_verdict`."""
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
@@ -195,6 +195,8 @@ class OutputsFleet(track_outputs.OutputsFleet, Judged, public=True):
 
 
 def _public(run: result.Track) -> Track:
-    """A run of the class that users know: once the facade is imported, every run is made so (`driftfit.run.plain`)."""
+    """A run of the class that users know: once the facade is imported, every run is made so
+    (`driftfit.run.public_class`).
+    """
     assert isinstance(run, Track)
     return run

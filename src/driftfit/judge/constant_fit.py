@@ -18,8 +18,8 @@ from driftfit.data.record import Record
 from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, unknown
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
+from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.program import lane_of
-from driftfit.run.seen import COLLECTED, collect
 
 FLAT = 1e-11
 """A diagonal entry below this share of its column counts as zero."""

@@ -28,8 +28,8 @@ from driftfit.data.record import Records
 from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array, Driver
 from driftfit.models.base import Model
-from driftfit.run.plain import Plain
 from driftfit.run.program import Program, State, tile_of
+from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Track
 from driftfit.run.warm_start import carried, first_interval
 from driftfit.trackers.base import Tracker

@@ -26,11 +26,11 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.fleet import Many
 from driftfit.run.output_lanes import shown
 from driftfit.run.program import Program, State, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
-from driftfit.run.seen import COLLECTED, collect
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 

@@ -16,8 +16,8 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.plain import Plain
 from driftfit.run.program import Program, State, lane_of, state_of
+from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 

@@ -18,7 +18,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.outputs import missing
-from driftfit.run.plain import Plain
+from driftfit.run.public_class import Plain
 from driftfit.run.result import Track
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker

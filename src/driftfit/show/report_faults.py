@@ -16,7 +16,7 @@ from driftfit.show.parts.text import key_text
 
 if TYPE_CHECKING:
     from driftfit.judge.alarms.detect import Alarms
-    from driftfit.judge.alarms.many import ManyAlarms
+    from driftfit.judge.alarms.fleet_alarms import ManyAlarms
     from driftfit.run.result import Track
 
 LISTED = 100

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from driftfit.engine.version import __version__
-from driftfit.judge.many import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import document, picture, section, table
 from driftfit.show.page_style import READING
@@ -23,7 +23,7 @@ from driftfit.show.report_faults import many_faults
 
 if TYPE_CHECKING:
     from driftfit.engine.kernel import Array
-    from driftfit.judge.alarms.many import ManyAlarms
+    from driftfit.judge.alarms.fleet_alarms import ManyAlarms
     from driftfit.run.result import Track
 
 LISTED = 200

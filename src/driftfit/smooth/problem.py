@@ -12,9 +12,9 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, output_type
 from driftfit.engine.kernel import Array, State, Step, kernel
+from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.program import lane_of
 from driftfit.run.result import Track
-from driftfit.run.seen import COLLECTED, collect
 from driftfit.smooth.parts.walk import NONE, Walk, free
 from driftfit.trackers.base import RandomWalk
 

@@ -7,7 +7,7 @@ modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
 the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
-proportion are left out (`driftfit.trackers.parts.disproportion`), and r is not below what coarse readings allow
+proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
 (`driftfit.trackers.parts.modes.ladder`), or more noise.
 
@@ -47,7 +47,6 @@ from driftfit.trackers.parts.coordinates import (
     whiten_within,
 )
 from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
-from driftfit.trackers.parts.disproportion import bound_leverage, learn_proportion, leave_out, no_proportion, proportion
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
@@ -61,6 +60,13 @@ from driftfit.trackers.parts.modes.filters import (
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
 from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
+from driftfit.trackers.parts.outlying_readings import (
+    bound_leverage,
+    learn_proportion,
+    leave_out,
+    no_proportion,
+    proportion,
+)
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RESIDUALS = 4

@@ -8,8 +8,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
-from driftfit.tune.knobs import Knobs
 from driftfit.tune.lanes import Task, score
+from driftfit.tune.parametrisation import Knobs
 from driftfit.tune.search import STEP, Search
 
 

@@ -17,8 +17,8 @@ from driftfit.smooth.parts.walk import ordered
 from driftfit.smooth.problem import walk_of
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.base import Tracker
-from driftfit.tune.knobs import Knobs, constant
 from driftfit.tune.lanes import Task, score
+from driftfit.tune.parametrisation import Knobs, constant
 
 
 def along(task: Task, tracker: Tracker, order_by: Any) -> Task:

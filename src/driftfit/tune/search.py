@@ -18,7 +18,7 @@ from statistics import NormalDist
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.tune.knobs import Knobs
+from driftfit.tune.parametrisation import Knobs
 
 Objective = Callable[[Array], Array]
 DECADE = 4

@@ -30,10 +30,10 @@ from driftfit.models.base import Model
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
-from driftfit.tune.knobs import find_knobs
 from driftfit.tune.lanes import Task, score
 from driftfit.tune.objective import Criterion, along
 from driftfit.tune.outputs import tune_outputs
+from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import Tuned
 

@@ -24,7 +24,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
-from driftfit.models.hammerstein_wiener.memory import (
+from driftfit.models.hammerstein_wiener.basis_values import Kind, level_of
+from driftfit.models.hammerstein_wiener.memory_layout import (
     BEFORE,
     BEND,
     BOTTOM,
@@ -54,7 +55,6 @@ from driftfit.models.hammerstein_wiener.memory import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.hammerstein_wiener.values import Kind, level_of
 
 WIDER = 0.2
 """Share of the range of the outputs by which the grid extends beyond it at both ends."""

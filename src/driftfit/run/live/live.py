@@ -28,12 +28,12 @@ from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import FixedLag, Window
+from driftfit.run.live.interventions import HELD, ORDINARY, Operated
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
-from driftfit.run.live.operator import HELD, ORDINARY, Operated
 from driftfit.run.live.outputs import LiveOutputs
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.plain import Plain
 from driftfit.run.program import Program, state_of
+from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
 from driftfit.run.warm_start import End, Run, carried
 from driftfit.trackers.base import Tracker

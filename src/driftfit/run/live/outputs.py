@@ -23,8 +23,8 @@ from driftfit.run.live.fixed_lag import FixedLag, Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.output_lanes import programs_of
-from driftfit.run.plain import Plain
 from driftfit.run.program import Program, state_of, tile_of
+from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
 from driftfit.run.shared_outputs import row_model
 from driftfit.run.warm_start import End, Run, carried

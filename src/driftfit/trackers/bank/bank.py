@@ -62,7 +62,7 @@ from driftfit.trackers.bank.layout import (
 )
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.factored import factorise, widened
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 from driftfit.trackers.bank.machine.start import GROWTH, begin
 from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample

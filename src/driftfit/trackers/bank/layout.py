@@ -1,8 +1,8 @@
 """The table of a bank: where its arrays lie, and what its counters and the numbers of a sample are called.
 
 Every part of the compiled routine is given the table alone (`driftfit.trackers.bank.table`) and reads from it by name.
-Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaves`. With n
-parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
+Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaf_matrix`.
+With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m sensors, the fields are
 
     parents, leaves         the leaves before and after the tree has grown, one a column
     history, history_2      what leaves remember of their events, one a row (`machine.ancestry`); the counter FLIPPED

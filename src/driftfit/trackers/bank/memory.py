@@ -13,7 +13,7 @@ from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
-from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 from driftfit.trackers.bank.machine.ancestry import news_of
 from driftfit.trackers.bank.machine.gaps.gap import SINCE
 from driftfit.trackers.bank.reducing import selection

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.disproportion import FIRST
+from driftfit.trackers.parts.outlying_readings import FIRST
 
 MEMORY = 200.0
 """Samples over which the mean square of a regressor is remembered."""

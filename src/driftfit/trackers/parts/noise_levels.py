@@ -26,7 +26,7 @@ OUTLIER = 0.02
 MEMORY = 100.0
 """Samples over which r is remembered."""
 IN_A_ROW, RISE = 4.0, 0.3
-"""From the third outlier in a row on (`driftfit.trackers.parts.disproportion`), log r rises by this with each."""
+"""From the third outlier in a row on (`driftfit.trackers.parts.outlying_readings`), log r rises by this with each."""
 FINEST = 1e-12
 """r is never below this share of the mean square of y: the data's own rounding."""
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, minus, over, plus, reaches, store, sum_of, times
-from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 ROUNDING = 4.0 * np.finfo(float).eps
 """A pivot below n times this share of its variance is one that rounding has left."""

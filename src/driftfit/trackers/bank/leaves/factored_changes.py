@@ -28,7 +28,7 @@ from driftfit.trackers.bank.leaves.forget import (
     RESET,
     STABILISED,
 )
-from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.layout import ALIKE, IN_NOISE, LAST, R
-from driftfit.trackers.bank.leaves.leaves import WEIGHT, total
+from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT, total
 
 FACTOR, VALUE, FROZEN, STUCK, CLEANS, OWN = range(6)
 """Columns of the table of sensors; OWN is the number of the user's function (`own_sensor`), 0 for none."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array, exp, shared
-from driftfit.trackers.bank.leaves.leaves import FIRST, blur, spread
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, blur, spread
 
 KEEP, RESET, KIND, GAIN = range(4)
 """Columns of the table of maps: the factor of C, whether all is reset, the kind; of the settings then log forget, of an

@@ -20,7 +20,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.layout import IN_Y, MOST, R
-from driftfit.trackers.bank.leaves.leaves import FIRST
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
 """Square of a prediction in mean squares of the outputs, and its variance in variances of the noise, beyond which it is

@@ -27,7 +27,7 @@ import numpy as np
 from driftfit.engine.callback import address_of, call
 from driftfit.engine.kernel import State, floats, kernel, machine, shared
 from driftfit.trackers.bank.layout import LAST
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, S
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 LARGEST, LEAST = 1e12, 1e-12
 """Noise variances beyond this multiple of the forecast's count as this one, which moves nothing, and those below this

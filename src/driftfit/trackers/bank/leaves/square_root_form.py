@@ -15,10 +15,10 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, fill, higher, load, minus, over, plus, store, sum_of, times
-from driftfit.trackers.bank.leaves import forget, leaves
+from driftfit.trackers.bank.leaves import forget, leaf_matrix
 from driftfit.trackers.bank.leaves.factored import absorb, along, condense, factorise, raised
 from driftfit.trackers.bank.leaves.factored_changes import add_walked, average, blur, develop_eight
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S, regressors, variance_factor
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S, regressors, variance_factor
 from driftfit.trackers.bank.machine import grow, start
 from driftfit.trackers.bank.machine.gaps import chain_gap
 from driftfit.trackers.bank.reducing import lookahead, merge, refilter
@@ -28,7 +28,7 @@ covariance_begin = start.begin
 
 @shared
 def ready(t: Any) -> None:
-    """`leaves.ready`: factorised."""
+    """`leaf_matrix.ready`: factorised."""
     for i in range(len(t.walks)):
         factorise(t.Q[i], t.n, 0.0)
 
@@ -43,7 +43,7 @@ def begin(t: Any, nu: float, squares: float) -> None:
 
 @shared
 def mixture(n: int, t: Any, L: int) -> None:
-    """`leaves.mixture`, multiplied out."""
+    """`leaf_matrix.mixture`, multiplied out."""
     B, X, theta = t.leaves, t.scratch, t.theta
     variance_factor(t, X, n, L)
     for i in range(n):
@@ -71,7 +71,7 @@ def mixture(n: int, t: Any, L: int) -> None:
 
 @shared
 def spread(C: Array, Z: Array, m: Array, L: int, n: int, na: int, g: Array, expected: Array) -> None:
-    """`leaves.spread`, but with f = U'z in g."""
+    """`leaf_matrix.spread`, but with f = U'z in g."""
     for l in range(0, L, WIDTH):
         y, k = fill(0.0), l if na > 0 else 0
         for i in range(n):
@@ -203,7 +203,7 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 
 
 PARTS = {
-    leaves.ready: ready, leaves.mixture: mixture, start.begin: begin,
+    leaf_matrix.ready: ready, leaf_matrix.mixture: mixture, start.begin: begin,
     forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
     refilter.widen: widen, chain_gap.widen_leaf: widen_leaf, lookahead.width: width,
 }  # fmt: skip

@@ -54,7 +54,7 @@ from driftfit.trackers.bank.layout import (
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
 from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
-from driftfit.trackers.bank.leaves.leaves import (
+from driftfit.trackers.bank.leaves.leaf_matrix import (
     FIRST,
     increments,
     later,

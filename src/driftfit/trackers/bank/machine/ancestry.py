@@ -17,7 +17,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, below, equal, fill, load, plus, store, sum_of, times
 from driftfit.trackers.bank.layout import EXPANDED, FLIPPED, PARENTS, flip
-from driftfit.trackers.bank.leaves.leaves import WEIGHT
+from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
 from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
-from driftfit.trackers.bank.leaves.leaves import FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 

@@ -26,7 +26,7 @@ from driftfit.trackers.bank.layout import ALIKE, FADE, LEAST, MOST, R
 from driftfit.trackers.bank.leaves.forecast import CLEANS, FACTOR, FROZEN, OWN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, KIND, MEAN, RESET, apply
 from driftfit.trackers.bank.leaves.lags import plausible, shift_covariance, widen_by_lags
-from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, S, regressors, spread
 from driftfit.trackers.bank.leaves.own_sensor import clean_all, judge_all, weigh_all
 from driftfit.trackers.parts.diffuse import LEFT
 

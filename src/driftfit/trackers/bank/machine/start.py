@@ -24,7 +24,7 @@ from driftfit.trackers.bank.layout import (
     Y_HAT,
 )  # fmt: skip
 from driftfit.trackers.bank.leaves.lags import push
-from driftfit.trackers.bank.leaves.leaves import AGE, FIRST, LOG, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, FIRST, LOG, NU, WEIGHT, S
 
 GROWTH = 1e8
 """Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""

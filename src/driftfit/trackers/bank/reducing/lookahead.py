@@ -21,7 +21,7 @@ from driftfit.engine.kernel import Array, exp, shared
 from driftfit.trackers.bank.layout import CHAINED, LAST, R
 from driftfit.trackers.bank.leaves.forecast import FACTOR, FROZEN, STUCK, VALUE
 from driftfit.trackers.bank.leaves.forget import KEEP, MEAN, RESET
-from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, NU, WEIGHT, S
 
 NODES = 33
 """Nodes for every distinct component."""

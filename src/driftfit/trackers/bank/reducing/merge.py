@@ -22,7 +22,7 @@ from driftfit.engine.kernel import Array, shared
 from driftfit.engine.simd import WIDTH, gathered, store
 from driftfit.trackers.bank.layout import FLIPPED, flip
 from driftfit.trackers.bank.leaves.lags import merge_covariance
-from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, FIRST, LOG, NU, SENSORS, WEIGHT, S
 from driftfit.trackers.bank.machine.ancestry import average
 
 

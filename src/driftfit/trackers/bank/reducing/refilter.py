@@ -13,7 +13,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, shared
 from driftfit.trackers.bank.layout import FLIPPED
-from driftfit.trackers.bank.leaves.leaves import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, increments, normalise, ready
 from driftfit.trackers.bank.machine.grow import grow
 from driftfit.trackers.bank.reducing.selection import DEPTH, PRIOR
 

@@ -13,7 +13,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.engine.simd import WIDTH, fill, load, plus, reaches, store, sum_of
 from driftfit.trackers.bank.layout import CLOCK, HELD
-from driftfit.trackers.bank.leaves.leaves import AGE, CHANGES, CODE, SENSORS, WEIGHT
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CHANGES, CODE, SENSORS, WEIGHT
 from driftfit.trackers.bank.reducing.lookahead import expected_risk
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)

@@ -27,7 +27,7 @@ from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth.problem import replay
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.leaves.leaves import NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import NU, WEIGHT, S
 from driftfit.trackers.bank.results.events import Event
 
 WIDER, CLOSE = 1e7, 0.05

@@ -10,7 +10,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import HELD, LEAVES, NEVER, OPEN, SETTLED
 from driftfit.trackers.bank.leaves.factored import product
-from driftfit.trackers.bank.leaves.leaves import AGE, CODE, FIRST, NU, WEIGHT, S
+from driftfit.trackers.bank.leaves.leaf_matrix import AGE, CODE, FIRST, NU, WEIGHT, S
 from driftfit.trackers.bank.machine.framed import in_theta
 from driftfit.trackers.bank.machine.gaps.gap import SINCE
 

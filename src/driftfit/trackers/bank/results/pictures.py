@@ -11,7 +11,7 @@ from driftfit.run.live.live import Live
 from driftfit.run.result import Track
 from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
 from driftfit.trackers.bank.layout import LEAVES
-from driftfit.trackers.bank.leaves.leaves import CODE, WEIGHT
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, WEIGHT
 from driftfit.trackers.bank.reduction import GPB, Decide
 from driftfit.trackers.bank.results.events import Event
 from driftfit.trackers.bank.results.mixture import mixture_of

@@ -9,8 +9,8 @@ from the top directly to the bottom: mixing the wide covariance of the top filte
 more than anything else when nothing changes (measured: 1.8 times the error of least squares instead of 1.15).
 
 The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
-deviations of the output (times patience, `driftfit.trackers.parts.disproportion`), explains the sample better by more
-than a factor 1 / RARE, its covariance grows by that move.
+deviations of the output (times patience, `driftfit.trackers.parts.outlying_readings`), explains the sample better by
+more than a factor 1 / RARE, its covariance grows by that move.
 
 Source: Blom and Bar-Shalom (1988); the ladder and its transitions are ours. Cost per sample: O(K^2 n^2) for K modes,
 vectorised over the destination modes.

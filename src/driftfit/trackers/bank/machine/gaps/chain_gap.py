@@ -29,7 +29,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
-from driftfit.trackers.bank.leaves.leaves import FIRST, LOG, WEIGHT, variance_factor
+from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, LOG, WEIGHT, variance_factor
 
 SURE = 1e-12
 """A course less likely than this is left out."""

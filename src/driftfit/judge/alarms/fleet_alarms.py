@@ -28,7 +28,7 @@ from rich.text import Text
 
 from driftfit.engine.settings import numbers
 from driftfit.judge.alarms.detect import Alarms, detect
-from driftfit.judge.many import SHOWN, discoveries
+from driftfit.judge.fleet_verdict import SHOWN, discoveries
 from driftfit.judge.verdict import p_text
 from driftfit.show.parts.text import Printed, facts, key_text, table_of
 

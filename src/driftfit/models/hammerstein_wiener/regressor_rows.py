@@ -11,7 +11,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
-from driftfit.models.hammerstein_wiener.memory import (
+from driftfit.models.hammerstein_wiener.memory_layout import (
     D_NOW,
     EACH,
     F_PAST,
