@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import dis
 import hashlib
 import math
@@ -28,9 +29,15 @@ def identity(function: FunctionType) -> str:
 
 
 def used_globals(function: FunctionType) -> dict[str, Any]:
-    """The globals that a function reads."""
-    names = _globals(function.__code__) & function.__globals__.keys()
-    return {name: function.__globals__[name] for name in names}
+    """The globals that a function reads; TypeError where one is not defined yet: an edit of it would go unnoticed."""
+    names = _globals(function.__code__)
+    later = sorted(names - function.__globals__.keys() - vars(builtins).keys())
+    if later:
+        raise TypeError(
+            f"the kernel {function.__qualname__} uses {', '.join(later)}, which is not defined above it; put what a "
+            "compiled function uses before it in the file."
+        )
+    return {name: function.__globals__[name] for name in names & function.__globals__.keys()}
 
 
 def _globals(code: CodeType) -> set[str]:

@@ -280,6 +280,16 @@ row_sums = _named("row_sums", _sums)
 
 
 @kernel
+def _line(x: Any, first: int, c: Any) -> Any:
+    return plus(fill(c[first]), times(fill(c[first + 1]), x))
+
+
+@kernel
+def _cubic(x: Any, x2: Any, first: int, c: Any) -> Any:
+    return plus(_line(x, first, c), times(_line(x, first + 2, c), x2))
+
+
+@kernel
 def exp_of(x: Any) -> Any:
     """e^x of each entry, with the bits of `kernel.exp`."""
     x = lower(fill(709.0), higher(fill(-708.0), x))
@@ -307,13 +317,3 @@ def log_of(x: Any) -> Any:
     total = plus(times(s2, _line(s, 2, ARTANH)), times(times(s2, s2), tail))
     total = plus(fill(1.0), plus(times(s, fill(ARTANH[1])), total))
     return plus(times(k, fill(LOG2_HIGH)), plus(times(times(fill(2.0), f), total), times(k, fill(LOG2_LOW))))
-
-
-@kernel
-def _line(x: Any, first: int, c: Any) -> Any:
-    return plus(fill(c[first]), times(fill(c[first + 1]), x))
-
-
-@kernel
-def _cubic(x: Any, x2: Any, first: int, c: Any) -> Any:
-    return plus(_line(x, first, c), times(_line(x, first + 2, c), x2))

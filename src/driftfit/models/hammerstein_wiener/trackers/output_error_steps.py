@@ -104,31 +104,6 @@ def product(S: Array, row: Array, moved: Array, total: float) -> float:
     return total
 
 
-@shared
-def advance(
-    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
-) -> None:  # fmt: skip
-    """The time update of w, which is held within reach whatever the poles do, and of S."""
-    n_w, N = len(w), len(S)
-    total, x_d = transition(p, theta, phi, w, row)
-    for x in range(x_d + p[N_OUT] - 1, N):
-        row[x] = -1.0
-        total -= theta[x - n_w]
-    own = product(S, row, moved, q_w)
-    for i in range(n_w - 1, 0, -1):
-        w[i] = w[i - 1]
-        for j in range(i, 0, -1):
-            S[i, j] = S[i - 1, j - 1]
-        for x in range(n_w, N):
-            S[x, i] = S[x, i - 1]
-    most = WIDEST * WIDEST * reach * reach
-    shrink = np.sqrt(most / own) if own > most else 1.0
-    for x in range(1, N):
-        S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
-    S[0, 0] = min(own, most)
-    w[0] = min(max(total, -reach), reach)
-
-
 @part
 def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tuple[float, int]:
     """The row of the transition for the present w but for the intercept; returns w, and where d begins in the state."""
@@ -153,6 +128,31 @@ def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tup
             total += theta[b + j] * v
         b, c, at = b + nb, c + more_in, at + nb * more_in
     return total, n_w + c
+
+
+@shared
+def advance(
+    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
+) -> None:  # fmt: skip
+    """The time update of w, which is held within reach whatever the poles do, and of S."""
+    n_w, N = len(w), len(S)
+    total, x_d = transition(p, theta, phi, w, row)
+    for x in range(x_d + p[N_OUT] - 1, N):
+        row[x] = -1.0
+        total -= theta[x - n_w]
+    own = product(S, row, moved, q_w)
+    for i in range(n_w - 1, 0, -1):
+        w[i] = w[i - 1]
+        for j in range(i, 0, -1):
+            S[i, j] = S[i - 1, j - 1]
+        for x in range(n_w, N):
+            S[x, i] = S[x, i - 1]
+    most = WIDEST * WIDEST * reach * reach
+    shrink = np.sqrt(most / own) if own > most else 1.0
+    for x in range(1, N):
+        S[x, 0] = shrink * (moved[x - 1] if x < n_w else moved[x])
+    S[0, 0] = min(own, most)
+    w[0] = min(max(total, -reach), reach)
 
 
 @shared
