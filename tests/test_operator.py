@@ -63,7 +63,7 @@ def test_a_warm_start_takes_new_settings_and_is_saved(tmp_path):
     y, u = record()
     first = track(MODEL, KINDS[0], y[:100], u[:100])
     second = track(MODEL, Kalman(q=0.0, r=0.1), y[100:], u[100:], warm_start=first)
-    assert np.array_equal(second._tile["q"][0, :, 0], [0.0, 0.0])
+    assert np.array_equal(second.state["q"], [0.0, 0.0])
     assert (second.std[-1] < first.std[-1]).all()
     second.save(tmp_path / "run.npz")
     assert np.array_equal(Track.load(tmp_path / "run.npz").cov(30), second.cov(30))
