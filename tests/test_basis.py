@@ -50,7 +50,7 @@ def test_bases_are_what_they_say():
     np.testing.assert_allclose(Sigmoid([-1.0, 0.5], 0.7).value(x), bent, atol=1e-15)
     assert np.isnan(Sigmoid([0.0], 1.0).value(np.nan)).all()
     assert basis_of(("sigmoid", 0.7, -1.0, 0.5)) == Sigmoid([-1.0, 0.5], 0.7)
-    with pytest.raises(ValueError, match="centres must be at least 1 increasing"):
+    with pytest.raises(ValueError, match="centres must be at least 1 strictly increasing"):
         Sigmoid([1.0, 0.0], 1.0)
 
 

@@ -287,7 +287,7 @@ def test_instruments_and_the_unbiased_basis_take_the_bias_away():
     assert np.std(fits[2].y - s.y0) < 0.2 * s.sigma
     with pytest.raises(ValueError, match="raw powers"):
         fit_constant(HammersteinWiener(1, 1, output=Legendre(3, (-3, 3))), s.y, s.u, sigma=0.1)
-    with pytest.raises(ValueError, match="cannot tell 14"):
+    with pytest.raises(ValueError, match="cannot determine 14"):
         fit_constant(CUBIC, s.y[:10], s.u[:10])
 
 

@@ -140,7 +140,7 @@ def test_what_cannot_be_prepared():
         prepare.remove_level([np.nan, np.nan, 1.0], first=2)
     with pytest.raises(ValueError, match="a scale must be positive; got 0"):
         prepare.scale(np.ones(5), first=5)
-    with pytest.raises(ValueError, match="give one of the two"):
+    with pytest.raises(ValueError, match="give either by="):
         prepare.scale(np.ones(5))
     with pytest.raises(ValueError, match="a trend needs two values"):
         prepare.remove_trend([1.0, np.nan, 2.0], first=2)

@@ -26,6 +26,7 @@ import numpy as np
 
 from driftfit.engine.callback import address_of, call
 from driftfit.engine.kernel import State, floats, kernel, machine, shared
+from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import LAST
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
@@ -54,20 +55,27 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """h + a in the place of h, which is kept in the first row of `scores`."""
-    for l in range(columns):
-        judge(t, which, at, l, y, r)
+    """h + a in the place of h, which is kept in the first row of `scores`.
+
+    The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, since it is divided by.
+    """
+    for l in range(-(-columns // WIDTH) * WIDTH):
+        noise = r
+        if l < columns:
+            judge(t, which, at, l, y, r)
+            noise = t.said[0, NOISE]
         t.scores[0, l] = t.expected[0, l]
-        t.expected[0, l] += t.said[0, NOISE]
+        t.expected[0, l] += noise
 
 
 @shared
 def weigh_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
     """The log densities in the place of what `judge_all` kept, which is given back."""
-    for l in range(columns):
+    for l in range(-(-columns // WIDTH) * WIDTH):
         t.expected[0, l] = t.scores[0, l]
-        judge(t, which, at, l, y, r)
-        t.scores[0, l] = t.said[0, LOG_P]
+        if l < columns:
+            judge(t, which, at, l, y, r)
+            t.scores[0, l] = t.said[0, LOG_P]
 
 
 @shared
