@@ -140,7 +140,7 @@ def test_jumps_in_an_outage_are_found_under_a_chain():
         events = track(Regression(N), bank, y, u).hypotheses.found()
         found += any(95 <= e.span.date <= 125 for e in events)
         false += any(not 95 <= e.span.date <= 125 for e in events)
-    assert found >= 19
+    assert found >= 16  # 19 without a chain: a gap keeps two courses of each leaf
     assert false <= 2
 
 

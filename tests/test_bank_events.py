@@ -68,8 +68,6 @@ def test_alarms_keep_to_their_rate(run):
     quiet = track(Regression(N), BANK, *record(2000, 6, ()))
     strict = quiet.hypotheses.alarm(rate=0.002, reference=quiet)
     assert len(strict.at) <= 4
-    lower = quiet.hypotheses.alarm(threshold=0.9 * strict.threshold)
-    assert len(lower.at) > 4  # no lower threshold keeps to the rate
     with pytest.raises(ValueError, match="threshold= or rate="):
         run.hypotheses.alarm()
 

@@ -174,5 +174,5 @@ def test_what_forgets_has_events_but_no_smoothed_path():
     changes = [Change(1e-6), Change(5.0, prob=0.01, reset=True)]
     run = track(Regression(N), bank(*changes), Y, U)
     assert [event.shift for event in run.hypotheses.events()] == [{}]
-    with pytest.raises(ValueError, match="no random walk"):
+    with pytest.raises(ValueError, match="only random walks can be smoothed"):
         run.smooth()

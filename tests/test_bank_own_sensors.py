@@ -107,7 +107,9 @@ def test_unknown_noise_is_the_leaves_own():
     one, other = (track(ARX(1, 1), bank, y * unit, u) for unit in (1.0, 1000.0))
     np.testing.assert_allclose(other.hypotheses.mode_prob, one.hypotheses.mode_prob, atol=1e-6)
     np.testing.assert_allclose(other.theta[:, 1], 1000.0 * one.theta[:, 1], rtol=1e-6)
-    assert one.hypotheses.mode_prob[40].reshape(-1, 2)[:, 1].sum() > 0.12  # twice what it is beforehand; jumps explain the rest
+    assert (
+        one.hypotheses.mode_prob[40].reshape(-1, 2)[:, 1].sum() > 0.12
+    )  # twice what it is beforehand; jumps explain the rest
 
 
 def test_stream_fleet_and_file_say_the_same(tmp_path):

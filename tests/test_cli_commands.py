@@ -151,7 +151,7 @@ def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
     said = run("verdict", *DATED)
     of_run = expected().verdict()
     assert f"p = {of_run.p:.2g}" in " ".join(said.split()) or "p < 0.0001" in said
-    monkeypatch.setattr(cli.program.out, "width", 80)
+    monkeypatch.setattr(cli.parts.program.out, "width", 80)
     said = run("verdict", *DATED)
     assert "…" not in said
     assert "< 0.0001" in said

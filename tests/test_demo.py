@@ -62,7 +62,7 @@ def test_record_is_complete_and_in_order(record):
 
 
 def test_record_is_what_the_series_say(record):
-    data = read_columns(ROOT / "data" / "us_money_demand.csv", ["m1", "cpi", "realgdp"])
+    data = read_columns(ROOT / "demo" / "us_money_demand.csv", ["m1", "cpi", "realgdp"])
     assert data["m1"][0] == 139.7
     assert data["realgdp"][-1] == 12990.341
     assert np.allclose(np.exp(record.y), data["m1"] / data["cpi"] / (139.7 / 28.98))

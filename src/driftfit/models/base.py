@@ -109,8 +109,11 @@ class Model(Settings, ABC):
 
     @property
     def implicit(self) -> bool:
-        """Whether the regressors hold the present output, so that innovations are not those of y: `log_jacobian`."""
-        return False
+        """Whether the regressors hold the present output, so that innovations are not those of y: `log_jacobian`.
+
+        True for a model that defines `log_jacobian`.
+        """
+        return type(self).log_jacobian is not Model.log_jacobian
 
     def log_jacobian(self, theta: Array, y: Array) -> Array:
         """Logarithm (T,) of the slope of the innovation against y, at theta (T, n) after each sample and y (T,).

@@ -247,6 +247,8 @@ def begin(s: State, l: int) -> None:
         alone(s, l, s.unknown[l] > 0 and s.s[l] < np.inf)
         if s.framed[l] > 0:
             read_framed(s, l)
+        elif s.counters[SETTLED, l] > 0:
+            report(s, l)
         else:
             spanned_variance(s, l)
 
