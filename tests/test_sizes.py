@@ -15,7 +15,12 @@ KNOWN = {
     "engine/drivers.py": ["drivers"],
     "judge/statistics/noise.py": ["_segments"],
     "models/hammerstein_wiener/separation/least_squares.py": ["refine"],
-    "models/hammerstein_wiener/trackers/output_error_steps.py": ["absorb", "output_error_work", "machine_output_error"],
+    "models/hammerstein_wiener/trackers/output_error_steps.py": [
+        "advance",
+        "absorb",
+        "output_error_work",
+        "machine_output_error",
+    ],
     "run/fleet.py": ["_gather"],
     "run/track_outputs.py": ["track_outputs"],
     "smooth/parts/elimination.py": ["forwards", "backwards", "residuals"],

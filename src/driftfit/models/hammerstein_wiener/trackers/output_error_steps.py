@@ -132,13 +132,9 @@ def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tup
 
 @shared
 def advance(
-    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array,
-    process: tuple[float, float],
+    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
 ) -> None:  # fmt: skip
-    """The time update of w and of S; ``process``: the variance of its noise, and how large w may be, whatever the poles
-    do.
-    """
-    q_w, reach = process
+    """The time update of w, which is held within reach whatever the poles do, and of S."""
     n_w, N = len(w), len(S)
     total, x_d = transition(p, theta, phi, w, row)
     for x in range(x_d + p[N_OUT] - 1, N):
@@ -249,7 +245,7 @@ def _work(out: Kind) -> Any:
             own[BEGUN] = 1.0
         power = unknown_power(m, p, theta, own)
         known = power == 0.0
-        advance(p, theta, phi, w, S, row, moved, (own[Q_W] + power, reach_of(m, p)))
+        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power, reach_of(m, p))
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
         fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])
