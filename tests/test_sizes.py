@@ -75,33 +75,3 @@ def test_what_is_too_large_is_found():
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.relative_to(HOME).as_posix())
 def test_functions_are_short_and_take_few_arguments(path):
     assert too_large(path.read_text()) == KNOWN.get(path.relative_to(HOME).as_posix(), [])
-
-
-COMPILED = {"kernel", "shared", "part", "machine", "Driver"}
-
-
-def called_too_early(text):
-    """Compiled functions that call one that the file defines below them: what that one does is then no part of the name
-    by which their code is found on disk, and after an edit the old code would run."""
-    compiled = [one for one in ast.parse(text).body if isinstance(one, ast.FunctionDef) and decorators(one) & COMPILED]
-    place = {one.name: k for k, one in enumerate(compiled)}
-    called = {
-        (one.name, call.func.id) for one in compiled for call in ast.walk(one)
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
-    }  # fmt: skip
-    return sorted((one, other) for one, other in called if place.get(other, -1) > place[one])
-
-
-def decorators(function):
-    return {getattr(getattr(one, "func", one), "id", None) for one in function.decorator_list}
-
-
-def test_compiled_functions_stand_below_those_that_they_call():
-    assert called_too_early("@kernel\ndef f(x):\n    return g(x)\n\n\n@kernel\ndef g(x):\n    return x\n") == [
-        ("f", "g")
-    ]
-    found = {path.relative_to(HOME).as_posix(): called_too_early(path.read_text()) for path in SOURCES}
-    found.pop("engine/simd.py")  # the whole file is part of every name
-    assert {name for name, early in found.items() if early} <= {
-        "models/hammerstein_wiener/trackers/output_error_steps.py"
-    }

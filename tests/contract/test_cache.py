@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from driftfit.engine.kernel import kernel
+
 SRC = Path(__file__).parents[2] / "src"
 
 COUNT = """
@@ -124,3 +126,11 @@ def test_an_edit_in_another_file_is_seen(tmp_path, edit):
     (tmp_path / "own_parts.py").write_text(OWN_PARTS.replace(*edit))
     compiled, theta = run(OWN_TRACKER, tmp_path)
     assert (compiled > 0, theta) == (True, 0.4375)
+
+
+def test_a_function_whose_parts_are_defined_later_is_refused():
+    """An edit of such a part would go unnoticed, and code on disk would be that before the edit."""
+    names = {}
+    exec("def whole(x):\n    return part(x)\n", names)
+    with pytest.raises(TypeError, match="uses part, which is not defined above it"):
+        kernel(names["whole"])

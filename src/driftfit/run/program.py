@@ -72,9 +72,9 @@ class Program:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         return drivers(self.model.steps, self.steps if steps is None else steps, keep)
 
-    def tile(self, state: State | None = None, **more: Any) -> Array:
-        """A tile of one lane at its start, or with the given fields; ``more`` are fields besides the tracker's own."""
-        return tile_of([self], () if state is None else (state,), **more)
+    def tile(self, state: State | None = None) -> Array:
+        """A tile of one lane at its start, or with the given fields."""
+        return tile_of([self], () if state is None else (state,))
 
     def resting(self, state: State) -> Array:
         """A tile with the state of a run, without the known factors of its last sample."""
@@ -101,10 +101,10 @@ STANDING = ("interval", "noise", "drift", "each")
 """Fields with the known factors of one sample."""
 
 
-def tile_of(programs: Sequence[Program], states: Sequence[State] = (), **more: Any) -> Array:
+def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
     """A tile with a lane for each program (all of one model), at its start or with the given fields."""
     model = programs[0].model
-    starts = {one: {**one.start, **more} for one in programs}
+    starts = {one: one.start for one in programs}
     tile = make_tile(model.n, model.m, model.memory(), [starts[one] for one in programs])
     for lane, state in enumerate(states):
         for name, value in state.items():

@@ -17,9 +17,9 @@ mode that lasted. That is exact in the probabilities of both courses and of what
 moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
 interval of dt nominal samples is a gap of dt - 1 and a floor.
 
-Only random walks; where there is no room for two (`Decide`, whose branches may still hold those of an earlier gap) one
-leaf has the moments of both. Cost: O(H^3 + H n^2) for each sample that is not used, and twice the leaves for the one
-that ends the gap.
+Only random walks, and not under `Decide`, `FirstFloor` and `IMM`, which widen by the mean; where there is no room for
+two, one leaf has the moments of both. Cost: O(H^3 + H n^2) for each sample that is not used, and twice the leaves for
+the one that ends the gap.
 """
 
 from __future__ import annotations
