@@ -1,6 +1,7 @@
 """Chromium without a window, driven by its own protocol: what a page shows, its console, keys, pictures."""
 
 import base64
+import contextlib
 import itertools
 import json
 import shutil
@@ -28,7 +29,8 @@ class Browser:
         )  # fmt: skip
         port = self._wait(self._port, 30.0)
         pages = self._wait(lambda: self._pages(port), 20.0)
-        self.socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None)
+        self.stack = contextlib.ExitStack()
+        self.socket = self.stack.enter_context(connect(pages[0]["webSocketDebuggerUrl"], max_size=None))
         self.numbers = itertools.count(1)
         self.console = []
         for domain in ("Runtime", "Log", "Page", "Network"):
@@ -108,7 +110,7 @@ class Browser:
         Path(path).write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
     def close(self):
-        self.socket.close()
+        self.stack.close()
         self.process.kill()
         self.process.wait()
         shutil.rmtree(self.home, ignore_errors=True)
