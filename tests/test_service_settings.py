@@ -121,7 +121,8 @@ def test_expressions(text, made):
     "text",
     ["ARX", "ARX(2", "ARX(2, 2).bind(1)", "open('/etc/passwd')", "ARX(*[1, 2])", "ARX(**{'na': 1})",
      "(" * 500 + ")" * 500, "ARX(" * 90 + ")" * 90, "Kalman(q=1, r=1)", "ARX([x for x in (1, 2)])",
-     "ARX(1 if 1 else 2)", "ARX(9**9**9)", "a" * 3000, "(lambda: 0)()", "ARX.__init__()", "ARX(f'{1}')", "Settings()", "Live()", "track()", ""],
+     "ARX(1 if 1 else 2)", "ARX(9**9**9)", "a" * 3000, "(lambda: 0)()", "ARX.__init__()", "ARX(f'{1}')",
+     "Settings()", "Live()", "track()", ""],
 )  # fmt: skip
 def test_nothing_is_evaluated(text):
     with pytest.raises(ValueError):
