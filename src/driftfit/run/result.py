@@ -292,9 +292,13 @@ class Track(Plain):
         return cls.from_stored(path, *storage.read(path, "track"))
 
     @classmethod
-    def from_stored(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        """The inverse of `stored`; ``path`` is named in error messages."""
-        program = Program(storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker))
+    def from_stored(
+        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array],
+        shared: Model | None = None,
+    ) -> Self:  # fmt: skip
+        """The inverse of `stored`; ``path`` is named in error messages, ``shared`` is that of `Program`."""
+        model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
+        program = Program(model, tracker, shared=shared)
         record = Record(
             arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
         )
