@@ -24,7 +24,7 @@ from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.many import Many
-from driftfit.run.program import Program, shown, state_of, tile_of
+from driftfit.run.program import Program, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -148,7 +148,7 @@ class Outputs(Many):
         steps = self._programs[0].steps._replace(store=collect)
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
         out = np.empty(len(self), output_type(tile, COLLECTED))
-        self._programs[0].drivers(steps=steps).run(tile, *_in_lanes(self.record), out)
+        self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
     def __getitem__(self, output: str | int) -> Track:
@@ -199,11 +199,6 @@ class Outputs(Many):
         lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
         return End(self._programs, states, self.time[-1] if self.timed else None)
-
-
-def _in_lanes(record: Record) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record of outputs, y (T, ny), known (T, k, ny): every lane gets the same inputs u (T, m)."""
-    return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
 
 
 def missing(name: str, output: str) -> str:

@@ -94,14 +94,14 @@ class Program:
         return np.empty(T, output_type(tile, self.tracker.outputs, keep))
 
     def run(self, tile: Array, record: Record, keep: str = "std") -> Array:
-        """Run a tile of one lane over a record; returns the driver's output, (T,) records of `output_type`."""
+        """Run a tile over a record, a lane for each output; returns the driver's output, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep)
         with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
             task = progress.add_task("tracking", total=T)
             for a in range(0, T, CHUNK):
                 b = min(a + CHUNK, T)
-                self.drivers(keep).run(tile, *lane_of(record.part(slice(a, b))), out[a:b])
+                self.drivers(keep).run(tile, *lanes_of(record.part(slice(a, b))), out[a:b])
                 progress.advance(task, b - a)
         return out
 
@@ -121,8 +121,10 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
     return tile
 
 
-def lane_of(record: Record) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record in the form that drivers of a tile of one lane take."""
+def lanes_of(record: Record) -> tuple[Array, Array, Array]:
+    """(y, u, known) of a record in the form that drivers take: a lane for each output, all with the same inputs."""
+    if record.y.ndim > 1:
+        return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
     return record.y[:, None], record.u[:, :, None], record.known.columns[:, :, None]
 
 

@@ -16,7 +16,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.program import Program, State, lane_of, state_of
+from driftfit.run.program import Program, State, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -245,7 +245,7 @@ class Track(Plain):
         """The state after sample t, field by field; replays the record up to t, O(t)."""
         tile = self.fresh()
         record = self.record.part(slice(0, t % len(self) + 1))
-        self.program.drivers().run(tile, *lane_of(record), self.program.written(tile, len(record)))
+        self.program.drivers().run(tile, *lanes_of(record), self.program.written(tile, len(record)))
         return state_of(tile)
 
     def fresh(self) -> Array:

@@ -13,8 +13,8 @@ from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.outputs import Outputs
-from driftfit.run.program import Program, programs_of
-from driftfit.run.result import Track, track_record
+from driftfit.run.program import Program, programs_of, tile_of
+from driftfit.run.result import Lane, Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval
@@ -134,13 +134,15 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
 
 def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None) -> Track | Outputs | Shared:
     """Run one series."""
-    if records.outputs:
-        run: Outputs = run_fleet(programs, records, keep, before={} if before is None else {0: before})[0]
-        return run
-    (program,), record, start = programs, records.part(0), None
+    program, record = programs[0], records.part(0)
+    starts = carried(before, programs)
     if before is not None:
-        (start,) = carried(before, programs)
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
-    track = track_record(program, record, keep, start)
-    return track if program.shared is None else Shared(track)
+    tile = tile_of(programs, starts)
+    out = program.run(tile, record, keep)
+    if records.outputs:
+        lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
+        return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
+    run = Track(program, record, Lane(out, tile), *starts)
+    return run if program.shared is None else Shared(run)
