@@ -35,6 +35,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import input_names, one_of, output_names, whole
 from driftfit.models.base import Model
+from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
@@ -177,6 +178,12 @@ class ARX(Model):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
 
+    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
+        return {**self.memory(), **no_doubts(len(self.outputs), self.na)} if doubts and self.na > 0 else self.memory()
+
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        return _steps(self.na, self.lags, self.intercept, True) if doubts and self.na > 0 else self.steps
+
     @property
     def apply(self) -> Step | None:
         return take_input if all(nk > 0 for _, nk in self.lags) else None
@@ -237,7 +244,7 @@ def take_input(s: State, l: int) -> None:
 
 
 @lru_cache
-def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> ModelSteps:
+def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: bool = False) -> ModelSteps:
     """The steps for one set of orders, which are constants, so that every loop is unrolled."""
     m = len(lags)
     # without inputs the loops over them never run, but Numba cannot type an empty tuple
@@ -254,7 +261,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
             lag = s.y_lag[i, l]
             lag = np.nan if broken else lag
             s.y_lag[i, l] = lag
-            s.phi[i, l] = lag
+            s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
         for j in range(m):
             # the present input has position 0, so lag k is entry k, and nk = 0 needs no special case
             for i in range(depth - 1, 0, -1):
@@ -275,6 +282,8 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
 
     @kernel
     def push(s: State, l: int) -> None:
+        if doubts:
+            shift_doubts(s, 0, l, l, l, 1)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
@@ -325,6 +334,10 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
 
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        doubts = doubts and self.na > 0
+        return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs), doubts)
+
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
 
@@ -333,7 +346,9 @@ class JointARX(ARX):
 
 
 @lru_cache
-def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
+def _joint_steps(
+    na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int, doubts: bool = False
+) -> ModelSteps:
     m = len(lags)
     nb = tuple(b for b, _ in lags) or (0,)
     nk = tuple(k for _, k in lags) or (0,)
@@ -347,7 +362,7 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
         for o in range(ny):
             for i in range(na):
                 s.y_lag[o, i, l] = np.nan if broken else s.y_lag[o, i, l]
-                s.phi[o * na + i, l] = s.y_lag[o, i, l]
+                s.phi[o * na + i, l] = doubted(s, o, i, l, s.y_lag[o, i, l]) if doubts else s.y_lag[o, i, l]
         for j in range(m):
             for i in range(depth - 1, 0, -1):
                 s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
@@ -365,6 +380,8 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
     @kernel
     def push(s: State, l: int) -> None:
         for o in range(ny):  # lane o belongs to output o
+            if doubts:
+                shift_doubts(s, o, l, o, 0, ny)
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
             informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
