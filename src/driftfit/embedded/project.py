@@ -164,13 +164,14 @@ def files_of(model: Model, tracker: Tracker, tile: Array, what: str) -> dict[str
 
     unit = Unit(tile)
     u = Value("array", "u", shape=(model.m,), strides=(1,))
-    update = drivers(model.steps, tracker.steps_for(model)).update.function
+    steps = tracker.steps_for(model)
+    update = drivers(model.steps_for(steps.doubts), steps).update.function
     entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
     names = ", ".join(tracker.names_for(model))
     header = HEADER.format(
         what=what, version=__version__, n=len(tile["theta"][0]), m=model.m, names=names, fields=_fields(tile)
     )
-    source = SOURCE.format(what=what) + _source(unit, entry, tile, set(model.memory()))
+    source = SOURCE.format(what=what) + _source(unit, entry, tile, set(model.memory_for(steps.doubts)))
     size = sum(tile[name][0].size for name in fields(tile))
     wholes = sum(tile[name][0].size for name in fields(tile) if tile.dtype[name].base.kind == "i")
     readme = README.format(

@@ -123,6 +123,7 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    doubts: bool = False
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
