@@ -224,7 +224,9 @@ def faults(run: Any) -> list[str]:
     """What is wrong with the numbers and the memory of a bank."""
     wrong = [] if np.isfinite(run.theta).all() and np.isfinite(run.prediction[run.ok]).all() else ["not finite"]
     wrong, p = wrong + trespassed(run.state), run.hypotheses.mode_prob
-    return wrong if (p > -1e-9).all() and (p < 1.0 + 1e-9).all() else [*wrong, "not probabilities"]
+    known = ~np.isnan(p).any(axis=1)  # once the bank has begun
+    proper = (p[known] > -1e-9).all() and (p[known] < 1.0 + 1e-9).all() and (np.diff(known.astype(int)) >= 0).all()
+    return wrong if proper else [*wrong, "not probabilities"]
 
 
 def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
