@@ -137,8 +137,31 @@ def test_states_travel_both_ways(tmp_path):
     assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
     ctypes.memmove(ours.buffer, to_struct(live), ours.size)
     assert bits(ours.update(0.4, [0.5])) == bits(live.update(0.4, 0.5))
-    with pytest.raises(ValueError, match="a state of 1336 bytes; got 3"):
+    with pytest.raises(ValueError, match="a state of 1280 bytes; got 3"):
         from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), b"abc")
+
+
+@needs_gcc
+def test_a_controllers_state_opens_as_a_saved_stream(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), 500)
+    opened = Live.from_bytes(from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), ours.state).to_bytes())
+    stored = Live.from_bytes(live.to_bytes())
+    assert bits(opened.theta) == bits(stored.theta)
+    assert same_numbers(to_struct(opened), to_struct(stored))
+    assert bits(opened.update(0.1, 0.2)) == bits(stored.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
+
+
+def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
+    given, nothing = (Live(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=p0)) for p0 in (1.0, None))
+    assert len(to_struct(given)) == 448 < len(to_struct(nothing)) == 1280  # without the fields of the diffuse start
+    export_c(ARX(2, 2), given.program.tracker, tmp_path)
+    source = (tmp_path / "tracker.c").read_text()
+    assert "refresh" not in source
+    assert re.search(r"s->P\[.*\] \+ \(s->q\[i\] \* time\)", source)  # no factors of one
+    assert "s->r * s->noise" in source  # settings and known factors may change on the controller
+    given.lane()["each"][:] = 1.5
+    with pytest.raises(ValueError, match=r"to_struct: the field 'each' is \[1.5, 1.5"):
+        to_struct(given)
 
 
 @needs_gcc
@@ -211,6 +234,66 @@ def test_what_cannot_be_exported_is_said(tmp_path):
 
 
 @kernel
+def slope_of(e):
+    if abs(e) > 1.0:
+        return 1.0 / abs(e)
+    return 1.0
+
+
+@kernel
+def descend(s, l):
+    y_hat, power = 0.0, 1e-3
+    for i in range(s.phi.shape[0]):
+        y_hat += s.phi[i, l] * s.theta[i, l]
+        power += s.phi[i, l] ** 2
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, s.y[l] - y_hat, s.r[l]
+    some = 1
+    for i in range(s.phi.shape[0]):
+        some = some if s.phi[i, l] == 0.0 else 3
+        s.theta[i, l] += s.ok[l] * s.rate[l] * some * slope_of(s.e[l]) * s.e[l] * s.phi[i, l] / power
+    s.leaks[l] += some - 1
+    some = 2
+    s.turns[l] += some
+    s.rate[l] *= 1.0 if s.noise[l] < 2.0 else 0.5
+
+
+@kernel
+def unknown_variance(s, l):
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = np.nan
+
+
+@kernel
+def still(s, l):
+    """Nothing changes with time."""
+
+
+@dataclass(frozen=True)
+class Descent(Tracker):
+    """A tracker of one's own: normalised gradient steps with bounded errors."""
+
+    rate: float = 0.1
+    covariance = False
+
+    def state(self, n):
+        return {"theta": np.zeros(n), "rate": self.rate, "r": 1.0, "leaks": 0, "turns": 0}
+
+    @property
+    def steps(self):
+        return TrackerSteps(still, descend, unknown_variance)
+
+
+@needs_gcc
+def test_a_tracker_of_ones_own_is_exported_like_any_other(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Descent(rate=0.1), 1_000)
+    assert "r" not in [name for name in re.findall(r"tracker_real (\w+);", (tmp_path / "tracker.h").read_text())]
+    live.lane()["noise"][...] = 4.0
+    ctypes.memmove(ours.buffer, to_struct(live), ours.size)
+    assert bits(live.update(0.5, 0.3)) == bits(ours.update(0.5, [0.3]))
+    assert same_numbers(ours.state, to_struct(live))
+
+
+@kernel
 def correct(s, l):
     s.y_hat[l] = s.phi[0, l] * s.theta[0, l]
     s.e[l] = s.y[l] - s.y_hat[l]
@@ -258,7 +341,7 @@ def test_the_command_writes_the_same(tmp_path):
 def test_readme_and_header_say_what_there_is(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
-    assert "1336 bytes in double precision" in readme
+    assert "1280 bytes in double precision" in readme
     counted = re.search(r"at most\s+(\d+) multiplications, (\d+) additions and 1 division\.", readme)
     assert 60 <= int(counted[1]) <= 100  # 2.5 n^2 + 8 n or so
     assert 60 <= int(counted[2]) <= 100

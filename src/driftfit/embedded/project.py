@@ -7,17 +7,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from driftfit.data.storage import fields
 from driftfit.embedded.selftest import selftest
-from driftfit.embedded.statements import translate
-from driftfit.embedded.unit import Function, Unit
-from driftfit.embedded.values import Value, number
-from driftfit.engine.drivers import drivers
-from driftfit.engine.kernel import Array
-from driftfit.models.base import Model
-from driftfit.trackers.base import Tracker
+from driftfit.embedded.translation import Translation, translation
+from driftfit.embedded.unit import Unit
+from driftfit.embedded.values import number
+from driftfit.run.program import Program
 
 HEADER = """\
 /* {what}
@@ -158,59 +152,56 @@ for (;;) {{
 """
 
 
-def files_of(model: Model, tracker: Tracker, tile: Array, what: str) -> dict[str, str]:
+def files_of(program: Program, what: str) -> dict[str, str]:
     """The text of every file, by its name."""
     from driftfit import __version__
 
-    unit = Unit(tile)
-    u = Value("array", "u", shape=(model.m,), strides=(1,))
-    update = drivers(model.steps, tracker.steps_for(model)).update.function
-    entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
-    names = ", ".join(tracker.names_for(model))
+    made, m = translation(program), program.model.m
+    names = ", ".join(program.names)
     header = HEADER.format(
-        what=what, version=__version__, n=len(tile["theta"][0]), m=model.m, names=names, fields=_fields(tile)
+        what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made)
     )
-    source = SOURCE.format(what=what) + _source(unit, entry, tile, set(model.memory()))
-    size = sum(tile[name][0].size for name in fields(tile))
-    wholes = sum(tile[name][0].size for name in fields(tile) if tile.dtype[name].base.kind == "i")
+    source = SOURCE.format(what=what) + _source(made, set(program.model.memory()))
     readme = README.format(
-        what=what, names=names, doubles=8 * size, singles=4 * size + 4 * wholes, ops=_said(entry.operations),
-        ordinary=_said(_ordinary(unit)),
+        what=what, names=names, doubles=made.size(8), singles=made.size(4), ops=_said(made.entry.operations),
+        ordinary=_said(_ordinary(made.unit)),
     )  # fmt: skip
-    return {"tracker.h": header, "tracker.c": source, "selftest.c": selftest(model, tracker), "README.md": readme}
+    test = selftest(program.model, program.tracker)
+    return {"tracker.h": header, "tracker.c": source, "selftest.c": test, "README.md": readme}
 
 
-def _fields(tile: Array) -> str:
+def _fields(made: Translation) -> str:
     lines = []
-    for name in fields(tile):
-        array = tile[name][0]
+    for name in made.names:
+        array = made.start[name][0]
         kind = "int64_t" if array.dtype.kind == "i" else "tracker_real"
         lines.append(f"    {kind} {name}{'' if array.size == 1 else f'[{array.size}]'};")
     return "\n".join(lines)
 
 
-def _source(unit: Unit, entry: Function, tile: Array, memory: set[str]) -> str:
+def _source(made: Translation, memory: set[str]) -> str:
     """Tables, functions and the public interface."""
-    steps = "\n\n".join(function.text for function in unit.functions.values())
+    steps = "\n\n".join(function.text for function in made.unit.functions.values())
     support = [text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)]
-    start = f"static const tracker_state START = {{\n{_initial(tile)}\n}};"
-    tables = [body % name for body, name in unit.tables.items()]
-    return "\n\n".join([*support, *tables, start, steps, _face(entry, tile, memory)]) + "\n"
+    start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
+    tables = [body % name for body, name in made.unit.tables.items()]
+    return "\n\n".join([*support, *tables, start, steps, _face(made, memory)]) + "\n"
 
 
-def _initial(tile: Array) -> str:
+def _initial(made: Translation) -> str:
     lines = []
-    for name in fields(tile):
-        values = ", ".join(number(one).text for one in tile[name][0].ravel().tolist())
-        lines.append(f"    {values}," if tile[name][0].size == 1 else f"    {{{values}}},")
+    for name in made.names:
+        values = ", ".join(number(one).text for one in made.start[name][0].ravel().tolist())
+        lines.append(f"    {values}," if made.start[name][0].size == 1 else f"    {{{values}}},")
     return "\n".join(lines)
 
 
-def _face(entry: Function, tile: Array, memory: set[str]) -> str:
-    own = [name for name in fields(tile) if name not in memory]
+def _face(made: Translation, memory: set[str]) -> str:
     copies = []
-    for name in own:
-        size = tile[name][0].size
+    for name in made.names:
+        if name in memory:
+            continue
+        size = made.start[name][0].size
         line = f"s->{name} = START.{name};" if size == 1 else (
             f"for (int i = 0; i < {size}; i++) s->{name}[i] = START.{name}[i];"
         )  # fmt: skip
@@ -219,7 +210,7 @@ def _face(entry: Function, tile: Array, memory: set[str]) -> str:
         "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
         "tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
         "    tracker_step step;",
-        f"    {entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
+        f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
         "    return step;", "}", "",
         "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
@@ -248,8 +239,3 @@ def write(path: Path, texts: dict[str, Any]) -> None:
     path.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (path / name).write_text(text, encoding="utf-8")
-
-
-def record_bytes(tile: Array) -> bytes:
-    """The state as it is stored in the structure of the double-precision build."""
-    return b"".join(np.ascontiguousarray(tile[name][0]).tobytes() for name in fields(tile))
