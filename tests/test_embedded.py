@@ -221,6 +221,23 @@ def test_a_wrong_bit_fails_the_self_test(tmp_path):
     assert subprocess.run([str(tmp_path / "st")], capture_output=True, check=False).returncode == 1
 
 
+@needs_gcc
+@pytest.mark.parametrize("inputs", [1, 0])
+def test_the_simulink_block_gives_the_bits_of_a_stream(tmp_path, inputs):
+    model, tracker = ARX(2, 2 * inputs), Kalman(q=1e-3, r=0.1, p0=1.0)
+    export_c(model, tracker, tmp_path)
+    include = [f"-I{ROOT / 'tests' / 'simulink'}", "-DMATLAB_MEX_FILE", "-fsanitize=address,undefined"]
+    sources = [str(tmp_path / name) for name in ("tracker_sfun.c", "tracker.c")]
+    subprocess.run(["gcc", *STRICT, "-O1", *include, "-o", str(tmp_path / "block"), *sources, "-lm"], check=True)
+    y, u = record(model, 200)
+    live, rows = Live(model, tracker), "\n".join(" ".join(map(repr, row)) for row in np.c_[y, u[:, :inputs]].tolist())
+    done = subprocess.run([str(tmp_path / "block")], input=rows, capture_output=True, text=True, check=True)
+    for line, *row in zip(done.stdout.splitlines(), y, u[:, :inputs], strict=True):
+        step = live.update(*row)
+        expected = [*np.c_[live.theta, live.lane()["var"]].ravel(), step[0], step[1], step[2], step[3]]
+        np.testing.assert_array_equal(np.array(line.split(), dtype=float), np.array(expected, dtype=float))
+
+
 def test_what_cannot_be_exported_is_said(tmp_path):
     with pytest.raises(ValueError, match="Bank has no C form"):
         export_c(ARX(1, 1), Bank(), tmp_path)

@@ -20,7 +20,7 @@ from driftfit.trackers.base import Tracker
 
 
 def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
-    """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``.
+    """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, a self-test, an S-function and ``README.md``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The files of an exported tracker: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``."""
+"""The files of an exported tracker: its source, a self-test, a block for Simulink and ``README.md``."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from driftfit.embedded.selftest import selftest
+from driftfit.embedded.simulink import SFUNCTION
 from driftfit.embedded.translation import Translation, translation
 from driftfit.embedded.unit import Unit
 from driftfit.embedded.values import number
@@ -127,7 +128,8 @@ static int64_t bits_of(double number) {
 README = """\
 # {what}
 
-`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give.
+`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give;
+`tracker_sfun.c`: an S-function that makes it a Simulink block.
 
     cc -std=c99 -O2 -ffp-contract=off -o selftest tracker.c selftest.c -lm && ./selftest
 
@@ -167,7 +169,9 @@ def files_of(program: Program, what: str) -> dict[str, str]:
         ordinary=_said(_ordinary(made.unit)),
     )  # fmt: skip
     test = selftest(program.model, program.tracker)
-    return {"tracker.h": header, "tracker.c": source, "selftest.c": test, "README.md": readme}
+    return {
+        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": SFUNCTION, "README.md": readme
+    }  # fmt: skip
 
 
 def _fields(made: Translation) -> str:
