@@ -183,9 +183,9 @@ def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples, no Ad
     if not quick:
         trackers["AdaptiveKalman"] = AdaptiveKalman()
     table = Table(title="On a Cortex-M4F, -O2", show_edge=False)
-    numbers = ("state, bytes", "code, bytes", "instructions", "cycles")
+    numbers = ("state", "code", "instr.", "cycles")
     for head in ("tracker", "n", *numbers, *numbers):
-        table.add_column(head, justify="left" if head == "tracker" else "right")
+        table.add_column(head, justify="left" if head == "tracker" else "right", no_wrap=True)
     for name, tracker in trackers.items():
         for n in sizes if name == "Kalman" else (4,):
             row = [name, str(n)]
@@ -203,7 +203,7 @@ def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples, no Ad
                 counts = [["-", "-"] if count is None else list(map(str, count)) for count in hand]
                 table.add_row("filter.c, by hand", str(n), "", "", *counts[0], "", "", *counts[1], style="dim")
     out.print(table)
-    out.print("double precision, then single (-DTRACKER_SINGLE), which the processor has in hardware", style="dim")
+    out.print("bytes of state and code, and per update; first in double precision, then in single (-DTRACKER_SINGLE)")
     beside = Table(title="\nOn this computer, beside filter.c", show_edge=False)
     for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
         beside.add_column(head, justify="right")

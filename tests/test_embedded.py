@@ -13,7 +13,9 @@ import pytest
 from contract_table import forms, ready
 from typer.testing import CliRunner
 
-from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, Kalman, Live, Regression, trackers
+from driftfit import (
+    ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, HammersteinWiener, Kalman, Live, Polynomial, Regression, trackers,
+)  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
 from driftfit.embedded.selftest import record
@@ -45,6 +47,7 @@ OTHERS = {
     "second differences": (ARX(1, 1), FLS(100.0, differences=2)),
     "two inputs": (ARX(2, [2, 1], nk=[1, 0], intercept=True), Kalman(q=1e-4, r=0.1)),
     "no input": (ARX(2, 0), Kalman(q=1e-4, r=0.1)),
+    "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }
 
 
@@ -183,7 +186,7 @@ def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, f
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["adaptive", "blocks"])
+@pytest.mark.parametrize("name", ["adaptive", "blocks", "start"])
 def test_single_precision_is_close(tmp_path, name):
     said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
     assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
@@ -200,7 +203,8 @@ def test_the_self_test_passes_on_an_emulated_controller(tmp_path, name, flags):
 
 def selftest(folder, name, compiler, run):
     """Compile the self-test and run it; it must pass and print one line."""
-    tracker = AdaptiveKalman() if name == "adaptive" else ready(ExtendedKalman)
+    kinds = {"adaptive": AdaptiveKalman, "blocks": ExtendedKalman, "start": Kalman}
+    tracker = ready(kinds[name])
     export_c(tracker.own_model(2, 2, 1) or ARX(2, 2), tracker, folder)
     target = str(folder / "selftest")
     sources = [str(folder / "tracker.c"), str(folder / "selftest.c")]

@@ -92,20 +92,16 @@ SUPPORT = {
     "whole_maximum": "static int64_t whole_maximum(int64_t a, int64_t b) { return b > a ? b : a; }",
     "whole_abs": "static int64_t whole_abs(int64_t a) { return a < 0 ? -a : a; }",
     "real_square": "static real real_square(real a) { return a * a; }",
-    "from_bits": """#ifndef TRACKER_SINGLE
-static double from_bits(int64_t bits) {
+    "from_bits": """static double from_bits(int64_t bits) {
     union { int64_t whole; double number; } both;
     both.whole = bits;
     return both.number;
-}
-#endif""",
-    "bits_of": """#ifndef TRACKER_SINGLE
-static int64_t bits_of(double number) {
+}""",
+    "bits_of": """static int64_t bits_of(double number) {
     union { int64_t whole; double number; } both;
     both.number = number;
     return both.whole;
-}
-#endif""",
+}""",
     "four": "typedef struct { real at[4]; } four;",
     "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
     "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
@@ -186,10 +182,18 @@ def _fields(made: Translation) -> str:
 def _source(made: Translation, memory: set[str]) -> str:
     """Tables, functions and the public interface."""
     steps = "\n\n".join(function.text for function in made.unit.functions.values())
-    support = [text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)]
+    support = _support(steps)
     start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
     tables = [body % name for body, name in made.unit.tables.items()]
     return "\n\n".join([*support, *tables, start, steps, _face(made, memory)]) + "\n"
+
+
+def _support(steps: str) -> list[str]:
+    """The functions that the steps call; those that only the double-precision build calls are not in the other."""
+    in_single = re.sub(r"^#else\n.*?^#endif", "", steps, flags=re.S | re.M)
+    used = {name: text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)}
+    return [text if re.search(rf"\b{name}\b", in_single) else f"#ifndef TRACKER_SINGLE\n{text}\n#endif"
+            for name, text in used.items()]  # fmt: skip
 
 
 def _initial(made: Translation) -> str:
