@@ -132,8 +132,7 @@ README = """\
 * Parameters: {names}.
 * State: {doubles} bytes in double precision, {singles} with `-DTRACKER_SINGLE`. No heap, no global state, no recursion.
 * An update takes at most {ops}.
-  Loops are counted at their longest, and of two branches the dearer. After the start a sample takes at most
-  {ordinary}.
+  Loops are counted at their longest, and of two branches the dearer.{ordinary}
 * From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
 * `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
 
@@ -162,7 +161,7 @@ def files_of(program: Program, what: str) -> dict[str, str]:
     source = SOURCE.format(what=what) + _source(made, set(program.model.memory()))
     readme = README.format(
         what=what, names=names, doubles=made.size(8), singles=made.size(4), ops=_said(made.entry.operations),
-        ordinary=_said(_ordinary(made.unit)),
+        ordinary=_after_the_start(made),
     )  # fmt: skip
     test = selftest(program.model, program.tracker)
     return {
@@ -224,6 +223,13 @@ def _face(made: Translation, memory: set[str]) -> str:
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
         "void tracker_reset(tracker_state *s) {", *copies, "}",
     ])  # fmt: skip
+
+
+def _after_the_start(made: Translation) -> str:
+    """What a sample takes after the start, if the start takes more."""
+    ordinary = _said(_ordinary(made.unit))
+    differs = ordinary != _said(made.entry.operations)
+    return f" After the start a sample takes at most\n  {ordinary}." if differs else ""
 
 
 def _ordinary(unit: Unit) -> Counter[str]:
