@@ -40,7 +40,7 @@ class Judged(fleet.Many):
         return diagnoses(self.runs())
 
     def detect(
-        self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
+        self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:  # fmt: skip
         """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
