@@ -50,7 +50,7 @@ class Judged(many.Many):
         return diagnoses(dict(self.items()))
 
     def detect(
-        self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
+        self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:  # fmt: skip
         """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
