@@ -11,6 +11,7 @@ import socket
 import subprocess
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -199,12 +200,29 @@ def test_postgres(tmp_path):
             rows = db.execute(
                 "select number, unit, y_hat, theta, std, names from driftfit_result order by number"
             ).fetchall()
+            for sql in dashboard():
+                db.execute(sql).fetchall()
             events = db.execute("select kind, detail->>'cause' from driftfit_event").fetchall()
     assert [row[0] for row in rows] == [1, 2, 3, 4, 5]
     assert rows[0][1] == "pump 1"
     assert np.isnan(rows[0][2])
     assert rows[0][3:] == ([0.5, 0.1], [0.1, float("inf")], ["a1", "b1"])
     assert events == [("alarm", "a1")]
+
+
+def dashboard():
+    """The queries of Grafana's dashboard, with its macros written out."""
+    page = Path(__file__).parent.parent / "docs" / "service" / "grafana" / "dashboard.json"
+    macros = {
+        "$__timeGroupAlias(time, $__interval)": "time",
+        "$__timeFilter(time)": "true",
+        "$__timeFilter(at)": "true",
+    }
+    for panel in json.loads(page.read_text())["panels"]:
+        sql = panel["targets"][0]["rawSql"].replace("$unit", "pump 1")
+        for macro, plain in macros.items():
+            sql = sql.replace(macro, plain)
+        yield sql
 
 
 def _opened(sink):

@@ -152,6 +152,9 @@ def test_payloads():
     assert seconds(1769860800000, 1e-3) == 1769860800.0
 
 
+ODD = list(b'0123456789.,:[]{}"-eEtyu nulNa\\\x00\xff')
+
+
 def fuzzed(count, seed):
     """Payloads that are nearly right, or not at all."""
     rng = np.random.default_rng(seed)
@@ -163,7 +166,7 @@ def fuzzed(count, seed):
     for _ in range(count - len(odd)):
         text = bytearray(good if rng.uniform() < 0.7 else rng.bytes(int(rng.integers(1, 80))))
         for _ in range(int(rng.integers(1, 5))):
-            text[int(rng.integers(len(text)))] = int(rng.integers(256))
+            text[int(rng.integers(len(text)))] = int(rng.choice(ODD))
         yield bytes(text)
 
 
@@ -175,7 +178,7 @@ def test_fuzzed_messages():
         except ValueError:
             refused += 1
         decoded("", payload)
-    assert 500 < refused < 3000
+    assert 1000 < refused < 2900
 
 
 def test_secrets_are_never_shown(tmp_path, monkeypatch):
