@@ -350,18 +350,18 @@ def test_tail(tmp_path, kind):
     reader = source.open(None)
     batch = reader.read(1.0)
     assert [one.topic for one in batch.samples] == ["plant/p0", "plant/p1"]
-    assert sum(one.count for one in batch.samples) == 10
+    assert sum(one.length for one in batch.samples) == 10
     assert reader.read(0.1) is None  # half a line
     with path.open("a") as file:
         file.write(lines[10][-3:] + "no,line\n" + "".join(lines[11:]))
     reader.close()
     reader = source.open(batch.position)
     rest = reader.read(1.0)
-    assert sum(one.count for one in rest.samples) == 10
+    assert sum(one.length for one in rest.samples) == 10
     assert rest.refused == 1
     path.rename(tmp_path / "old")
     path.write_text(head + "".join(lines[:4]))
-    assert sum(one.count for one in reader.read(2.0).samples) == 4  # the new file, from its beginning
+    assert sum(one.length for one in reader.read(2.0).samples) == 4  # the new file, from its beginning
     reader.close()
 
 
@@ -369,11 +369,11 @@ def test_replay(tmp_path):
     path = tmp_path / "plant.csv"
     path.write_text("t,y\n" + "".join(f"2026-01-01T00:00:{t:02d},{t}\n" for t in range(30)))
     fast = Replay("r", str(path)).open(5).read(1.0)
-    assert (fast.samples[0].count, fast.position) == (25, 30)
+    assert (fast.samples[0].length, fast.position) == (25, 30)
     slow = Replay("r", str(path), time="t", speed=100.0).open(None)
     begun, count = time.monotonic(), 0
     while count < 30:
-        count += sum(one.count for one in slow.read(0.5).samples)
+        count += sum(one.length for one in slow.read(0.5).samples)
     assert 0.25 < time.monotonic() - begun < 5.0
     with pytest.raises(ValueError, match="no column"):
         Replay("r", str(path), time="when").check()

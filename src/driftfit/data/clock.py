@@ -188,6 +188,8 @@ class Clock:
 
     def since(self, last: Any, time: Any) -> float:
         """Nominal intervals from one instant to another; 1 if there is none before, NaN if time does not advance."""
+        if type(time) is float and type(last) is float and self.kind in ("number", "unset"):
+            return (time - last) / self.count if time > last else float("nan")
         self._fits(time)
         if last is None:
             return 1.0

@@ -1,4 +1,4 @@
-"""A live service: sources, a journal, the engine, sinks and a page; docs/service.md. What own sources and sinks need."""
+"""A live service: sources, a journal, the engine, sinks and a page (docs/service.md); what own sources need."""
 
 from driftfit.service.sinks.contract import Event, Outcome, Result, Sink, Writer
 from driftfit.service.sources.contract import Reader, Source

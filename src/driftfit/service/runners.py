@@ -81,7 +81,7 @@ class SourceRunner(Runner):
                         return
                     if batch.position is not None:
                         self.position = batch.position
-                    self.count += sum(one.count for one in batch.samples)
+                    self.count += sum(one.length for one in batch.samples)
         finally:
             reader.close()
 

@@ -183,7 +183,8 @@ class Live(Operated, Plain, Kept):
             self._ignored += 1
             self._expect(IGNORED if later else NOTHING)
             return (np.nan, np.nan, np.nan, False)
-        known = (float(interval), float(noise_of(weight)), float(factor("drift", drift)))
+        noise = 1.0 if weight == 1.0 else float(noise_of(weight))
+        known = (float(interval), noise, 1.0 if drift == 1.0 else float(factor("drift", drift)))
         y, u = float(as_numbers("y", y)), self._inputs(u)
         if self._gate is not None:
             (y,), u = self._gate.sample(np.array([y]), u)

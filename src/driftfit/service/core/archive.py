@@ -77,7 +77,7 @@ def export(folder: Path, floor: int, before: float) -> int:
                 break
             number = start
             for item in items:
-                count = item.count
+                count = item.length
                 rows["number"] += range(number, number + count)
                 rows["unit"] += [names[item.unit]] * count
                 rows["time"] += item.times if item.times is not None else [None] * count
@@ -88,7 +88,7 @@ def export(folder: Path, floor: int, before: float) -> int:
         journal.close()
     target = folder / "journal" / f"{first:016d}-{upto - 1:016d}.parquet"
     target.parent.mkdir(exist_ok=True)
-    types = {
+    types: dict[str, Any] = {
         "number": pl.Int64,
         "unit": pl.String,
         "time": pl.Float64,

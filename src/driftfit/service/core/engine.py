@@ -69,8 +69,8 @@ class Engine:
             out, number = Out(), first
             for item in items:
                 if self._apply(number, item, out, replay=True):
-                    again += item.count
-                number += item.count
+                    again += item.length
+                number += item.length
             if first >= told:
                 self._pending.add_results(first, out.results, out.events, time.time())
             self._flush_blocks(items)
@@ -118,7 +118,7 @@ class Engine:
         now = time.time()
         if items:
             self._pending.add_group(first, items, now)
-            self.next += sum(item.count for item in items)
+            self.next += sum(item.length for item in items)
         self._store_states()
         self._archive.forget(self._pending, self.journal, self._sinks_at())
         if not self._commit():
@@ -141,7 +141,7 @@ class Engine:
             for samples in batch.samples:
                 found = self.units.of_topic(samples.topic, self._pending, self.next)
                 if not found:
-                    refused["no unit for the topic"] += samples.count
+                    refused["no unit for the topic"] += samples.length
                 for number in found:
                     times, rows = self.units.admitted(self.units.get(number), samples)
                     if rows:
@@ -159,7 +159,7 @@ class Engine:
         out, number = Out(), first
         for item in items:
             self._apply(number, item, out)
-            number += item.count
+            number += item.length
         self._pending.add_results(first, out.results, out.events, now)
         self._flush_blocks(items)
         for unit in out.to_calibrate:

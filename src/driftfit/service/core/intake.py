@@ -91,4 +91,4 @@ class Intake:
 
 
 def _size(batch: Batch) -> int:
-    return max(1, sum(one.count for one in batch.samples))
+    return max(1, sum(one.length for one in batch.samples))

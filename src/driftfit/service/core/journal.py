@@ -53,7 +53,7 @@ class Item(NamedTuple):
     """What an operator, or the service itself, did; then there are no rows."""
 
     @property
-    def count(self) -> int:
+    def length(self) -> int:
         """How many numbers of the journal the entry takes."""
         return 1 if self.action is not None else len(self.rows)
 
@@ -162,7 +162,7 @@ class Pending:
 
     def add_group(self, first: int, items: list[Item], at: float) -> None:
         """The group that is to be journaled."""
-        count = sum(item.count for item in items)
+        count = sum(item.length for item in items)
         self.log = (first, count, at, _encode(items))
         self.meta["next"] = str(first + count)
 

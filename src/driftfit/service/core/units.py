@@ -117,10 +117,10 @@ class Units:
 
     def admitted(self, unit: Unit, samples: Samples) -> tuple[list[float] | None, list[list[float]]]:
         """The rows of a message that a unit takes; what it does not take is counted."""
-        if not self._paid(unit, samples.count):
-            unit.counts["flood"] += samples.count
+        if not self._paid(unit, samples.length):
+            unit.counts["flood"] += samples.length
             return None, []
-        settings, columns, count = unit.settings, samples.columns, samples.count
+        settings, columns, count = unit.settings, samples.columns, samples.length
         if not any(name in columns for name in settings.columns):
             unit.counts["no signal"] += count
             return None, []

@@ -125,14 +125,15 @@ class Feed:
 
     async def recent(self, unit: int) -> list[list[Any]]:
         """The last results of a unit, which is watched from now on."""
-        found = self.watched.get(unit)
-        if found is None:
+        if unit not in self.watched:
             async with self.lock:
-                found = self.watched.get(unit) or await asyncio.to_thread(self._watch, unit)
-        found[1][0] = time.monotonic()
-        return list(found[0])
+                if unit not in self.watched:
+                    await asyncio.to_thread(self._watch, unit)
+        rows, asked = self.watched[unit]
+        asked[0] = time.monotonic()
+        return list(rows)
 
-    def _watch(self, unit: int) -> tuple[deque[list[Any]], list[float]]:
+    def _watch(self, unit: int) -> None:
         """Read what the blocks of the history do not yet have."""
         row = self.journal.db.execute("select last from block where unit = ? order by first desc limit 1", (unit,))
         found = row.fetchone()
@@ -147,7 +148,6 @@ class Feed:
                 if group <= end:
                     rows.extend(one for one in results if one[1] == unit)
         self.watched[unit] = (rows, [time.monotonic()])
-        return self.watched[unit]
 
     async def ask(self, header: dict[str, Any], body: bytes = b"") -> dict[str, Any]:
         """A question to the engine; OSError if it does not answer."""

@@ -113,6 +113,7 @@ def _told(found: list[Array], counts: list[int]) -> dict[str, Any]:
     if not found:
         return {"count": 0, "low": [], "high": [], "mean": []}
     stack = np.stack(found)
-    plain = np.where(np.isfinite(stack), stack, None)
+    plain = stack.astype(object)
+    plain[~np.isfinite(stack)] = None
     kinds = {name: plain[:, k].T.tolist() for k, name in enumerate(("low", "high", "mean"))}
     return {"count": int(sum(counts)), **kinds}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -119,7 +120,7 @@ class _Reader:
         service = self.tried(("service",), lambda: build(ServiceOptions, self.table("service")))
         page = self.tried(("page",), lambda: build(PageOptions, self.table("page")))
         sources = [self.one("source", key, given) for key, given in self.sources().items()]
-        units = [self.tried(("unit", k), lambda k=k: self.unit(k)) for k in range(len(self.tables("unit")))]
+        units = [self.tried(("unit", k), partial(self.unit, k)) for k in range(len(self.tables("unit")))]
         sinks = [self.one("sink", k, given) for k, given in enumerate(self.tables("sink"))]
         if not self.problems and not self.data.get("source"):
             self.fault((), 'there is no source; add a table such as [source.plant] with kind = "mqtt".')

@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import polars as pl
 
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
-TYPES = {
+TYPES: dict[str, Any] = {
     "number": pl.Int64, "unit": pl.String, "time": pl.Float64, "y": pl.Float64, "y_hat": pl.Float64, "e": pl.Float64,
     "s": pl.Float64, "ok": pl.Boolean, "theta": pl.List(pl.Float64), "std": pl.List(pl.Float64), "alarm": pl.Boolean,
 }  # fmt: skip

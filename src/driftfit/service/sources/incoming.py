@@ -32,7 +32,7 @@ class Incoming:
             return {"error": "busy: samples are held back; try again later", "status": 503}
         if not done.wait(WAIT):
             return {"error": "the journal does not take samples now; try again later", "status": 503}
-        return {"received": sum(one.count for one in samples), "refused": refused[:20]}
+        return {"received": sum(one.length for one in samples), "refused": refused[:20]}
 
 
 INCOMING = Incoming()

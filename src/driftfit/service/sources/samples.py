@@ -33,9 +33,9 @@ class Samples(NamedTuple):
     """Samples of one topic."""
 
     topic: str
-    count: int
+    length: int
     columns: Mapping[str, Any]
-    """A list of ``count`` values, or one value for all of them, by name of the field."""
+    """A list of ``length`` values, or one value for all of them, by name of the field."""
 
 
 class Batch(NamedTuple):

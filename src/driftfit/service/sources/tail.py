@@ -97,7 +97,7 @@ class _Tail(Reader):
                     refused += 1
                     continue
                 topic = self._topic(found.columns)
-                if found.count > 1:
+                if found.length > 1:
                     samples.append(found._replace(topic=topic))
                     continue
                 row = dict(found.columns)
