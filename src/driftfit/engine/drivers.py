@@ -365,5 +365,21 @@ def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None
 
 
 def tile_type(tile: Array) -> types.Type:
-    """The compiler's type of a tile."""
-    return numba.typeof(tile)
+    """The compiler's type of a tile; finding it takes a millisecond, so it is kept for tiles of the same kind."""
+    flags, dtype = tile.flags, tile.dtype
+    key = (
+        dtype,
+        dtype.isalignedstruct,
+        tile.ndim,
+        flags.c_contiguous,
+        flags.f_contiguous,
+        flags.writeable,
+        flags.aligned,
+    )
+    if key not in _TILE_TYPES:
+        _TILE_TYPES[key] = numba.typeof(tile)
+    return _TILE_TYPES[key]
+
+
+_TILE_TYPES: dict[Any, types.Type] = {}
+"""Types by what they depend on, one for each kind of tile that was compiled."""
