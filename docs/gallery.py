@@ -32,7 +32,11 @@ def panel(text, caption, name, place):
     """One figure with its caption, and the script that is named last before it."""
     scripts = SCRIPT.findall(text[:place])
     path = HOME.parent / "examples" / f"{scripts[-1]}.py" if scripts else None
-    code = "" if path is None or not path.exists() else f'\n??? example "examples/{path.name}"\n\n' + indented(path.read_text())
+    code = (
+        ""
+        if path is None or not path.exists()
+        else f'\n??? example "examples/{path.name}"\n\n' + indented(path.read_text())
+    )
     return f"![{caption}](figures/{name}.png)\n\n{caption}\n{code}\n"
 
 
