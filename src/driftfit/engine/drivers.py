@@ -111,9 +111,9 @@ class TrackerSteps(NamedTuple):
     that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
     symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
     of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
-    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval,
-    noise and drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)`` copies what
-    the tracker's ``noted`` names when a run is replayed for a smoother.
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
+    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
+    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
