@@ -5,7 +5,7 @@ import pytest
 from contract_table import as_arx, model_of, ready, unusable
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from support import BAD, arx_record, damaged, same
+from support import BAD, THETA, arx_record, damaged, same
 
 from driftfit import Live, Regression, track
 from driftfit.trackers import found
@@ -91,14 +91,12 @@ def test_a_sample_of_weight_0_is_not_used(model, tracker):
 
 def test_a_regressor_that_wakes_up_late(model, tracker):
     """Silence before every direction was seen: exponential forgetting must not run away meanwhile."""
-    rng = np.random.default_rng(6)
-    u = np.zeros(20_000)
-    u[2], u[-200:] = 1.0, rng.standard_normal(200)
-    y = np.append(0.0, u[:-1])  # y_t = u_(t-1): one impulse shows three of the four directions
-    y[-200:] += 0.01 * rng.standard_normal(200)
+    y, u = np.zeros((2, 20_000))
+    u[2] = 1.0  # shows two of the four directions
+    y[-200:], u[-200:] = arx_record(200, 6, noise=0.01)
     run = track(model, tracker, y, u)
     assert np.isfinite(run.theta).all()
-    np.testing.assert_allclose(as_arx(tracker, run.theta)[-1], [0.0, 0.0, 1.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(as_arx(tracker, run.theta)[-1], THETA, atol=0.05)
 
 
 # Numbers whose squares span less than double precision: beyond that a covariance needs its square-root form.
