@@ -125,6 +125,7 @@ class TrackerSteps(NamedTuple):
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
+    doubts: bool = False
 
 
 def _common(n: int, m: int) -> dict[str, Any]:

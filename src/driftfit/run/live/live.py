@@ -193,12 +193,12 @@ class Live(Operated, Plain, Kept):
         known = HELD if self.held else known
         self._rest(known)
         step: Step = self._update(self._tile, float(y), one_or_all(u))
+        for alarm in self._alarms:
+            alarm.take(self._tile, 0, step[1], step[2], time)
         if known is not HELD:
             self._rest(ORDINARY)
         if self._window is not None:
             self._window.push(self._tile, known)
-        for alarm in self._alarms:
-            alarm.take(self._tile, 0, step[1], step[2], time)
         self._expect(INPUT if later else NOTHING)
         return step
 
