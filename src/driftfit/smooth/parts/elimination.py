@@ -30,6 +30,9 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver
 from driftfit.smooth.parts.walk import Path, Walk
 
+Y, WEIGHT, DRIFT = 0, 1, 2
+"""Columns of the samples."""
+
 CORRECTION = 1e-10
 """Largest correction, relative to the largest value of the parameter."""
 
@@ -45,18 +48,18 @@ def smooth(walk: Walk) -> Path | None:
     T, n = walk.phi.shape
     work = workspace(n).copy()
     work["q"] = np.diag(walk.q)
-    steps, path = np.empty(T, step_type(n)), np.empty(T, path_type(n))
-    moved = walk.drift, np.ascontiguousarray(walk.each if len(walk.each) else np.ones((1, n)))
-    least = forwards(work, walk.phi, walk.y, walk.weight, *moved, steps)
+    steps, samples = np.empty(T, step_type(n)), np.stack([walk.y, walk.weight, walk.drift], axis=1)
+    each = np.ascontiguousarray(walk.each if len(walk.each) else np.ones((1, n)))
+    least = forwards(work, walk.phi, samples, each, steps)
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
     work["C"], work["theta"] = C, C @ work["z"][0]
-    backwards(work, walk.phi, walk.weight, *moved, steps, path)
-    cost = residuals(work, walk.phi, walk.y, walk.weight, *moved, steps, path)
+    theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
+    backwards(work, walk.phi, samples, each, steps, theta, var, left)
+    cost = residuals(work, walk.phi, samples, each, steps, theta)
     work["theta"] = C @ work["z"][0]
-    correct(work, steps, path)
-    theta, var, left = (np.ascontiguousarray(path[name]) for name in ("theta", "var", "left"))
+    correct(work, steps, theta)
     correction = work["correction"][0] / np.maximum(work["size"][0], 1e-300)
     if not (correction.max() <= CORRECTION and left.min() > LEVERAGE and var.min() > 0.0):
         return None
@@ -91,13 +94,8 @@ def step_type(n: int) -> np.dtype[Any]:
     return np.dtype([("a", np.float64, (n, n)), ("b", np.float64, (n,))])
 
 
-def path_type(n: int) -> np.dtype[Any]:
-    """The path at a sample: theta, its variances, and 1 - leverage."""
-    return np.dtype([("theta", np.float64, (n,)), ("var", np.float64, (n,)), ("left", np.float64)])
-
-
 @Driver
-def forwards(work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, steps: Array) -> float:
+def forwards(work: Array, phi: Array, samples: Array, each: Array, steps: Array) -> float:
     """Eliminate every increment; leaves the last U and z in the scratch space and returns the smallest f."""
     s = work[0]
     n = s.z.shape[0]
@@ -106,7 +104,7 @@ def forwards(work: Array, phi: Array, y: Array, weight: Array, drift: Array, eac
     for t in range(phi.shape[0]):
         a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = s.q[i] * drift[t] * each[t * many, i] ** 2
+            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
             f = 1.0 / (1.0 + g * s.U[i, i])
             least = min(least, f)
             for j in range(n):
@@ -126,37 +124,39 @@ def forwards(work: Array, phi: Array, y: Array, weight: Array, drift: Array, eac
             for j in range(n):
                 s.U[i, j] *= f
                 s.U[j, i] = s.U[i, j]
-        w = weight[t]
+        w = samples[t, WEIGHT]
         for j in range(n):
             for k in range(n):
                 s.U[j, k] += w * phi[t, j] * phi[t, k]
-            s.z[j] += w * phi[t, j] * y[t]
+            s.z[j] += w * phi[t, j] * samples[t, Y]
     return least
 
 
 @Driver
-def backwards(work: Array, phi: Array, weight: Array, drift: Array, each: Array, steps: Array, path: Array) -> None:
+def backwards(
+    work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array, var: Array, left: Array
+) -> None:
     """theta, variances and 1 - leverage, from the last theta and C in the scratch space."""
     s = work[0]
     n = s.z.shape[0]
     many = 1 if each.shape[0] > 1 else 0
     for t in range(phi.shape[0] - 1, -1, -1):
-        a, b, here = steps[t].a, steps[t].b, path[t]
+        a, b = steps[t].a, steps[t].b
         h = 0.0
         for j in range(n):
             total = 0.0
             for k in range(n):
                 total += s.C[j, k] * phi[t, k]
             h += phi[t, j] * total
-            here.theta[j] = s.theta[j]
-            here.var[j] = s.C[j, j]
-        here.left = 1.0 - weight[t] * h
+            theta[t, j] = s.theta[j]
+            var[t, j] = s.C[j, j]
+        left[t] = 1.0 - samples[t, WEIGHT] * h
         for i in range(n - 1, -1, -1):
             x = b[i]
             for j in range(n):
                 x += a[i, j] * s.theta[j]
             s.theta[i] = x
-            own = s.q[i] * drift[t] * each[t * many, i] ** 2 * a[i, i]
+            own = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2 * a[i, i]
             for j in range(n):
                 total = 0.0
                 for k in range(n):
@@ -171,9 +171,7 @@ def backwards(work: Array, phi: Array, weight: Array, drift: Array, each: Array,
 
 
 @Driver
-def residuals(
-    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, steps: Array, path: Array
-) -> float:
+def residuals(work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array) -> float:
     """The forward pass of the refinement: b of the residuals; returns the cost of the path."""
     s = work[0]
     n = s.z.shape[0]
@@ -182,38 +180,38 @@ def residuals(
     for i in range(n):
         s.z[i] = 0.0
     for t in range(phi.shape[0]):
-        a, b, theta = steps[t].a, steps[t].b, path[t].theta
+        a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = s.q[i] * drift[t] * each[t * many, i] ** 2
-            x = theta[i] - path[t - 1].theta[i] if t > 0 else 0.0
+            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
+            x = theta[t, i] - theta[t - 1, i] if t > 0 else 0.0
             shift = x / g if g > 0.0 else 0.0
             cost += x * shift
             z = s.z[i] + shift
             b[i] = g * a[i, i] * z
             for j in range(n):
                 s.z[j] = (s.z[j] if j != i else -shift) + a[i, j] * z
-        e = y[t]
+        e = samples[t, Y]
         for j in range(n):
-            e -= phi[t, j] * theta[j]
-        cost += weight[t] * e * e
+            e -= phi[t, j] * theta[t, j]
+        cost += samples[t, WEIGHT] * e * e
         for j in range(n):
-            s.z[j] += weight[t] * phi[t, j] * e
+            s.z[j] += samples[t, WEIGHT] * phi[t, j] * e
     return cost
 
 
 @Driver
-def correct(work: Array, steps: Array, path: Array) -> None:
+def correct(work: Array, steps: Array, theta: Array) -> None:
     """The backward pass of the refinement: adds the correction to theta and stores the sizes of both."""
     s = work[0]
     n = s.z.shape[0]
     for i in range(n):
         s.correction[i] = s.size[i] = 0.0
-    for t in range(path.shape[0] - 1, -1, -1):
-        a, b, theta = steps[t].a, steps[t].b, path[t].theta
+    for t in range(theta.shape[0] - 1, -1, -1):
+        a, b = steps[t].a, steps[t].b
         for i in range(n):
-            theta[i] += s.theta[i]
+            theta[t, i] += s.theta[i]
             s.correction[i] = max(s.correction[i], abs(s.theta[i]))
-            s.size[i] = max(s.size[i], abs(theta[i]))
+            s.size[i] = max(s.size[i], abs(theta[t, i]))
         for i in range(n - 1, -1, -1):
             x = b[i]
             for j in range(n):
