@@ -13,7 +13,6 @@ SOURCES = sorted(HOME.rglob("*.py"))
 KNOWN = {
     "engine/callback.py": ["_call"],
     "engine/drivers.py": ["drivers"],
-    "models/hammerstein_wiener/separation/least_squares.py": ["refine"],
     "models/hammerstein_wiener/trackers/output_error_steps.py": [
         "advance",
         "absorb",
