@@ -12,7 +12,6 @@ LINES, ARGUMENTS = 60, 8
 SOURCES = sorted(HOME.rglob("*.py"))
 KNOWN = {
     "engine/callback.py": ["_call"],
-    "engine/drivers.py": ["drivers"],
     "models/hammerstein_wiener/trackers/output_error_steps.py": [
         "advance",
         "absorb",

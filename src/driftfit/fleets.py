@@ -50,7 +50,7 @@ class Judged(many.Many):
         return diagnoses(dict(self.items()))
 
     def detect(
-        self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
+        self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:  # fmt: skip
         """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
@@ -166,7 +166,7 @@ class Shared(shared_outputs.Shared, public=True):
         """Diagnose the rows; see `Track.diagnose`."""
         return diagnose(self.rows)
 
-    def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
+    def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
         """Alarms of the rows; see `Track.detect`, whose numbers of samples are numbers of rows here."""
         return detect(self.rows, kind, **settings)
 

@@ -123,6 +123,7 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    doubts: bool = False
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -269,9 +270,22 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     ready(1)
     for machine in tracker.machines:
         machine.load()
-    told = tracker.told
-    store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
-    advance = _advance(tracker)
+    sample = _sample(regress, push, _advance(tracker))
+    run = _run(sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        inputs = {"y": y, "u": u, "known": known}
+        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
+        _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
+        run(tile, *inputs.values(), out)
+
+    return Drivers(checked, *_updates(sample))
+
+
+def _sample(regress: Step, push: Step, advance: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record."""
 
     @kernel
     def sample(s: State) -> None:
@@ -287,6 +301,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             s.y_hat[l] = y_hat if valid else np.nan
             s.s[l] = v if valid else np.nan
             s.e[l] = e if s.ok[l] > 0.0 else np.nan
+
+    return sample
+
+
+def _run(sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+    """The loop over the samples of a record."""
 
     @Driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
@@ -325,6 +345,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 store(o, s, l)
                 keep_more(o, s, l)
 
+    return run
+
+
+def _updates(sample: Any) -> tuple[Driver, Driver]:
+    """One sample of a stream, with an array of inputs and with a single one."""
+
     @Driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
@@ -344,15 +370,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
-        ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
-
-    return Drivers(checked, update, update_one)
+    return update, update_one
 
 
 def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:

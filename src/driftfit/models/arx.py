@@ -36,6 +36,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import input_names, one_of, output_names, whole
 from driftfit.models.base import Model
+from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
@@ -178,6 +179,12 @@ class ARX(Model):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
 
+    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
+        return {**self.memory(), **no_doubts(len(self.outputs), self.na)} if doubts and self.na > 0 else self.memory()
+
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        return _steps(self.na, self.lags, self.intercept, True) if doubts and self.na > 0 else self.steps
+
     @property
     def apply(self) -> Step | None:
         return take_input if all(nk > 0 for _, nk in self.lags) else None
@@ -238,7 +245,7 @@ def take_input(s: State, l: int) -> None:
 
 
 @lru_cache
-def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> ModelSteps:
+def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: bool = False) -> ModelSteps:
     """The steps for one set of orders, which are constants, so that every loop is unrolled."""
     m = len(lags)
     # without inputs the loops over them never run, but Numba cannot type an empty tuple
@@ -255,7 +262,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
             lag = s.y_lag[i, l]
             lag = np.nan if broken else lag
             s.y_lag[i, l] = lag
-            s.phi[i, l] = lag
+            s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
         for j in range(m):
             # the present input has position 0, so lag k is entry k, and nk = 0 needs no special case
             for i in range(depth - 1, 0, -1):
@@ -276,6 +283,8 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
 
     @kernel
     def push(s: State, l: int) -> None:
+        if doubts:
+            shift_doubts(s, 0, l, l, l, 1, 1)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
@@ -326,6 +335,10 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
 
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        doubts = doubts and self.na > 0
+        return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs), doubts)
+
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
 
@@ -334,7 +347,9 @@ class JointARX(ARX):
 
 
 @lru_cache
-def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
+def _joint_steps(
+    na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int, doubts: bool = False
+) -> ModelSteps:
     m = len(lags)
     nb = tuple(b for b, _ in lags) or (0,)
     nk = tuple(k for _, k in lags) or (0,)
@@ -348,7 +363,7 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
         for o in range(ny):
             for i in range(na):
                 s.y_lag[o, i, l] = np.nan if broken else s.y_lag[o, i, l]
-                s.phi[o * na + i, l] = s.y_lag[o, i, l]
+                s.phi[o * na + i, l] = doubted(s, o, i, l, s.y_lag[o, i, l]) if doubts else s.y_lag[o, i, l]
         for j in range(m):
             for i in range(depth - 1, 0, -1):
                 s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
@@ -367,9 +382,11 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
     def push(s: State, l: int) -> None:
         series = s.y.shape[0] // ny
         for o in range(ny):
+            lane = o * series + l % series  # of output o of the same series
+            if doubts:
+                shift_doubts(s, o, l, lane, l % series, series, ny)
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
-            lane = o * series + l % series  # of output o of the same series
             informed = (s.s[lane] != np.inf) | (s.noise[lane] == np.inf)
             fill = s.y_hat[lane] if s.valid[lane] > 0.0 and informed and s.filled[o, l] < na else np.nan
             s.filled[o, l] = 0.0 if s.seen[lane] > 0.0 else s.filled[o, l] + 1.0

@@ -65,7 +65,7 @@ class Program:
         if self.output is None:
             return self.tracker.state_for(self.model)
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory(), **self.tracker.state_for(own)}
+        return {**own.memory_for(self.steps.doubts), **self.tracker.state_for(own)}
 
     @property
     def steps(self) -> TrackerSteps:
@@ -79,7 +79,7 @@ class Program:
 
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
-        return drivers(self.model.steps, self.steps if steps is None else steps, keep)
+        return drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
@@ -114,7 +114,8 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
     """A tile with a lane for each program (all of one model), at its start or with the given fields."""
     model = programs[0].model
     starts = {one: one.start for one in programs}
-    tile = make_tile(model.n, model.m, model.memory(), [starts[one] for one in programs])
+    memory = model.memory_for(programs[0].steps.doubts)
+    tile = make_tile(model.n, model.m, memory, [starts[one] for one in programs])
     for lane, state in enumerate(states):
         for name, value in state.items():
             tile[name][0, ..., lane] = value
