@@ -272,9 +272,23 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     ready(1)
     for machine in tracker.machines:
         machine.load()
-    told, driver = tracker.told, partial(Driver, instead=tracker.instead)
-    store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
-    advance = _advance(tracker)
+    driver = partial(Driver, instead=tracker.instead)
+    sample = _sample(regress, push, _advance(tracker))
+    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        inputs = {"y": y, "u": u, "known": known}
+        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
+        _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
+        run(tile, *inputs.values(), out)
+
+    return Drivers(checked, *_updates(driver, sample))
+
+
+def _sample(regress: Step, push: Step, advance: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record."""
 
     @kernel
     def sample(s: State) -> None:
@@ -290,6 +304,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             s.y_hat[l] = y_hat if valid else np.nan
             s.s[l] = v if valid else np.nan
             s.e[l] = e if s.ok[l] > 0.0 else np.nan
+
+    return sample
+
+
+def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+    """The loop over the samples of a record."""
 
     @driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
@@ -328,6 +348,12 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 store(o, s, l)
                 keep_more(o, s, l)
 
+    return run
+
+
+def _updates(driver: Any, sample: Any) -> tuple[Driver, Driver]:
+    """One sample of a stream, with an array of inputs and with a single one."""
+
     @driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
@@ -347,15 +373,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
-        ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
-
-    return Drivers(checked, update, update_one)
+    return update, update_one
 
 
 def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:

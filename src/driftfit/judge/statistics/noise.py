@@ -96,11 +96,13 @@ def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, le
             r[w, k] = lagged(own, HELD * level[w], k)
 
 
-def _segments(
-    Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, residual: Array, near: Array, leverage: Array
-) -> None:
-    """Robust fits of segments on the white rows X, z, those that are mixed left out: residual (N,) of y on Q, near
-    (N,), that of the neighbouring segment where a break is near and it is smaller, and the leverage (N,) of X."""
+def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, out: Array) -> None:
+    """Robust fits of segments on the white rows X, z, those that are mixed left out.
+
+    ``out`` (3, N) are the residual of y on Q, that of the neighbouring segment where a break is near and it is smaller,
+    and the leverage of X.
+    """
+    residual, near, leverage = out[0], out[1], out[2]
     N, n = Q.shape
     K = bounds.shape[0] - 1
     theta, own = np.zeros((K, n)), np.empty(N)
@@ -212,10 +214,11 @@ class _Search(NamedTuple):
             X, z = whitened(Q / self.c[:, None], held / self.c, ar)
             size = self.size(near, ar)
             breaks = partition(X / size, z / size, self.grid, self.price(ar), self.least, len(ar))
-            residual, near, leverage = np.empty(N), np.empty(N), np.empty(N)
+            fits = np.empty((3, N))
             z = whitened(X[:, :0], y / self.c, ar)[1]
             bounds = np.concatenate([[0], breaks, [N]])
-            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), residual, near, leverage)
+            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), fits)
+            residual, near, leverage = fits
             ar = self.correlation(near, breaks)
             c = self.c * (1.4826 * np.median(np.abs(near / self.c)))
             held = y - near + np.clip(near, -HELD * c, HELD * c)
