@@ -24,6 +24,7 @@ from driftfit import (
     track,
     tune,
 )
+from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.parts.noise_levels import OUTLIER, level_chain
@@ -240,6 +241,28 @@ def test_smoothed_bands_hold_where_the_truth_walks(kind):
             )
     assert 0.93 < np.mean(inside) < 0.97
     assert np.mean(better) < 0.75
+
+
+def test_a_smoothed_path_is_about_as_good_as_with_the_true_drift():
+    lost, inside = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u, theta = rng.normal(size=(2000, 3)), 1.0 + np.cumsum(0.003 * rng.normal(size=(2000, 3)), axis=0)
+        y = np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=2000)
+        path = track(MODEL, AdaptiveKalman(), y, u).smooth()
+        best = track(MODEL, Kalman(q=0.003**2, r=0.09), y, u).smooth()
+        lost.append(np.mean((path.theta - theta) ** 2) / np.mean((best.theta - theta) ** 2))
+        inside.append(np.mean(np.abs(path.theta - theta) < 1.96 * path.std))
+    assert np.mean(lost) < 1.15  # with the drift as estimated sample by sample: 1.19
+    assert np.mean(inside) > 0.91
+
+
+def test_drift_is_pooled_over_time_except_at_jumps():
+    rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
+    rate[7] = 200.0
+    steady = (np.arange(41) > 0) & (np.arange(41) != 7)
+    np.testing.assert_allclose(pooled(rate)[:, 0], np.where(steady, rate[steady].mean(), rate[:, 0]))
+    np.testing.assert_array_equal(pooled(np.zeros((3, 2))), np.zeros((3, 2)))
 
 
 def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
