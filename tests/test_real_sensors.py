@@ -218,6 +218,18 @@ def test_a_conductance_that_switches_is_followed():
     assert errors["AdaptiveKalman"] < 0.3 < errors["RLS"]
 
 
+@pytest.mark.parametrize("constant", [False, True])
+def test_a_regressor_at_zero_is_no_evidence_of_a_jump(constant):
+    rng, t = np.random.default_rng(4), np.arange(2000)
+    u, g = np.sin(np.pi * t / 25.0), np.full(2000, 0.02)  # 1e-14 where it passes zero
+    for k in range(1, 2000):
+        g[k] = 4.0 if abs(u[k]) > 0.7 or (g[k - 1] > 1.0 and u[k] * u[k - 1] > 0.0) else 0.02
+    y = g * u + 0.05 * rng.normal(size=2000)
+    run = track(Regression(1, intercept=constant), AdaptiveKalman(), y, u[:, None])
+    assert np.abs(run.theta[50:]).max() < 20.0  # 1e12 if the jump may be of any size
+    assert np.nanmax(np.abs(run.innovation[50:])) < 5.0
+
+
 def test_noise_that_grows_thirtyfold_is_followed():
     rng = np.random.default_rng(10)
     u = rng.normal(size=(T, 3))
