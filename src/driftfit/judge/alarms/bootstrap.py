@@ -35,7 +35,7 @@ from driftfit.run.live.likelihood_ratio import (
     scan_scores,
 )
 
-RECORDS, SAMPLES = 128, 256_000
+RECORDS, SAMPLES = 128, 128_000
 """Simulated records, and samples of all together."""
 START = SHORT << (LEVELS - 1)
 """Samples at the beginning of a record that are not counted: the longest window is not complete."""

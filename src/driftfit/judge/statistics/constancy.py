@@ -17,8 +17,10 @@ or the excitation changes, that table is wrong, but the null distribution used h
 record. Zero drift lies on the boundary of "q >= 0", which invalidates likelihood-ratio tests, but not a score test.
 
 L averages over the record and is most powerful against slow drift. The suprema over one break and over an interval
-(`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. The Cauchy combination of
-Liu and Xie (2020) turns the three into one p-value, so that the error rate is that of all together.
+(`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. If the scores are white
+and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild`), which also finds a break
+in the last few samples. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, so that the error
+rate is that of all together.
 
 The noise is estimated under the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which
 are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
@@ -48,6 +50,7 @@ from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
+from driftfit.judge.statistics.wild import wild_supremum
 
 POINTS = 48
 """Largest number of points of the path for the suprema and their null; the mean squares use every second point."""
@@ -74,8 +77,8 @@ class Constancy(NamedTuple):
     """Nyblom's statistic of all parameters together."""
     p_joint: float
     """p-value of all tests of all parameters together."""
-    p_each: tuple[float, float, float]
-    """p-values of all parameters: of the mean square, of one break, of an interval."""
+    p_each: tuple[float, float, float, float]
+    """p-values of all parameters: of the mean square, of one break, of an interval, of one break near an end."""
     at: Array
     """(n,): the sample (of the N) at which each parameter most likely changed."""
     path: Array
@@ -144,7 +147,9 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
     joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
-    p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
+    white = len(found.ar) + rest == 0
+    late = wild_supremum(X, still.residual, found.level) if white else np.nan
+    p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart), late)
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
     at, z = _dates(path, std.T)
@@ -200,7 +205,7 @@ def _nothing(N: int, n: int) -> Constancy:
     unknown = np.full(n, np.nan)
     fit = Fit(unknown, np.full(N, np.nan), float("nan"), np.full(N, np.nan), np.zeros(N))
     path = np.full((N, n), np.nan)
-    return Constancy(unknown, unknown, unknown, np.nan, np.nan, (np.nan,) * 3, np.zeros(n, int), path, fit, None, 0)
+    return Constancy(unknown, unknown, unknown, np.nan, np.nan, (np.nan,) * 4, np.zeros(n, int), path, fit, None, 0)
 
 
 def _summed(scores: Array, lags: int) -> Array:
