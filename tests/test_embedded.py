@@ -14,7 +14,18 @@ from contract_table import forms, ready
 from typer.testing import CliRunner
 
 from driftfit import (
-    ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, HammersteinWiener, Kalman, Live, Polynomial, Regression, trackers,
+    ARX,
+    FLS,
+    RLS,
+    AdaptiveKalman,
+    Bank,
+    ExtendedKalman,
+    HammersteinWiener,
+    Kalman,
+    Live,
+    Polynomial,
+    Regression,
+    trackers,
 )  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct

@@ -135,7 +135,7 @@ class Expressions:
             return lifted(inner)
         name, kind = self.unit.table(table.constant)
         strides = [int(np.prod(np.shape(table.constant)[axis + 1 :])) for axis in range(len(index))]
-        at = " + ".join(f"{one.text} * {stride}" for one, stride in zip(index, strides, strict=True))
+        at = " + ".join(f"({one.text} * {stride})" for one, stride in zip(index, strides, strict=True))
         most = int(np.max(table.constant)) if kind == "int" else None
         return Value(kind, f"{name}[{at}]", most=most)
 

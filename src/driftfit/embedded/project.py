@@ -106,16 +106,16 @@ SUPPORT = {
     "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
     "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
     "four_plus": """static four four_plus(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] + b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] + b.at[i]; }
     return a;
 }""",
     "four_times": """static four four_times(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] * b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] * b.at[i]; }
     return a;
 }""",
     "four_reached": """static int64_t four_reached(four a, four b) {
     int64_t count = 0;
-    for (int i = 0; i < 4; i++) count += a.at[i] >= b.at[i];
+    for (int i = 0; i < 4; i++) { count += a.at[i] >= b.at[i]; }
     return count;
 }""",
 }
@@ -210,7 +210,7 @@ def _face(made: Translation, memory: set[str]) -> str:
             continue
         size = made.start[name][0].size
         line = f"s->{name} = START.{name};" if size == 1 else (
-            f"for (int i = 0; i < {size}; i++) s->{name}[i] = START.{name}[i];"
+            f"for (int i = 0; i < {size}; i++) {{ s->{name}[i] = START.{name}[i]; }}"
         )  # fmt: skip
         copies.append(f"    {line}")
     return "\n".join([

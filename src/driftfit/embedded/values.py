@@ -113,7 +113,7 @@ def view(array: Value, index: Sequence[Value | range]) -> Value:
                 offset.append(str(one.start * stride))
         elif one.constant != 0:
             offset.append(one.text if stride == 1 else f"{one.text} * {stride}")
-    at = " + ".join(offset)
+    at = " + ".join(f"({one})" if " * " in one and len(offset) > 1 else one for one in offset)
     if shape:
         begin = f"({begin_of(array)} + {at})" if at else begin_of(array)
         return Value("array", begin, shape=tuple(shape), strides=tuple(strides), element=array.element)
