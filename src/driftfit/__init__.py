@@ -3,7 +3,7 @@
 from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
-from driftfit.fleets import Fleet, Outputs, OutputsFleet, Shared
+from driftfit.fleets import Fleet, Outputs, Shared
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -83,7 +83,6 @@ __all__ = [
     "Model",
     "OutputError",
     "Outputs",
-    "OutputsFleet",
     "PiecewiseLinear",
     "Polynomial",
     "Regression",

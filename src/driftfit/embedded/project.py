@@ -158,7 +158,7 @@ def files_of(program: Program, what: str) -> dict[str, str]:
     header = HEADER.format(
         what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made)
     )
-    source = SOURCE.format(what=what) + _source(made, set(program.model.memory()))
+    source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps.doubts)))
     readme = README.format(
         what=what, names=names, doubles=made.size(8), singles=made.size(4), ops=_said(made.entry.operations),
         ordinary=_after_the_start(made),

@@ -81,7 +81,8 @@ class Translation:
 def translation(program: Program) -> Translation:
     """Translate the steps of a model and a tracker."""
     tile = program.tile()
-    update = drivers(program.model.steps, program.steps).update.function
+    steps = program.steps
+    update = drivers(program.model.steps_for(steps.doubts), steps).update.function
     u = Value("array", "u", shape=(program.model.m,), strides=(1,))
     constant = frozenset(fields(tile)) - {*FACTORS, *RESULTS, *program.tracker.settings()}
     while True:

@@ -123,6 +123,7 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    doubts: bool = False
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -203,6 +204,19 @@ class Drivers(NamedTuple):
     update: Any
     update_one: Any
 
+    def updater(self, tile: Array, m: int) -> Any:
+        """The entry point for one sample of tiles of this type: ``f(tile, y, u)``, u as `one_or_all` gives it.
+
+        A number is read faster than an array, and a model of one input needs no second routine for arrays.
+        """
+        update, u = (self.update_one, types.float64) if m == 1 else (self.update, INPUTS)
+        return update.entry(tile_type(tile), types.float64, u)
+
+
+def one_or_all(u: Array) -> Any:
+    """The inputs (m,) of a sample as the step of a stream takes them: a number if m is 1, an array otherwise."""
+    return u.item() if u.size == 1 else u
+
 
 def _advance(tracker: TrackerSteps) -> Any:
     """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
@@ -249,8 +263,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
     every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
-    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u; both take what is known from
-    the fields ``interval``, ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
+    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
+    take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     regress, push, ready = model
     ready(1)

@@ -19,7 +19,7 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 
 FLAT = 1e-11
 """A diagonal entry below this share of its column counts as zero."""
@@ -80,7 +80,7 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
     tile = make_tile(n, model.m, model.memory(), [state])
     out = np.empty(len(record), output_type(tile, COLLECTED))
-    drivers(model.steps, STEPS).run(tile, *lane_of(replace(record, known=record.known.common)), out)
+    drivers(model.steps, STEPS).run(tile, *lanes_of(replace(record, known=record.known.common)), out)
     return out
 
 
