@@ -29,7 +29,7 @@ from driftfit.judge.alarms.reference import burn, first_third, stretch
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.trackers.bank.results.results import Hypotheses
 
@@ -51,7 +51,7 @@ def samples_of(run: Track) -> tuple[Array, Array]:
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
     out = np.empty(len(run), output_type(tile, COLLECTED))
-    run.program.drivers(steps=steps).run(tile, *lane_of(run.record), out)
+    run.program.drivers(steps=steps).run(tile, *lanes_of(run.record), out)
     noise = np.broadcast_to(run.known.noise, len(run))
     return out["phi"][..., 0], np.column_stack([out["y"], out["ok"], noise, out["dt"]])
 
