@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from driftfit.data.clock import Clock
+from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
 from driftfit.run.live.rule import KINDS
+from driftfit.run.program import Program
 from driftfit.service.settings.expressions import model_of, tracker_of
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import PageOptions, ServiceOptions, build, kinds
@@ -218,7 +220,7 @@ class _Reader:
                 ("dt" if dt is not None else "hold_back",),
                 "dt and hold_back need the name of the field of times: time = ...",
             )
-        at("tracker", settings.live)
+        at("tracker", lambda: Program(model, check_ready(tracker)).tile())  # whether they fit; nothing is compiled
         return settings
 
 
