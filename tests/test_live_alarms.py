@@ -123,7 +123,7 @@ def test_alarms_of_several_outputs(record):
     assert all(len(one.onsets) for one in said.values())
     ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
     assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
-    with pytest.raises(ValueError, match=r"separate theta; got \['speed'\]"):
+    with pytest.raises(ValueError, match=r"by the name of their output; got \['speed'\]"):
         live.detect({"speed": rules["flow"]})
 
 

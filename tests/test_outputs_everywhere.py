@@ -395,3 +395,13 @@ def test_alarms_of_outputs_that_share_a_theta():
     said = run.detect("innovation", reference=400)
     assert 600 <= said.onsets[0] < 620
     assert said.span(said.onsets[0])[0] == str(said.onsets[0] // 2)
+    live = Live(SHARED, Kalman(q=1e-6, r=0.01))
+    alarm = live.detect(said.rule)["rows"]
+    for t in range(400):
+        live.update(y[t], phi[t], time=float(t))
+        if t == 350:
+            live = Live.from_bytes(live.to_bytes())
+            alarm = live.alarms["rows"]
+    again = run.detect(said.rule)
+    assert alarm.samples == 800
+    assert alarm.onsets()[0].time == again.onsets[0] // 2

@@ -166,7 +166,7 @@ class Shared(shared_outputs.Shared, public=True):
         """Diagnose the rows; see `Track.diagnose`."""
         return diagnose(self.rows)
 
-    def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
+    def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
         """Alarms of the rows; see `Track.detect`, whose numbers of samples are numbers of rows here."""
         return detect(self.rows, kind, **settings)
 

@@ -18,7 +18,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numba
@@ -109,10 +109,11 @@ class TrackerSteps(NamedTuple):
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
     ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
     that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
-    ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval,
-    noise and drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)`` copies what
-    the tracker's ``noted`` names when a run is replayed for a smoother.
+    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
+    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
+    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
+    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -123,6 +124,7 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
 
 
@@ -270,9 +272,23 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     ready(1)
     for machine in tracker.machines:
         machine.load()
-    told = tracker.told
-    store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
-    advance = _advance(tracker)
+    driver = partial(Driver, instead=tracker.instead)
+    sample = _sample(regress, push, _advance(tracker))
+    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        inputs = {"y": y, "u": u, "known": known}
+        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
+        _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
+        run(tile, *inputs.values(), out)
+
+    return Drivers(checked, *_updates(driver, sample))
+
+
+def _sample(regress: Step, push: Step, advance: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record."""
 
     @kernel
     def sample(s: State) -> None:
@@ -289,7 +305,13 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             s.s[l] = v if valid else np.nan
             s.e[l] = e if s.ok[l] > 0.0 else np.nan
 
-    @Driver
+    return sample
+
+
+def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Any:
+    """The loop over the samples of a record."""
+
+    @driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         s = tile[0]
         n, L = s.theta.shape
@@ -326,7 +348,13 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 store(o, s, l)
                 keep_more(o, s, l)
 
-    @Driver
+    return run
+
+
+def _updates(driver: Any, sample: Any) -> tuple[Any, Any]:
+    """One sample of a stream, with an array of inputs and with a single one."""
+
+    @driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -336,7 +364,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    @Driver
+    @driver
     def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -345,15 +373,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
-        ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
-
-    return Drivers(checked, update, update_one)
+    return update, update_one
 
 
 def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:
