@@ -1,6 +1,6 @@
 """Size and speed of exported trackers: code, state, instructions on a Cortex-M4F, and time next to hand-written C.
 
-    python -m benchmarks.embedded            three minutes
+    python -m benchmarks.embedded            four minutes
     python -m benchmarks.embedded --quick    two sizes, few samples, no AdaptiveKalman
 
 The emulator reports what it executes, if it and the cross compiler are installed; `benchmarks/cortex_cycles.py` turns
@@ -83,6 +83,7 @@ int main(void) {
     return 0;
 }
 """
+KALMAN = Kalman(q=1e-4, r=0.01, p0=1.0)
 FIRST, LAST = 16, 20
 """The samples between are counted, as the difference of two programs."""
 
@@ -167,13 +168,41 @@ def timed(job: Any) -> float:
     return float(perf_counter_ns() - begin)
 
 
+def state_and_cost(model: ARX, tracker: Any) -> list[str]:
+    """Bytes of state, bytes of code, instructions and cycles per update, in double and in single precision."""
+    row = []
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        export_c(model, tracker, folder)
+        said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
+        states = [word for word in said.replace(",", "").split() if word.isdigit()]
+        for single in (False, True):
+            row += [states[single], *exported(folder, single)]
+    return row
+
+
+def against_filter(n: int) -> list[str]:
+    """Cycles of filter.c, then those of the exported Kalman and their ratio, with and without the fixed rate."""
+    row = [str(n)]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for single in (False, True):
+            hand = by_hand(folder, n, single)
+            row.append("-" if hand is None else str(hand[1]))
+            for fixed_rate in (False, True):
+                export_c(ARX(n // 2, n - n // 2), KALMAN, folder, fixed_rate=fixed_rate)
+                cycles = exported(folder, single)[2]
+                row += [cycles, "-" if hand is None else f"{int(cycles) / hand[1]:.2f}"]
+    return row
+
+
 def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples, no AdaptiveKalman.")] = False) -> None:
-    """Print both tables."""
+    """Print the three tables."""
     out = Console(width=120)
     sizes = (2, 4) if quick else (2, 4, 6, 8)
     T, repeats = (2_000, 3) if quick else (20_000, 31)
     trackers = {
-        "Kalman": Kalman(q=1e-4, r=0.01, p0=1.0),
+        "Kalman": KALMAN,
         "Kalman, sqrt": Kalman(q=1e-4, r=0.01, p0=1.0, form="sqrt"),
         "RLS": RLS(0.98),
         "FLS": FLS(100.0),
@@ -187,28 +216,21 @@ def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples, no Ad
         table.add_column(head, justify="left" if head == "tracker" else "right", no_wrap=True)
     for name, tracker in trackers.items():
         for n in sizes if name == "Kalman" else (4,):
-            row = [name, str(n)]
-            with tempfile.TemporaryDirectory() as place:
-                folder = Path(place)
-                export_c(ARX(n // 2, n - n // 2), tracker, folder)
-                said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
-                states = [word for word in said.replace(",", "").split() if word.isdigit()]
-                for single in (False, True):
-                    row += [states[single], *exported(folder, single)]
-                if name == "Kalman":
-                    hand = [by_hand(folder, n, single) for single in (False, True)]
-            table.add_row(*row)
-            if name == "Kalman":
-                counts = [["-", "-"] if count is None else list(map(str, count)) for count in hand]
-                table.add_row("filter.c, by hand", str(n), "", "", *counts[0], "", "", *counts[1], style="dim")
+            table.add_row(name, str(n), *state_and_cost(ARX(n // 2, n - n // 2), tracker))
     out.print(table)
     out.print("bytes of state and code, and per update; first in double precision, then in single (-DTRACKER_SINGLE)")
+    ratios = Table(title="\nCycles per update on a Cortex-M4F, beside filter.c", show_edge=False)
+    for head in ("n", *("by hand", "Kalman", "ratio", "fixed rate", "ratio") * 2):
+        ratios.add_column(head, justify="right", no_wrap=True)
+    for n in sizes if quick else range(2, 9):
+        ratios.add_row(*against_filter(n))
+    out.print(ratios)
     beside = Table(title="\nOn this computer, beside filter.c", show_edge=False)
     for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
         beside.add_column(head, justify="right")
     for n in sizes:
         with tempfile.TemporaryDirectory() as place:
-            export_c(ARX(n // 2, n - n // 2), trackers["Kalman"], place)
+            export_c(ARX(n // 2, n - n // 2), KALMAN, place)
             ours, other = beside_hand_written(Path(place), n, T, repeats)
         kept = "yes" if ours <= 1.3 * other else "no"
         beside.add_row(str(n), f"{ours:.1f}", f"{other:.1f}", f"{ours / other:.2f}", kept)

@@ -4,6 +4,9 @@
     python -m benchmarks.embedded_single --quick    two records of 500 samples
 
 The records are those of the self-test: a system whose gain doubles, with missing data, an outage and constant inputs.
+The second table asks whether a difference comes from the precision or from the start: an `OutputError` is told outputs
+in other units, once from its default start and once from estimates in these units, and the double-precision build also
+gets readings that are wrong by one part in ten million.
 """
 
 from __future__ import annotations
@@ -19,7 +22,18 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, ExtendedKalman, HammersteinWiener, Kalman, OutputError
+from driftfit import (
+    ARX,
+    FLS,
+    RLS,
+    AdaptiveKalman,
+    AugmentedFLS,
+    ExtendedKalman,
+    HammersteinWiener,
+    Kalman,
+    OutputError,
+    track,
+)
 from driftfit.embedded import export_c
 from driftfit.embedded.selftest import record
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
@@ -87,8 +101,37 @@ def differences(folder: Path, n: int, T: int, seed: int) -> tuple[float, float, 
     return predicted, float(np.max(away[:, 1 : 1 + n]) / np.max(np.abs(theta))), largest
 
 
+def of_scaled_outputs(T: int) -> Table:
+    """`OutputError` on outputs in other units."""
+    model = HammersteinWiener(2, 2, input=Polynomial(2)).bind(1)
+    names = OutputError().names_for(model)
+    clean, inputs = record(LINEAR.bind(1), T)
+    u = np.ascontiguousarray(inputs[:, 0])
+    learned = track(model, OutputError(q=1e-3, r=0.1), clean, u).theta[-1]
+    table = Table(title="\nOutputError, predictions / std of y", show_edge=False)
+    for head in ("outputs times", "start", "single - double", "double - double of y (1 + 1e-7)", "error in double"):
+        table.add_column(head, justify="left" if head == "start" else "right")
+    rng = np.random.default_rng(0)
+    for scale in (1.0, 30.0, 1000.0):
+        y, factors = clean * scale, np.array([scale if name.startswith("b") else 1.0 for name in names])
+        moved = y * (1.0 + 1e-7 * rng.standard_normal(T))
+        starts = {"default": {"q": 1e-3}, "in these units": {"q": 1e-3 * factors**2, "theta0": learned * factors}}
+        for start, settings in starts.items():
+            with tempfile.TemporaryDirectory() as place:
+                export_c(model, OutputError(r=0.1 * scale**2, **settings), place)
+                told = ((y, False), (y, True), (moved, False))
+                double, single, other = (rows(Path(place), len(names), v, u, narrow)[:, 0] for v, narrow in told)
+            std, error = np.std(y[np.isfinite(y)]), y - double
+            error = error[np.isfinite(error)][T // 10 :]
+            away = [np.nanmax(np.abs(double - one)) / std for one in (single, other)]
+            table.add_row(
+                f"{scale:g}", start, *(f"{one:.0e}" for one in away), f"{np.sqrt(np.mean(error**2)) / std:.2f}"
+            )
+    return table
+
+
 def main(quick: Annotated[bool, typer.Option(help="Two records of 500 samples.")] = False) -> None:
-    """Print the table."""
+    """Print both tables."""
     records, T = (2, 500) if quick else (20, 2_000)
     table = Table(title=f"Single against double precision, the largest of {records} x {T} samples", show_edge=False)
     table.add_column("tracker")
@@ -101,7 +144,9 @@ def main(quick: Annotated[bool, typer.Option(help="Two records of 500 samples.")
             n = len(tracker.names_for(bound))
             worst = np.max([differences(Path(place), n, T, seed) for seed in range(records)], axis=0)
         table.add_row(name, *("-" if np.isnan(one) else f"{one:.0e}" for one in worst))
-    Console(width=110).print(table)
+    out = Console(width=110)
+    out.print(table)
+    out.print(of_scaled_outputs(T))
 
 
 if __name__ == "__main__":

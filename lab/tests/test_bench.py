@@ -262,7 +262,8 @@ def test_every_scenario_is_on_the_page_and_the_chapter_shows_its_table():
         assert f"## {name}\n" in page
         assert (DOCS / "figures" / f"scoreboard_{name}.png").exists()
     summary = page.split("## All scenarios\n\n")[1].split("\n\n")[0]
+    chapter = (DOCS / "choosing_a_tracker.md").read_text()
     for kind in trackers.found().values():
-        if kind.own_model(1, 1, 1) is None:
+        if kind.own_model(1, 1, 1) is None and f"`{kind.__name__}` is not in the" not in chapter:
             assert kind.__name__ in summary
-    assert summary in (DOCS / "choosing_a_tracker.md").read_text()
+    assert summary in chapter

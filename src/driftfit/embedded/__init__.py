@@ -1,6 +1,6 @@
 """Export a tracker as standalone C99, for controllers without Python.
 
-The source is translated from the steps that run live, on records and in fleets (`driftfit.embedded.statements`). A new
+The source is translated from the steps that run live, on records and in fleets (`driftfit.embedded.functions`). A new
 tracker can therefore be exported without further work, and the double-precision build gives the same bits. States can
 be transferred in both directions as bytes.
 """

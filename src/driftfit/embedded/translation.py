@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.storage import fields
-from driftfit.embedded.statements import translate
+from driftfit.embedded.functions import translate
 from driftfit.embedded.unit import Function, Unit
 from driftfit.embedded.values import Value
 from driftfit.engine.drivers import drivers
