@@ -347,13 +347,13 @@ def test_a_late_direction_enters_all_hypotheses_as_it_enters_the_kalman_filter(r
 def test_the_density_of_a_sample_is_that_of_the_mixture(step):
     """Against sums over modes and levels in numpy, and it integrates to 1 over what the next reading may be."""
     rng = np.random.default_rng(7)
-    x = rng.normal(size=(400, 2))
-    y = x @ [1.0, 0.5] + 0.1 * rng.normal(size=400)
+    x = rng.normal(size=(400, 3))
+    y = x @ [1.0, 0.5, -0.2] + 0.1 * rng.normal(size=400)
     y[200:] += x[200:, 0]
     y[300] += 5.0
     y, first = (np.round(y / step) * step, 100) if step else (y, 20)  # the quantum is known from the 100th on
-    live = Live(Regression(2), AdaptiveKalman())
-    run = track(Regression(2), AdaptiveKalman(), y, x)
+    live = Live(Regression(3), AdaptiveKalman())
+    run = track(Regression(3), AdaptiveKalman(), y, x)
     for t in range(320):
         lane = {name: np.array(value) for name, value in live.lane().items()}
         live.update(y[t], x[t])

@@ -21,8 +21,6 @@ KNOWN = {
         "output_error_work",
         "machine_output_error",
     ],
-    "run/fleet.py": ["_gather"],
-    "run/track_outputs.py": ["track_outputs"],
     "smooth/parts/elimination.py": ["forwards", "backwards", "residuals"],
     "smooth/parts/two_filters.py": ["compiled", "filters", "meet"],
     "trackers/bank/machine/framed.py": ["machine_walks", "machine_enter"],

@@ -20,7 +20,7 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 
 FLAT = 1e-11
 """A diagonal entry below this share of its column counts as zero."""
@@ -87,7 +87,7 @@ def constant_least_squares(model: Model, record: Record) -> Array:
     """
     tile = repeat_tile(_start(model), 1)
     out = np.empty(len(record), output_type(tile, COLLECTED))
-    drivers(model.steps, STEPS).run(tile, *lane_of(replace(record, known=record.known.common)), out)
+    drivers(model.steps, STEPS).run(tile, *lanes_of(replace(record, known=record.known.common)), out)
     return out
 
 

@@ -15,8 +15,9 @@ Several outputs (``ny=2``) have a regression each, all on the same regressors, a
 
     phi_t = [y1_{t-1} .. y1_{t-na}, y2_{t-1} .., u1_{t-nk} .., (1)],   yo_t = phi_t' theta_o,t + v_o,t
 
-The outputs are lanes of one tile, so every tracker runs unchanged. Each lane keeps a copy of the lags of all outputs,
-which ``push`` fills from ``y`` of the other lanes, or from their predictions where y is missing.
+The outputs are lanes of one tile, so every tracker runs unchanged: of G series, lane o G + g is output o of series g.
+Each lane keeps a copy of the lags of all outputs of its series, which ``push`` fills from ``y`` of the other lanes, or
+from their predictions where y is missing.
 
 Source: Ljung, System Identification (1999), eq. 4.7; the filling rule is ours. Cost per sample: O(na + nb), and
 O(ny (ny na + nb)) for the lags of several outputs.
@@ -283,7 +284,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: 
     @kernel
     def push(s: State, l: int) -> None:
         if doubts:
-            shift_doubts(s, 0, l, l, l, 1)
+            shift_doubts(s, 0, l, l, l, 1, 1)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
@@ -379,15 +380,17 @@ def _joint_steps(
 
     @kernel
     def push(s: State, l: int) -> None:
-        for o in range(ny):  # lane o belongs to output o
+        series = s.y.shape[0] // ny
+        for o in range(ny):
+            lane = o * series + l % series  # of output o of the same series
             if doubts:
-                shift_doubts(s, o, l, o, 0, ny)
+                shift_doubts(s, o, l, lane, l % series, series, ny)
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
-            informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
-            fill = s.y_hat[o] if s.valid[o] > 0.0 and informed and s.filled[o, l] < na else np.nan
-            s.filled[o, l] = 0.0 if s.seen[o] > 0.0 else s.filled[o, l] + 1.0
+            informed = (s.s[lane] != np.inf) | (s.noise[lane] == np.inf)
+            fill = s.y_hat[lane] if s.valid[lane] > 0.0 and informed and s.filled[o, l] < na else np.nan
+            s.filled[o, l] = 0.0 if s.seen[lane] > 0.0 else s.filled[o, l] + 1.0
             if na > 0:
-                s.y_lag[o, 0, l] = s.y[o] if s.seen[o] > 0.0 else fill
+                s.y_lag[o, 0, l] = s.y[lane] if s.seen[lane] > 0.0 else fill
 
     return ModelSteps(regress, push)

@@ -74,12 +74,13 @@ def doubted(s: State, o: int, i: int, l: int, lag: float) -> float:
 
 
 @kernel
-def judge(s: State, o: int, i: int, l: int, first: int, ny: int) -> None:
-    """Bayes' rule for lag i of output o, by the innovations of the lanes ``first`` .. first + ny - 1."""
+def judge(s: State, o: int, i: int, l: int, first: int, step: int, ny: int) -> None:
+    """Bayes' rule for lag i of output o, by the innovations of the ny lanes ``first``, first + step, .."""
     d, away, k = s.doubt[o, i, l], s.aside[o, i, l], o * s.doubt.shape[1] + i
     if (d > 0.0) & (d < 1.0):
         wrong, right, own = d, 1.0 - d, lag_variance(s, o, i, l)
-        for p in range(first, first + ny):
+        for q in range(ny):
+            p = first + q * step
             a = s.theta[k, p]
             if (s.ok[p] > 0.0) & (s.s[p] < np.inf):
                 rest = max(s.s[p] - a * a * own, 0.1 * s.s[p])
@@ -101,11 +102,14 @@ def learn_share(s: State, o: int, l: int) -> None:
 
 
 @kernel
-def shift_doubts(s: State, o: int, l: int, own: int, first: int, ny: int) -> None:
-    """Judge the lags of output o by this sample, and move them by one; ``own`` is the lane of that output."""
+def shift_doubts(s: State, o: int, l: int, own: int, first: int, step: int, ny: int) -> None:
+    """Judge the lags of output o by this sample, and move them by one.
+
+    ``own`` is the lane of that output; the lanes of all ny outputs are ``first``, first + step, ..
+    """
     na = s.doubt.shape[1]
     for i in range(na):
-        judge(s, o, i, l, first, ny)
+        judge(s, o, i, l, first, step, ny)
     learn_share(s, o, l)
     for i in range(na - 1, 0, -1):
         s.doubt[o, i, l], s.suspect[o, i, l] = s.doubt[o, i - 1, l], s.suspect[o, i - 1, l]

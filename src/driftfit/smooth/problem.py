@@ -13,7 +13,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps, output_type
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import NONE, Walk, free
@@ -59,7 +59,7 @@ def replay(run: Track) -> Array:
     program = run.program
     tile = program.tile()
     out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.noted)))
-    program.drivers(steps=attentive(program.steps)).run(tile, *lane_of(run.record), out)
+    program.drivers(steps=attentive(program.steps)).run(tile, *lanes_of(run.record), out)
     return out
 
 

@@ -40,7 +40,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
@@ -162,14 +162,14 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     """
     N, n = X.shape
     w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
-    basis = linalg.qr(rows, mode="economic")[0]
+    basis = scipy.linalg.qr(rows, mode="economic")[0]
     w = w - basis @ (basis.T @ w)
     for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
         lagged = np.zeros((N, n))
         lagged[k:] = X[:-k]
         lagged[: len(found.ar)] = 0.0
         lagged -= basis @ (basis.T @ lagged)
-        Q, R, _ = linalg.qr(lagged, mode="economic", pivoting=True)
+        Q, R, _ = scipy.linalg.qr(lagged, mode="economic", pivoting=True)
         new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
         explained = new.T @ w
         gain = -N * np.log1p(-explained @ explained / (w @ w))

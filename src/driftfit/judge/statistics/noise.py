@@ -30,7 +30,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
@@ -296,8 +296,8 @@ def penalty(N: int, n: int, least: int, quiet: float) -> float:
     follows from the supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
     """
     span = np.log(max(N / least - 1.0, np.e))
-    one = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
-    pair = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
+    one = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
+    pair = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
     return max(one, 0.5 * pair)
 
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.statistics.robust import cholesky
@@ -124,14 +124,14 @@ def _tail(Q: Array, n: int, *moved: Array) -> float:
     places = np.ones(len(Q))
     for one in moved:
         places *= _kappa(c * np.minimum(one, 1.0))
-    return float(min(1.0, special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
+    return float(min(1.0, scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
 
 
 def _kappa(x: Array) -> Array:
     """x nu(sqrt(2 x))."""
     half = np.sqrt(np.maximum(x, 1e-12) / 2.0)
     density = np.exp(-0.5 * half * half) / np.sqrt(2.0 * np.pi)
-    above = special.ndtr(half)
+    above = scipy.special.ndtr(half)
     nu = (above - 0.5) / half / (half * above + density)
     kappa: Array = np.minimum(1.0, np.maximum(x, 0.0) * nu)
     return kappa

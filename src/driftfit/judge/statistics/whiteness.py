@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.scale import deviation
@@ -57,4 +57,4 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     r = shifted @ z / total
     std = np.sqrt((shifted * shifted) @ (z * z)) / total
     Q = float(np.sum((r[std > 0.0] / std[std > 0.0]) ** 2))
-    return Whiteness(r, std, Q, float(special.chdtrc(len(lags), Q)))
+    return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))

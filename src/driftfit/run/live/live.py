@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numba import types
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.clock import Clock, Pace, instant
@@ -22,7 +21,7 @@ from driftfit.data.limits import Gate
 from driftfit.data.signals import check_ready, noise_of
 from driftfit.data.storage import Kept, describe, rebuild, restore
 from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
@@ -113,11 +112,7 @@ class Live(Operated, Plain, Kept):
         self._m = self.model.m
         self._unknown = np.full(self._m, np.nan)
         self._shape = (self._m,)
-        compiled = self.program.drivers()
-        kind = tile_type(tile)
-        f8 = types.float64
-        self._update = compiled.update.entry(kind, f8, INPUTS)
-        self._update_one = compiled.update_one.entry(kind, f8, f8) if self._m == 1 else None
+        self._update = self.program.drivers().updater(tile, self._m)
         self._be_careful()
 
     def _be_careful(self) -> None:
@@ -155,14 +150,15 @@ class Live(Operated, Plain, Kept):
             return self._update_known(y, u, time, weight, drift)
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
-        if self._update_one is not None and type(u) is float:
-            return self._update_one(self._tile, y, u)  # type: ignore[no-any-return]
+        if type(u) is float and self._m == 1:
+            return self._update(self._tile, y, u)  # type: ignore[no-any-return]
         if u is LATER and self._m:
             return self._update_later(y)
         # the compiled step reads m floats from any address, so they must exist
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
-        return self._update(self._tile, y, u)  # type: ignore[no-any-return]
+        # as `one_or_all`, whose call would take 30 ns
+        return self._update(self._tile, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
 
     def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
@@ -196,20 +192,20 @@ class Live(Operated, Plain, Kept):
             self._pace.see(interval)
         known = HELD if self.held else known
         self._rest(known)
-        step: Step = self._update(self._tile, float(y), u)
+        step: Step = self._update(self._tile, float(y), one_or_all(u))
+        for alarm in self._alarms:
+            alarm.take(self._tile, 0, step[1], step[2], time)
         if known is not HELD:
             self._rest(ORDINARY)
         if self._window is not None:
             self._window.push(self._tile, known)
-        for alarm in self._alarms:
-            alarm.take(self._tile, 0, step[1], step[2], time)
         self._expect(INPUT if later else NOTHING)
         return step
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
-        step: Step = self._update(self._tile, y, self._unknown)
+        step: Step = self._update(self._tile, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step
 
@@ -262,7 +258,7 @@ class Live(Operated, Plain, Kept):
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         if self._awaits == INPUT:
             self._placing()(self._scratch, inputs)
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, inputs)
+        y_hat, _, s, _ = self._update(self._scratch, np.nan, one_or_all(inputs))
         return y_hat, s
 
     def smooth(self) -> FixedLag:

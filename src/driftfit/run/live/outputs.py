@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -22,11 +21,9 @@ from driftfit.run.live.alarm import LiveAlarm, check_rule
 from driftfit.run.live.fixed_lag import FixedLag, Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.output_lanes import programs_of
-from driftfit.run.program import Program, state_of, tile_of
+from driftfit.run.program import Program, programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.shared_outputs import row_model
 from driftfit.run.warm_start import End, Run, carried
 from driftfit.trackers.base import Tracker
 
@@ -49,7 +46,7 @@ class LiveOutputs(Plain, storage.Kept):
         limits: Mapping[Any, Any] | None = None,
     ) -> None:  # fmt: skip
         self.model = model if model.shared else model.bind(model.m)
-        given = programs_of(self.model, tracker)
+        self.programs = programs_of(self.model, tracker, self.model.m)
         self._clock = Clock.of(dt)
         self.dt = self._clock.plain
         self._pace = Pace(self._clock, model.reach)
@@ -63,8 +60,7 @@ class LiveOutputs(Plain, storage.Kept):
         self._ignored = 0
         self._alarms: dict[str, LiveAlarm] = {}
         self._place: Any = None
-        self._rows = row_model(self.model, given[0].tracker) if self.model.shared else self.model
-        self.programs = tuple(replace(one, model=self._rows) for one in given)
+        self._rows = self.programs[0].model
         self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
         self._tile = tile_of(self.programs, carried(warm_start, self.programs))
         self._out = self.programs[0].written(self._tile, 1)
