@@ -100,6 +100,17 @@ def test_suprema_of_a_brownian_bridge_are_exceeded_as_often_as_they_say(m, n, N)
         assert np.mean(np.array(p) < level, axis=0) == pytest.approx(level, abs=error + 0.25 * level)
 
 
+def test_where_a_path_is_tied_to_zero_it_says_nothing():
+    m, rows = 40, np.arange(10, 410, 10)
+    t = rows / rows[-1]
+    cov = np.minimum.outer(t, t) - np.outer(t, t)
+    cov[19], cov[:, 19] = 0.0, 0.0
+    cov[19, 19] = 1e-22
+    S = 0.3 * np.sqrt(t * (1.0 - t))[:, None]
+    S[19] = 1e-10  # ten standard deviations of a rounding error
+    assert min(suprema(S, cov.reshape(m, 1, m, 1), rows, 20, False)) > 0.3
+
+
 def test_quadratic_forms_are_those_of_plain_numpy():
     """Q of one stretch, by solving with its covariance."""
     rng = np.random.default_rng(0)
