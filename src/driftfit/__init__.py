@@ -44,6 +44,7 @@ from driftfit.trackers.bank.results.pictures import plot_tree
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
+from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
@@ -75,6 +76,7 @@ __all__ = [
     "Functions",
     "HammersteinWiener",
     "Hybrid",
+    "InstrumentalVariables",
     "Kalman",
     "Legendre",
     "Live",

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
+from datetime import time as clock
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -63,12 +64,12 @@ PLAIN = Labels()
 
 
 def time_text(time: Any, zone: str | None) -> str:
-    """A time as text, dates in a time zone."""
+    """A time as text, dates in a time zone; midnight without a zone is the date alone."""
     if not isinstance(time, np.datetime64):
         return f"{time:g}"
     text = time.astype("datetime64[us]").item()
     if zone is None:
-        return f"{text:%Y-%m-%d %H:%M:%S}"
+        return f"{text:%Y-%m-%d}" if text.time() == clock(0) else f"{text:%Y-%m-%d %H:%M:%S}"
     return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
 
 

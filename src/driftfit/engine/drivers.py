@@ -18,7 +18,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numba
@@ -109,10 +109,11 @@ class TrackerSteps(NamedTuple):
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
     ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
     that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
-    ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval,
-    noise and drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)`` copies what
-    the tracker's ``noted`` names when a run is replayed for a smoother.
+    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
+    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
+    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
+    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -123,6 +124,7 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
 
 
@@ -270,8 +272,9 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     ready(1)
     for machine in tracker.machines:
         machine.load()
+    driver = partial(Driver, instead=tracker.instead)
     sample = _sample(regress, push, _advance(tracker))
-    run = _run(sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
@@ -281,7 +284,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         ready(tile["theta"].shape[2])
         run(tile, *inputs.values(), out)
 
-    return Drivers(checked, *_updates(sample))
+    return Drivers(checked, *_updates(driver, sample))
 
 
 def _sample(regress: Step, push: Step, advance: Any) -> Any:
@@ -305,10 +308,10 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
     """The loop over the samples of a record."""
 
-    @Driver
+    @driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         s = tile[0]
         n, L = s.theta.shape
@@ -348,10 +351,10 @@ def _run(sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
     return run
 
 
-def _updates(sample: Any) -> tuple[Driver, Driver]:
+def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driver]:
     """One sample of a stream, with an array of inputs and with a single one."""
 
-    @Driver
+    @driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -361,7 +364,7 @@ def _updates(sample: Any) -> tuple[Driver, Driver]:
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    @Driver
+    @driver
     def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y

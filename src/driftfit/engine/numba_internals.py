@@ -29,10 +29,10 @@ import ctypes
 import itertools
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from types import FunctionType
+from types import FunctionType, MappingProxyType
 from typing import Any, NamedTuple
 from weakref import ref
 
@@ -353,12 +353,15 @@ def emit(function: FunctionType, arguments: tuple[Any, ...]) -> Code:
         )  # fmt: skip
 
 
-def load(code: Code) -> Any:
-    """The entry point of code. Numba's loader never frees anything; this one does with the last reference to it."""
+def load(code: Code, instead: Mapping[str, str] = MappingProxyType({})) -> Any:
+    """The entry point of code. Numba's loader never frees anything; this one does with the last reference to it.
+
+    ``instead`` maps symbols that the code calls to those that are called in their place.
+    """
     library = llvm.JITLibraryBuilder().add_object_img(code.data).add_current_process().export_symbol(code.wrapper)
     loader = _loader()
     for name in code.outside:
-        address = llvm.address_of_symbol(name)
+        address = llvm.address_of_symbol(instead.get(name, name))
         if address is not None:
             library.import_symbol(name, address)
     for name, _ in code.environments:

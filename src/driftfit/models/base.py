@@ -134,7 +134,7 @@ class Model(Settings, ABC):
     def output_lags(self) -> int | None:
         """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
 
-        None where past outputs stand elsewhere, or in functions of theirs.
+        None where past outputs stand elsewhere, or in functions of theirs; 0 where there are none.
         """
         return None
 

@@ -15,8 +15,8 @@ The results are the mean and covariance of the mixture. The one-step variance ex
 for samples that are not outliers.
 
 The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
-there are enough residuals to estimate r. The filters then start from there, in the directions that the regressors span by
-then. Scaling inputs or outputs changes only the units.
+there are enough residuals to estimate r. The filters then start from there, in the directions that the regressors span
+by then. Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Two groups of parameters with
 very different rates are tracked at one common rate unless ``groups`` is given.

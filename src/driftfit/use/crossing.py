@@ -30,7 +30,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
@@ -199,7 +199,7 @@ def _reflected(run: Track, lane: Mapping[str, Array], place: int, sign: float, l
     with np.errstate(divide="ignore", invalid="ignore"):
         B, ratio = c / np.sqrt(P + V), np.sqrt(V / P)
     B = np.where(P + V > 0.0, B, np.inf if c > 0.0 else -np.inf)
-    F = special.ndtr(-B) + 2.0 * special.owens_t(B, np.where(np.isnan(ratio), 0.0, ratio))
+    F = scipy.special.ndtr(-B) + 2.0 * scipy.special.owens_t(B, np.where(np.isnan(ratio), 0.0, ratio))
     return np.asarray(np.clip(F, 0.0, 1.0))
 
 

@@ -160,7 +160,7 @@ class LagErrors:
     def of(cls, model: Model, n: int) -> LagErrors | None:
         """For a model whose regressors begin with past outputs; None for others."""
         na = model.output_lags
-        return None if na is None else cls(len(model.outputs), na, n)
+        return cls(len(model.outputs), na, n) if na else None
 
     def step(self, phi: Array, theta: Array, P: Array, s: Array) -> Array:
         """Variances (ny,) of the outputs of the next sample, for phi (n,), theta (ny, n), P (ny, n, n).

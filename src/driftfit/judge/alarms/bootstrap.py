@@ -15,8 +15,7 @@ Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: SAMPLES samples, a 
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
-from scipy.stats import qmc
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
@@ -36,7 +35,7 @@ from driftfit.run.live.likelihood_ratio import (
     scan_scores,
 )
 
-RECORDS, SAMPLES = 128, 256_000
+RECORDS, SAMPLES = 128, 128_000
 """Simulated records, and samples of all together."""
 START = SHORT << (LEVELS - 1)
 """Samples at the beginning of a record that are not counted: the longest window is not complete."""
@@ -56,7 +55,7 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     rng = np.random.default_rng(seed)
     (N, n), T = rows.phi.shape, SAMPLES // RECORDS + START
     root, block = np.linalg.cholesky(frozen.cov), _block(frozen, rows.x)
-    drawn = special.ndtri(qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
+    drawn = scipy.special.ndtri(scipy.stats.qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
     made = []
     for z in drawn:
         known, later = _played(frozen, rows.x[_blocks(rng, N, N, block)], rng), _blocks(rng, N, T, block)

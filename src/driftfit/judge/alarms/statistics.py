@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
@@ -197,7 +197,7 @@ def chance_of(run: Track, rule: AlarmRule) -> Chance:
         rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
 
         def of_band(highest: Array, J: int) -> float:
-            each = [chance(rate, z, special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
+            each = [chance(rate, z, scipy.special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
             return min(1.0, len(each) * min(each))
 
         return of_band
@@ -206,8 +206,8 @@ def chance_of(run: Track, rule: AlarmRule) -> Chance:
         W, slack = rule.window, rule.slack
         loud, aside = W + (highest[0] - W) / slack, highest[1] / slack
         each = (
-            chance(power_rate(W), loud, special.chdtrc(W, max(loud, 0.0)), J),
-            chance(mean_rate(W), aside, 2.0 * special.ndtr(-aside / np.sqrt(W)), J),
+            chance(power_rate(W), loud, scipy.special.chdtrc(W, max(loud, 0.0)), J),
+            chance(mean_rate(W), aside, 2.0 * scipy.special.ndtr(-aside / np.sqrt(W)), J),
         )
         return min(1.0, 2.0 * min(each))
 

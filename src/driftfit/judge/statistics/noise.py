@@ -30,11 +30,12 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
 from driftfit.judge.statistics.robust import cholesky, huber
+from driftfit.judge.statistics.scale import deviation, median
 
 HELD = 3.0
 """y is limited to this many noise levels around the fit."""
@@ -220,7 +221,7 @@ class _Search(NamedTuple):
             _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), fits)
             residual, near, leverage = fits
             ar = self.correlation(near, breaks)
-            c = self.c * (1.4826 * np.median(np.abs(near / self.c)))
+            c = self.c * deviation(near / self.c)
             held = y - near + np.clip(near, -HELD * c, HELD * c)
             if np.array_equal(before, breaks):
                 break
@@ -233,7 +234,7 @@ class _Search(NamedTuple):
             held,
             near,
             leverage,
-            self.size(near, ar) * float(np.median(self.c / c)),
+            self.size(near, ar) * median(self.c / c),
             self.price(ar),
         )
 
@@ -245,7 +246,7 @@ class _Search(NamedTuple):
     def correlation(self, v: Array, breaks: Array) -> Array:
         """The autoregression of v within segments."""
         N, r, v = len(v), np.zeros(self.P + 1), v / self.c
-        limit = HELD * 1.4826 * np.median(np.abs(v))
+        limit = HELD * deviation(v)
         _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
         if not r[0] > 0.0:
             return r[:0]
@@ -259,7 +260,7 @@ class _Search(NamedTuple):
         if longest <= self.P:
             return ar
         w, r = whitened(np.zeros((N, 0)), v, ar)[1], np.zeros(longest + 1)
-        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * 1.4826 * np.median(np.abs(w))]), r)
+        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * deviation(w)]), r)
         later = r[self.P + 1 :] / r[0] if r[0] > 0.0 else np.zeros(longest - self.P)
         best = int(np.argmax(np.abs(later)))
         b = float(np.clip(later[best], -LARGEST, LARGEST))
@@ -272,8 +273,9 @@ class _Search(NamedTuple):
     def size(self, v: Array, ar: Array) -> float:
         """Standard deviation of the white noise, with outliers limited."""
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
-        limit = HELD * 1.4826 * np.median(np.abs(w))
-        return float(np.sqrt(np.mean(np.clip(w, -limit, limit) ** 2))) if limit > 0.0 else 1.0
+        limit = HELD * deviation(w)
+        held = np.clip(w, -limit, limit)
+        return float(np.sqrt(held @ held / len(held))) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
@@ -297,8 +299,8 @@ def penalty(N: int, n: int, least: int, quiet: float) -> float:
     follows from the supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
     """
     span = np.log(max(N / least - 1.0, np.e))
-    one = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
-    pair = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
+    one = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
+    pair = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
     return max(one, 0.5 * pair)
 
 
@@ -322,7 +324,7 @@ def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
 
     smooth = ndimage.median_filter(level, 5, mode="nearest") if len(level) > 2 else level
     positive = smooth[smooth > 0.0]
-    floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
+    floor = 0.05 * median(positive) if len(positive) else 1.0
     return np.interp(np.arange(N), 0.5 * (spans[0] + spans[1]), np.maximum(smooth, floor))
 
 

@@ -45,6 +45,15 @@ LEVERAGE = 1e-5
 
 def smooth(walk: Walk) -> Path | None:
     """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough."""
+    solved = smooth_and_weigh(walk)
+    return None if solved is None else solved[0]
+
+
+def smooth_and_weigh(walk: Walk) -> tuple[Path, float] | None:
+    """The same, and the log of the diffuse likelihood of y given q, drift and weights, up to a constant.
+
+    With U after the last sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
+    """
     T, n = walk.phi.shape
     work = workspace(n).copy()
     work["q"] = np.diag(walk.q)
@@ -54,6 +63,8 @@ def smooth(walk: Walk) -> Path | None:
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
+    pivots = np.einsum("tii->ti", steps["a"])
+    volume = float(np.linalg.slogdet(work["U"][0])[1]) - float(np.sum(np.log(pivots)))
     work["C"], work["theta"] = C, C @ work["z"][0]
     theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
     backwards(work, walk.phi, samples, each, steps, theta, var, left)
@@ -65,7 +76,7 @@ def smooth(walk: Walk) -> Path | None:
         return None
     c, empty = np.sqrt(left), np.zeros((0, n, n))
     rho = np.where(walk.weight > 0.0, np.sqrt(walk.weight) * walk.residual(theta) / c, np.nan)
-    return Path(theta, var, rho, c, cost, empty, empty, "fast")
+    return Path(theta, var, rho, c, cost, empty, empty, "fast"), -0.5 * (cost + volume)
 
 
 def inverse(U: Array) -> Array | None:
