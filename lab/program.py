@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from driftfit.cli.parts.program import helpful
 from driftfit.engine.settings import near
 from lab import same_numbers
 from lab.bench import commands as bench
@@ -28,16 +27,6 @@ app.add_typer(
 out = Console(highlight=False)
 
 
-@contextmanager
-def helpful() -> Iterator[None]:
-    """Turn errors that a user can correct into one line and exit code 2."""
-    try:
-        yield
-    except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"lab: {' '.join(str(error).split())}", err=True)
-        raise typer.Exit(2) from None
-
-
 @app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
     help=f"Reproduce a paper: {', '.join(reproductions())}. Options: python -m lab reproduce NAME --help.",
@@ -47,7 +36,7 @@ def reproduce(context: typer.Context, name: Annotated[str, typer.Argument(help="
     if name == "--help":
         out.print(f"python -m lab reproduce {{{','.join(reproductions())}}} [--help]", markup=False)
         return
-    with helpful():
+    with helpful("lab"):
         if name not in reproductions():
             raise ValueError(f"there is no reproduction {name!r}; {near(name, reproductions())}")
         program = typer.Typer(add_completion=False, rich_markup_mode=None)

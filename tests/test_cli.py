@@ -207,7 +207,6 @@ def test_wrong_endings_are_refused_before_the_work(file, tmp_path):
     assert ".parquet" in fails(*arguments, "--out", tmp_path / "result.xls")
     assert "--dt soon" in fails(*arguments, "--dt", "soon")
     assert ".html" in fails(*arguments, "--report", tmp_path / "page.pdf", "--y", "no such column")
-    assert "one run" in fails(*arguments, "--out", tmp_path / "result.npz", "--by", "no such column")
 
 
 @pytest.mark.parametrize("name", ["AugmentedFLS", "augmentedfls", "augmented-fls", "augmented_FLS"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, Kalman, track
 from driftfit.cli import app
-from driftfit.fleets import Outputs
+from driftfit.fleets import Fleet, Outputs
 
 OWN = '''
 from dataclasses import dataclass
@@ -165,14 +166,15 @@ def test_a_fleet_of_several_outputs(tanks):
         data["valve"].to_numpy()[:, None],
     )  # fmt: skip
     assert table.filter(tank="b")["theta_a1[level<-flow]"].to_numpy() == pytest.approx(alone.theta[:, 0, 1])
+    run("all.csv", *TWO, "--u", "valve", "--by", "tank", "--out", "two.npz", "--plot", "two.png")
+    assert np.array_equal(Fleet.load("two.npz")["b"].theta, alone.theta)
+    assert Path("two.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("--model", "arx:1,1,ny=3", "--y", "level,flow"), "ny=3, but --y names level, flow"),
-        (("--y", "level,flow", "--by", "tank", "--plot", "x.png"), "many records with several outputs cannot be drawn"),
-        (("--y", "level,flow", "--by", "tank", "--out", "x.npz"), "one run"),
         (("--y", ","), "names no column"),
         (("--y", "level", "--y", "level"), "--y level,level: name each output once"),
         (("--y", "level,flow", "--u", "valve"), "inputs must be different names"),

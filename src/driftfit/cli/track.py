@@ -15,7 +15,7 @@ from driftfit.show.export import check_ending, write
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (one run).")]
+Out = Annotated[Path | None, typer.Option("--out", help="Write the result to .csv, .parquet or .npz (complete).")]
 Plot = Annotated[Path | None, typer.Option(help="Save a picture (.png, .pdf, .svg).")]
 Report = Annotated[Path | None, typer.Option(help="Write a page (.html) to send to someone; a fleet has one page.")]
 
@@ -32,14 +32,12 @@ def track(
     report: Report = None,
 ) -> None:
     """Track the parameters of a model in a record, or in a fleet of records."""
-    if write_to is not None and check_ending(write_to) == ".npz" and given.by:
-        raise ValueError(f"--out {write_to}: an .npz file holds one run; write a fleet as .parquet or .csv.")
+    if write_to is not None:
+        check_ending(write_to)
     if report is not None:
         from driftfit.show.report import check_path
 
         check_path(report)
-    if plot is not None and given.by and len(given.outputs) > 1:
-        raise ValueError("--plot: many records with several outputs cannot be drawn; use --report.")
     run = given.run()
     say(run.summary())
     if write_to is not None:

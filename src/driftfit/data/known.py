@@ -1,4 +1,4 @@
-"""What is known of every sample beside its signals: how much time has passed, how noisy it is, how much may move."""
+"""What is known of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Known:
 
     @property
     def more(self) -> Array:
-        """(T, k - 3): what a tracker is told beside these."""
+        """(T, k - 3): further columns, which only some trackers understand."""
         return self.columns[:, COMMON:]
 
     @property
@@ -91,7 +91,7 @@ class Known:
         return Known(columns)
 
     def with_more(self, columns: Array) -> Known:
-        """With what a tracker is told beside interval, noise and drift, (T, k)."""
+        """With further columns (T, k) after interval, noise and drift."""
         common = self.common.over(len(columns)).columns
         if common.ndim > 2:
             columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)

@@ -104,16 +104,16 @@ def _bounds(key: Any, bounds: Any) -> tuple[float, float]:
     return found
 
 
-def within(stretches: Any, time: Array | None, number: Array, zone: str | None = None) -> Array:
+def within(intervals: Any, time: Array | None, number: Array, zone: str | None = None) -> Array:
     """Which samples are in one of the intervals; ``number`` (N,) counts the samples of each series."""
     inside = np.zeros(len(number), dtype=bool)
     axis = number if time is None else time
-    for stretch in stretches:
-        if isinstance(stretch, str) or not isinstance(stretch, Sequence | np.ndarray) or len(stretch) != 2:
-            raise ValueError(f"exclude: each interval must be (from, to), in a list; got {stretch!r}.")
-        low, high = (_end(one, axis, zone, upper) for upper, one in enumerate(stretch))
+    for interval in intervals:
+        if isinstance(interval, str) or not isinstance(interval, Sequence | np.ndarray) or len(interval) != 2:
+            raise ValueError(f"exclude: each interval must be (from, to), in a list; got {interval!r}.")
+        low, high = (_end(one, axis, zone, upper) for upper, one in enumerate(interval))
         if low is not None and high is not None and not low <= high:
-            raise ValueError(f"exclude: an interval must not end before it begins; got {stretch!r}.")
+            raise ValueError(f"exclude: an interval must not end before it begins; got {interval!r}.")
         inside |= (True if low is None else axis >= low) & (True if high is None else axis <= high)
     return inside
 

@@ -120,7 +120,7 @@ class Records:
     ``y`` (N,), ``u`` (N, m), ``known`` of N samples or one row, ``time`` (N,) or None; series k is ``length[k]``
     samples from ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that
     never became samples and numbers that were taken as missing. ``drifts`` (N, k) are
-    factors of the drift for each parameter or change, until the tracker has made columns of ``known`` of them (`told`).
+    factors of the drift for each parameter or change, until `for_trackers` has made columns of ``known`` of them.
     Series with several ``outputs`` have ``y`` (N, ny), ``known`` of each, and ``u`` (N, m), or (N, ny, m) if the
     outputs share one theta (`in_rows`).
     """
@@ -175,8 +175,8 @@ class Records:
         known, first, length = self.known.in_rows(N), self.first * ny, self.length * ny
         return replace(self, first=first, length=length, y=y, u=u, known=known, time=time, outputs=())
 
-    def told(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
-        """With what is known beside interval, noise and drift as columns of ``known``, for these trackers."""
+    def for_trackers(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
+        """With everything that is known of the samples as columns of ``known``, as these trackers take it."""
         if self.drifts is None and prob is None:
             return self
         columns, *others = (one.beside(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
@@ -234,16 +234,16 @@ class Records:
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
     signals = {"y": held("y", y), "u": held("u", u)}
-    beside = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
-    together(**signals, **beside)
+    factors = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    together(**signals, **factors)
     output = as_output(signals["y"].values)
     T = len(output)
     times = times_of(reading.time, list(signals.values()))
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
-    drift = beside["drift"].values
+    drift = factors["drift"].values
     common, drifts = (1.0, as_numbers("drift", drift)) if np.ndim(drift) == 2 else (drift, None)
-    known = Known.of(gaps, noise_of(beside["weights"].values, T), factor("drift", common, T))
+    known = Known.of(gaps, noise_of(factors["weights"].values, T), factor("drift", common, T))
     labels = Labels(
         (signals["y"].names or ("y",))[0], signals["u"].names, times.name, zone=times.zone, dt=Clock.of(dt).plain
     )

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 PATIENCE = 2.0
-"""Seconds of compiling before it is said."""
+"""Seconds of compiling after which the notice appears."""
 
 TEXT = "driftfit: compiling once for this computer ..."
 TEXT_IN_MEMORY = "driftfit: compiling; no folder can be written to keep the code ..."

@@ -4,11 +4,11 @@ Numba keeps the signatures of a function in one index and numbers its files by w
 processes that compile different layouts at the same moment may store both under one number, and a third runs the wrong
 code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the processor,
 and the versions of everything that makes code, so that two processes can only ever write the same content; a file
-appears at once or not at all, and one that was damaged is compiled anew.
+appears at once or not at all, and what was in a damaged file is compiled again.
 
 The folder is ``NUMBA_CACHE_DIR`` where that is set, else ``__pycache__`` of the package, else the user's cache folder.
 Code is found in any of them, as in an image that was filled by ``driftfit warm`` and can only be read, and written to
-the first that can be written. Where none can, it is compiled in memory, in every process anew, and a warning says so
+the first that can be written. Where none can, it is compiled in memory by every process, and a warning says so
 once.
 """
 
@@ -32,7 +32,7 @@ from driftfit.engine.numba_internals import dumps, processor, versions
 PACKAGE = Path(__file__).parent
 ENDING = ".compiled"
 MAKERS = ("kernel.py", "numba_internals.py", "simd.py")
-"""Files that decide what becomes of a function, beside its own code."""
+"""Files that decide how a function is compiled, in addition to its own code."""
 
 
 @cache
@@ -124,7 +124,7 @@ def _say_nothing_is_kept() -> None:
     tried = ", ".join(map(str, folders()))
     warnings.warn(
         f"driftfit: compiled code cannot be kept, because none of these folders can be written: {tried}. It is "
-        "compiled anew in every process. Set NUMBA_CACHE_DIR to a folder that can be written.",
+        "compiled again in every process. Set NUMBA_CACHE_DIR to a folder that can be written.",
         stacklevel=2,
     )
 

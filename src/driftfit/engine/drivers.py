@@ -308,7 +308,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Any:
+def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
@@ -351,7 +351,7 @@ def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Any
     return run
 
 
-def _updates(driver: Any, sample: Any) -> tuple[Any, Any]:
+def _updates(driver: Callable[[Any], Driver], sample: Any) -> tuple[Driver, Driver]:
     """One sample of a stream, with an array of inputs and with a single one."""
 
     @driver

@@ -1,4 +1,4 @@
-"""Compiled functions made anew with other functions in the place of some that they call."""
+"""Compiled functions, built again with other functions in the place of some that they call."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from driftfit.engine.kernel import Machine, machine
 
 
 def substituted(functions: Sequence[Any], others: Mapping[Any, Any]) -> tuple[Any, ...]:
-    """Compiled functions, or machines, made anew with other functions in the place of some that they call.
+    """Compiled functions, or machines, built again with other functions in the place of some that they call.
 
     ``others`` says what takes whose place, also where it is called through others. So a second form of a machine is the
     first with some parts replaced, and is compiled only where it is asked for.

@@ -69,7 +69,7 @@ def _prepared(
         if one.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
             (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
-    records = records.told(programs[0].model, [one.tracker for one in programs], prob)
+    records = records.for_trackers(programs[0].model, [one.tracker for one in programs], prob)
     return programs, records.in_rows() if model.shared else records
 
 

@@ -162,4 +162,4 @@ def _warn(tuned: Tuned) -> None:
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any) -> Task:
     records = records_of(model, y, u, reading, data)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
-    return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))
+    return Task(bound, replace(records.for_trackers(bound, [tracker]).part(0), time=None))

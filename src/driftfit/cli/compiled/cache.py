@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from driftfit.cli.parts.program import app, helpful, say
-from driftfit.engine.disk_cache import contents, prune
+from driftfit.engine.disk_cache import Contents, contents, prune
 from driftfit.show.parts.text import facts
 
 
@@ -26,9 +26,16 @@ def cache(
         there = contents()
         say(
             facts(
-                ("Folder", str(there.place or "none: no folder can be written, see NUMBA_CACHE_DIR")),
-                ("Files", f"{there.files}, {there.usable} of them of this version and processor"),
-                ("Size", f"{there.size / 1e6:.1f} MB"),
+                *stored(there, f"{there.usable} of them of this version and processor"),
                 *([] if gone is None else [("Removed", f"{gone} files")]),
             )
         )
+
+
+def stored(found: Contents, more: str) -> list[tuple[str, str]]:
+    """Where compiled code is stored, how many files there are, and their size."""
+    return [
+        ("Folder", str(found.place or "none: no folder can be written, see NUMBA_CACHE_DIR")),
+        ("Files", f"{found.files}, {more}"),
+        ("Size", f"{found.size / 1e6:.1f} MB"),
+    ]

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from driftfit.cli.compiled.cache import stored
 from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
@@ -53,9 +54,7 @@ def warm(
         after = contents()
         say(
             facts(
-                ("Folder", str(after.place or "none: no folder can be written, see NUMBA_CACHE_DIR")),
-                ("Files", f"{after.files}, {after.files - before.files} new"),
-                ("Size", f"{after.size / 1e6:.1f} MB"),
+                *stored(after, f"{after.files - before.files} new"),
                 ("Seconds", f"{time.perf_counter() - start:.0f}"),
             )
         )

@@ -42,12 +42,12 @@ def main() -> None:
 
 
 @contextmanager
-def helpful() -> Iterator[None]:
+def helpful(program: str = "driftfit") -> Iterator[None]:
     """Turn errors that a user can correct into one line and exit code 2."""
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"driftfit: {' '.join(str(error).split())}", err=True)
+        typer.echo(f"{program}: {' '.join(str(error).split())}", err=True)
         raise typer.Exit(2) from None
 
 

@@ -47,11 +47,11 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.basis_values import DIGITS
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
-from driftfit.models.hammerstein_wiener.memory_layout import memory, places_of
+from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
 from driftfit.models.hammerstein_wiener.regressor_rows import FLOOR
+from driftfit.models.hammerstein_wiener.step_memory import memory, places_of
 from driftfit.models.hammerstein_wiener.steps import applying, build
 
 IDENTITY = Polynomial(1)

@@ -24,8 +24,8 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
 from driftfit.engine.simd import fill_four, load_four, plus, reached, times
-from driftfit.models.hammerstein_wiener.basis_values import Kind, level_of
-from driftfit.models.hammerstein_wiener.memory_layout import (
+from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
+from driftfit.models.hammerstein_wiener.step_memory import (
     BEFORE,
     BEND,
     BOTTOM,

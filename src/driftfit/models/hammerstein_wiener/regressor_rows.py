@@ -11,7 +11,7 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part, shared
-from driftfit.models.hammerstein_wiener.memory_layout import (
+from driftfit.models.hammerstein_wiener.step_memory import (
     D_NOW,
     EACH,
     F_PAST,

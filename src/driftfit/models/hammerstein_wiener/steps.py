@@ -21,8 +21,18 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, floats, kernel, machine, part, shared
 from driftfit.models.arx import GAP
-from driftfit.models.hammerstein_wiener.basis_values import Kind, input_values, level_of, output_values, usable
-from driftfit.models.hammerstein_wiener.memory_layout import (
+from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, input_values, level_of, output_values, usable
+from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
+from driftfit.models.hammerstein_wiener.regressor_rows import (
+    complete,
+    fill,
+    forget,
+    minimal_past,
+    noise_factor,
+    past,
+    shift,
+)
+from driftfit.models.hammerstein_wiener.step_memory import (
     ADAPTIVE,
     DT,
     EACH,
@@ -59,16 +69,6 @@ from driftfit.models.hammerstein_wiener.memory_layout import (
     N,
     Places,
     Y,
-)
-from driftfit.models.hammerstein_wiener.output_curve import believe, inverting, laying, locating, refining
-from driftfit.models.hammerstein_wiener.regressor_rows import (
-    complete,
-    fill,
-    forget,
-    minimal_past,
-    noise_factor,
-    past,
-    shift,
 )
 
 INSIDE = 0.97

@@ -20,10 +20,10 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.models.hammerstein_wiener.curves.basis import Thresholds
-from driftfit.models.hammerstein_wiener.memory_layout import GRID
 from driftfit.models.hammerstein_wiener.output_curve import FAR, WIDER
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
+from driftfit.models.hammerstein_wiener.step_memory import GRID
 from driftfit.run.result import burn_in
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from driftfit.data.record import Record
 from driftfit.data.signals import as_inputs, as_output
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.models.hammerstein_wiener.memory_layout import MINIMAL
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.diagnostics import LEAST, excitation_of
 from driftfit.models.hammerstein_wiener.results.run_blocks import WEAK, blocks_of
+from driftfit.models.hammerstein_wiener.step_memory import MINIMAL
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.run.program import Program

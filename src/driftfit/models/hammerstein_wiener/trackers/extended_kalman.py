@@ -31,9 +31,9 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
-from driftfit.models.hammerstein_wiener.memory_layout import MINIMAL
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.products import Structure
+from driftfit.models.hammerstein_wiener.step_memory import MINIMAL
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.diffuse import LEFT, product_with

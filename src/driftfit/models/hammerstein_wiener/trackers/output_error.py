@@ -30,8 +30,8 @@ from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
-from driftfit.models.hammerstein_wiener.memory_layout import PREDICTED
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
+from driftfit.models.hammerstein_wiener.step_memory import PREDICTED
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     OK,

@@ -3,7 +3,7 @@ once for all orders.
 
 S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
 outputs of the linear block. ``own`` holds the numbers named below. What the model says of the present input and output
-stands in its memory (`driftfit.models.hammerstein_wiener.memory_layout`).
+stands in its memory (`driftfit.models.hammerstein_wiener.step_memory`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, floats, machine, part, shared
-from driftfit.models.hammerstein_wiener.basis_values import Kind, level_of, output_values
-from driftfit.models.hammerstein_wiener.memory_layout import (
+from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of, output_values
+from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
+from driftfit.models.hammerstein_wiener.step_memory import (
     CURVE,
     D_NOW,
     EACH,
@@ -44,7 +45,6 @@ from driftfit.models.hammerstein_wiener.memory_layout import (
     TRIAL_BEND,
     Places,
 )
-from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
 from driftfit.trackers.parts.diffuse import LEFT
 
 FLATTEST = 0.05

@@ -12,7 +12,7 @@ from typing import Any
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array, part
 from driftfit.models.hammerstein_wiener.curves.kernels import LEGENDRE, POWERS
-from driftfit.models.hammerstein_wiener.memory_layout import (
+from driftfit.models.hammerstein_wiener.step_memory import (
     CURVE,
     D_NOW,
     EACH,
