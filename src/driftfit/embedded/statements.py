@@ -21,7 +21,7 @@ from typing import Any
 
 from driftfit.embedded.expressions import Expressions
 from driftfit.embedded.unit import TYPES, Function, TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, bare, begin_of, joined, lifted, renamed
+from driftfit.embedded.values import RANK, Value, assigned, bare, begin_of, joined, lifted, narrow, plain, renamed
 
 RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if int long register return
@@ -107,6 +107,10 @@ class Body(Expressions):
         signature = f"static {result} {name}({', '.join([*self.parameters, *outs]) or 'void'})"
         taken = {parameter.split("*")[-1].split()[-1] for parameter in self.parameters}
         own = {self.safe(one): kind for one, kind in self.kinds.items() if self.safe(one) not in taken}
+        for one in [one for one in own if not self._reads(one)]:  # constants went to the places that would read it
+            self.lines = [line for line in self.lines if not re.fullmatch(rf"\s*{one} = -?\d+;", line)]
+            if not any(re.search(rf"\b{one}\b", line) for line in self.lines):
+                del own[one]
         declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
         unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
         said = (ast.get_docstring(self.tree) or "").split("\n")[0]
@@ -185,8 +189,16 @@ class Body(Expressions):
         elif isinstance(target, ast.Name):
             self.assign_name(target.id, value)
         else:
-            self.line(f"{self.value(target).text} = {value.text};")
-            self.ops[-1]["store"] += 1
+            self.store(target, value)
+
+    def store(self, target: ast.expr, value: Value) -> None:
+        """Assign a number to an element of an array."""
+        place = self.value(target)
+        if place.kind == "flag" and narrow(value) not in ("bool", "flag"):
+            assert isinstance(target, ast.Subscript)
+            self.unit.beyond.add(self.owner(target.value)[1])
+        self.line(f"{place.text} = {assigned(value, place.kind)};")
+        self.ops[-1]["store"] += 1
 
     def held(self, value: Value) -> Value:
         """Store a value in a separate variable, so that a later assignment does not change it."""
@@ -201,19 +213,22 @@ class Body(Expressions):
         if value.kind not in RANK or (fixed and value.known):
             self.locals[name] = value
             return
-        self.kinds[name] = joined(value.kind, self.kinds.get(name, "bool"))
+        self.kinds[name] = joined(narrow(value), self.kinds.get(name, "bool"))
         most = value.most if fixed else None
-        self.locals[name] = Value(self.kinds[name], self.safe(name), most=most)
-        self.line(f"{self.safe(name)} = {value.text};")
+        whole = value.known and self.kinds[name] != "real"
+        self.locals[name] = value if whole else Value(self.kinds[name], self.safe(name), most=most)
+        if value.text != self.safe(name):
+            self.line(f"{self.safe(name)} = {assigned(value, self.kinds[name])};")
+
+    def forget(self, node: ast.stmt) -> None:
+        """The values of variables that a statement with branches or turns may have changed are not known after it."""
+        for name in {one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)}:
+            if name in self.kinds and name in self.locals and self.locals[name].known:
+                self.locals[name] = Value(self.kinds[name], self.safe(name))
 
     def on_augassign(self, node: ast.AugAssign) -> None:
         target = self.value(node.target)
-        value = self.binary(node.op, target, self.value(node.value))
-        if isinstance(node.target, ast.Name):
-            self.assign_name(node.target.id, value)
-        else:
-            self.line(f"{target.text} = {value.text};")
-            self.ops[-1]["store"] += 1
+        self.assign(node.target, self.binary(node.op, target, self.value(node.value)))
 
     def on_if(self, node: ast.If) -> bool:
         test = self.value(node.test)
@@ -221,10 +236,12 @@ class Body(Expressions):
             return self.block(node.body if test.constant else node.orelse)
         self.line(f"if ({bare(test.text)}) {{")
         one, ended = self.nested(node.body)
+        self.forget(node)
         other, other_ended = Counter[str](), False
         if node.orelse:
             self.line("} else {")
             other, other_ended = self.nested(node.orelse)
+            self.forget(node)
         self.line("}")
         self.ops[-1] += one if one.total() >= other.total() else other
         return ended and other_ended
@@ -246,12 +263,14 @@ class Body(Expressions):
         top = self.largest(high)
         turns = max(0, top - (low.constant if low.known else 0))
         turns = -(-turns // abs(step))
-        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         sign = "<" if step > 0 else ">"
         move = f"{name}++" if step == 1 else f"{name}--" if step == -1 else f"{name} += {step}"
         bound = f"(int)({stop.text})" if stop.kind == "long" else stop.text
+        self.forget(node)
+        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         self.line(f"for (int {name} = {start.text}; {name} {sign} {bound}; {move}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
 
@@ -260,10 +279,12 @@ class Body(Expressions):
         return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
+        self.forget(node)
         with self.lazily():
             test = self.value(node.test)
         self.line(f"while ({bare(test.text)}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         turns = self.unit.largest
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
@@ -273,7 +294,7 @@ class Body(Expressions):
             self.line("return;")
             return True
         value = self.value(node.value)
-        items = value.constant if value.kind == "items" else [value]
+        items = [plain(one) for one in (value.constant if value.kind == "items" else [value])]
         kinds = tuple(one.kind for one in items)
         self.returns = tuple(map(joined, kinds, self.returns)) if self.returns else kinds
         if len(items) == 1:

@@ -236,6 +236,7 @@ class AdaptiveKalman(Tracker):
             "count": 0.0,
             "settled": 0,
             "weighed": 0,
+            "vague": 0.0,
             "gain": np.zeros((n, K)),
             "e_k": np.zeros(K),
             "step": np.zeros(K),
@@ -252,7 +253,7 @@ class AdaptiveKalman(Tracker):
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin, keep_density, note=note, machines=FRAME)
+        return TrackerSteps(predict, correct, report, begin, keep_density, note=note, machines=FRAME, doubts=True)
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
