@@ -8,7 +8,8 @@ from driftfit import Bank, Kalman, Regression, track
 from driftfit.smooth.piecewise import piecewise
 from driftfit.trackers.bank.change import DRIFT, Change
 from driftfit.trackers.bank.reduction import Beam
-from driftfit.trackers.bank.results.decided_path import problem_of, solve
+from driftfit.trackers.bank.results.decided_path import problem_of
+from driftfit.trackers.bank.results.given_steps import solve
 from driftfit.trackers.bank.sensor import Sensor
 
 KNOWN = [Sensor.nominal(R)]

@@ -281,9 +281,9 @@ def test_instruments_and_the_unbiased_basis_take_the_bias_away():
         )  # fmt: skip
         off.append([np.linalg.norm(fit.xi - s.xi[0]) for fit in fits])
     plain, instruments, both = np.median(off, axis=0)
-    assert plain == pytest.approx(0.18, rel=0.15)
-    assert 0.02 < instruments / plain < 0.07
-    assert both < 0.9 * instruments
+    assert plain == pytest.approx(0.18, rel=0.03)
+    assert 0.03 < instruments / plain < 0.05
+    assert both < 0.87 * instruments
     assert np.std(fits[2].y - s.y0) < 0.2 * s.sigma
     with pytest.raises(ValueError, match="raw powers"):
         fit_constant(HammersteinWiener(1, 1, output=Legendre(3, (-3, 3))), s.y, s.u, sigma=0.1)
@@ -295,8 +295,8 @@ def test_ratios_choose_as_the_noise_asks():
     """Section 9: without noise the largest ratio leads, at 20 dB a small one; and nothing looks ahead."""
     clean, noisy = example(1, 0, T=900), example(3, 0, T=900, snr_db=20.0)
     led = [track_ratios(s.model, s.y, s.u, rhos=(1e-3, 1e-1, 1e1)) for s in (clean, noisy)]
-    assert np.mean(led[0].rho[300:] == 10.0) > 0.8
-    assert np.mean(led[1].rho[300:] < 10.0) > 0.8
+    assert np.mean(led[0].rho[300:] == 10.0) > 0.98
+    assert np.mean(led[1].rho[300:] < 10.0) > 0.98
     short = track_ratios(noisy.model, noisy.y[:500], noisy.u[:500], rhos=(1e-3, 1e-1, 1e1))
     assert same(short.theta, led[1].theta[:500])
     assert same(short.rho, led[1].rho[:500])

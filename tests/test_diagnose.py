@@ -111,9 +111,16 @@ def test_short_records_and_trackers_without_covariance_are_diagnosed_too():
 
 def test_picture_has_six_panels_and_marks_what_is_out_of_bounds():
     y, u = arx_record(600, 3)
-    figure = track(ARX(2, 2), Kalman(q=0.0, r=0.001), y, u).diagnose().plot()
-    assert len(figure.axes) == 6
-    assert "out of bounds" in figure.axes[2].get_title(loc="left")
+    said = track(ARX(2, 2), Kalman(q=0.0, r=0.001), y, u).diagnose()
+    panels = said.plot().axes
+    marked = ["out of bounds" in panel.get_title(loc="left") for panel in panels]
+    wrong = {check.name for check in said.checks if not check.ok}
+    assert len(panels) == 6
+    causes = ({"outliers"}, {"whiteness (p)"}, {"noise level", "steady noise"}, {"symmetry", "outliers"})
+    assert marked[:4] == [bool(cause & wrong) for cause in causes]
+    assert marked[2]
+    np.testing.assert_array_equal(panels[0].lines[0].get_ydata(), said.z)
+    assert [bar.get_height() for bar in panels[1].patches] == list(said.white.r)
 
 
 def test_a_tracker_that_may_move_is_not_accused_on_short_constant_records():

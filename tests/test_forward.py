@@ -58,14 +58,15 @@ def test_drawn_bands_are_the_delta_method_where_that_is_exact_enough():
     future = np.random.default_rng(1).normal(size=12)
     exact, got = run.simulate(future), simulate_by_draws(run, future[:, None], -1, np.zeros(0))
     assert got.y_hat == pytest.approx(exact.y_hat, abs=1e-9)
-    assert got.theta_std[1:] == pytest.approx(exact.theta_std[1:], rel=0.25)
-    assert got.y_std == pytest.approx(exact.y_std, rel=0.25)
+    assert got.theta_std[1:] == pytest.approx(exact.theta_std[1:], rel=0.12)
+    assert got.y_std == pytest.approx(exact.y_std, rel=0.12)
     exact, got = run.ahead(5), ahead_by_draws(run, 5)
     later = slice(200, None)
     assert got.y_hat[later] == pytest.approx(exact.y_hat[later], abs=1e-9)
-    assert got.y_std[later] == pytest.approx(exact.y_std[later], rel=0.3)
+    assert got.y_std[later] == pytest.approx(exact.y_std[later], rel=0.2)
+    assert np.mean(got.y_std[later] / exact.y_std[later]) == pytest.approx(1.0, abs=0.02)
     low, high = got.band(0.95)
-    assert 0.9 < np.mean((y[later] > low[later]) & (y[later] < high[later])) <= 1.0
+    assert 0.93 < np.mean((y[later] > low[later]) & (y[later] < high[later])) < 0.98
 
 
 def test_bands_of_a_hammerstein_wiener_model_cover():
@@ -74,7 +75,7 @@ def test_bands_of_a_hammerstein_wiener_model_cover():
     said = run.ahead(4)
     later = slice(150, None)
     low, high = (end[later] for end in said.band(0.9))
-    assert 0.8 < np.mean((y[later] > low) & (y[later] < high)) < 0.97
+    assert 0.87 < np.mean((y[later] > low) & (y[later] < high)) < 0.94
     assert np.isnan(said.y_hat[:4]).all()
     once = run.ahead(1)
     # the filter widens its grid only when an output leaves it, and predicts within the grid
@@ -87,7 +88,7 @@ def test_free_simulation_of_a_hammerstein_wiener_model():
     fresh = np.random.default_rng(9).uniform(-1.0, 1.0, 60)
     truth = simulate(SMALL, [-0.6], [0.5], [0.3], [0.2], T=60, rng=np.random.default_rng(0), u=fresh).y
     said = run.simulate(fresh)
-    assert np.abs(said.y_hat - truth)[5:].max() < 0.05
+    assert np.abs(said.y_hat - truth)[5:].max() < 0.006
     assert (said.theta_std[5:] <= said.y_std[5:] + 1e-3).all()
     again = run.simulate(fresh)
     assert np.array_equal(again.paths, said.paths)
@@ -100,7 +101,7 @@ def test_a_tracker_of_the_free_parameters():
     y, u = curved_record(noise=0.01)
     run = track(SMALL, ExtendedKalman(q=0.0, r=1e-4, p0=1.0, theta0=0.1), y, u)
     said = run.simulate(u[:50])
-    assert np.abs(said.y_hat - y[:50])[5:].max() < 0.2
+    assert np.abs(said.y_hat - y[:50])[5:].max() < 0.06
     assert np.isfinite(said.y_std[5:]).all()
 
 

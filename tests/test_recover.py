@@ -94,9 +94,9 @@ def test_exponential_autoregression():
     found = [exp_autoregression(exp_ar(500, rng=np.random.default_rng(s)).y, 2) for s in range(20)]
     np.testing.assert_allclose(np.median([f.a for f in found], axis=0), [1.95, -0.96], atol=0.01)
     np.testing.assert_allclose(np.median([f.b for f in found], axis=0), [0.23, -0.24], atol=0.06)
-    assert np.median([f.r for f in found]) == pytest.approx(1.0, abs=0.3)
-    assert np.median([f.noise for f in found]) == pytest.approx(0.01, rel=0.1)
-    assert sum(f.interval[0] <= 1.0 <= f.interval[1] for f in found) >= 17
+    assert np.median([f.r for f in found]) == pytest.approx(1.0, abs=0.12)
+    assert np.median([f.noise for f in found]) == pytest.approx(0.01, rel=0.03)
+    assert sum(f.interval[0] <= 1.0 <= f.interval[1] for f in found) >= 18
     d = exp_ar(500, rng=np.random.default_rng(0))
     np.testing.assert_allclose(found[0].theta(d.y)[5:], d.theta[5:], atol=0.1)
 
@@ -106,7 +106,7 @@ def test_exponential_autoregression_with_holes_and_in_other_units():
     hole = y.copy()
     hole[[50, 200]] = np.nan
     whole, some, large = (exp_autoregression(v, 2) for v in (y, hole, 1e3 * y))
-    assert some.r == pytest.approx(whole.r, rel=0.5)
+    assert some.r == pytest.approx(whole.r, rel=0.06)
     assert large.r == pytest.approx(1e-6 * whole.r, rel=1e-4)
     np.testing.assert_allclose(large.a, whole.a, rtol=1e-6)
     noise = np.random.default_rng(1).normal(size=60)

@@ -226,9 +226,18 @@ def test_table_and_plot():
     table = tuned.table
     assert table.columns == ["q[theta1]/r", "q[theta2]/r", "loglik"]
     assert table["loglik"].is_sorted(descending=True)
-    assert len(tuned.plot().axes) == 2
     assert "Kalman" in repr(tuned)
-    assert len(tune(Regression(2), RLS(), y, u).plot().axes) == 1
+    panels = tuned.plot().axes
+    assert [panel.get_xlabel() for panel in panels] == ["q[theta1]/r", "q[theta2]/r"]
+    for panel in panels:
+        (values, criterion), chosen = panel.lines[0].get_data(), tuned.chosen[panel.get_xlabel()]
+        assert criterion.max() <= tuned.loglik + 1e-6
+        near = np.argmin(np.abs(np.log(values / chosen)))
+        assert criterion[near] > criterion.max() - 1.0  # the curve has its top where the red line is
+        assert panel.lines[1].get_xdata()[0] == chosen
+    memory = tune(Regression(2), RLS(), y, u)
+    (panel,) = memory.plot().axes
+    assert panel.lines[1].get_xdata()[0] == pytest.approx(1.0 / (1.0 - memory.tracker.forgetting))
 
 
 def test_frontier():
@@ -243,7 +252,10 @@ def test_frontier():
     for mu in (1e-3, 1.0, 300.0):
         pair = frontier(d.model, d.y, d.u, mu=[mu * 1.001**0.5, mu / 1.001**0.5])
         assert np.diff(pair.measurement) / np.diff(pair.dynamic) == pytest.approx(-mu, rel=1e-3)
-    assert len(grid.plot().axes) == 2
+    left, right = grid.plot().axes
+    np.testing.assert_array_equal(left.lines[0].get_data(), (grid.dynamic, grid.measurement))
+    for line, cost in zip(right.lines, (grid.measurement, grid.dynamic), strict=True):
+        np.testing.assert_array_equal(line.get_data(), (grid.mu, cost))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from driftfit.smooth.piecewise import piecewise
 from driftfit.systems.jumps import MODEL, START, Jumping, jumping
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.reduction import Beam, Decide
-from driftfit.trackers.bank.results.decided_path import problem_of, solve
+from driftfit.trackers.bank.results.decided_path import problem_of
+from driftfit.trackers.bank.results.given_steps import solve
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
