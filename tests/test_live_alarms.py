@@ -110,7 +110,8 @@ def test_alarms_of_several_outputs(record):
     y, u = record
     both = np.column_stack([y, 2.0 * y[::-1]])
     before = track(Regression(1, ny=("level", "flow")), K, both[:CUT], u[:CUT])
-    rules = {name: before[name].detect("innovation", every=30.0, window=8).rule for name in ("level", "flow")}
+    kinds = {"level": "innovation", "flow": "glr"}
+    rules = {name: before[name].detect(kind, every=30.0, window=8, reference=CUT).rule for name, kind in kinds.items()}
     whole = track(Regression(1, ny=("level", "flow")), K, both, u)
     live = Live(Regression(1, ny=("level", "flow")), K, warm_start=before)
     live.detect(rules)
@@ -123,7 +124,7 @@ def test_alarms_of_several_outputs(record):
     assert all(len(one.onsets) for one in said.values())
     ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
     assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
-    with pytest.raises(ValueError, match=r"separate theta; got \['speed'\]"):
+    with pytest.raises(ValueError, match=r"by the name of their output; got \['speed'\]"):
         live.detect({"speed": rules["flow"]})
 
 

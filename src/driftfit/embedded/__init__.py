@@ -10,10 +10,9 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
-
 from driftfit.data.signals import check_ready
-from driftfit.embedded.project import files_of, record_bytes, write
+from driftfit.embedded.project import files_of, write
+from driftfit.embedded.translation import translation
 from driftfit.models.base import Model
 from driftfit.run.program import Program
 from driftfit.streams import Live
@@ -21,7 +20,7 @@ from driftfit.trackers.base import Tracker
 
 
 def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
-    """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``.
+    """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, a self-test, an S-function and ``README.md``.
 
     Parameters
     ----------
@@ -44,13 +43,18 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
     if len(model.outputs) > 1:
         raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
     bound = model.bind(model.m)
-    tile = Program(bound, check_ready(tracker)).tile()
-    write(Path(path), files_of(bound, tracker, tile, f"{bound!r}, {tracker!r}"))
+    write(Path(path), files_of(Program(bound, check_ready(tracker)), f"{bound!r}, {tracker!r}"))
 
 
 def to_struct(live: Live) -> bytes:
-    """The state of a stream as the bytes of ``tracker_state`` (double precision, the byte order of this computer)."""
-    return record_bytes(live.program.tile(live.lane()))
+    """The state of a stream as the bytes of ``tracker_state`` (double precision, the byte order of this computer).
+
+    Raises
+    ------
+    ValueError
+        If a field that the exported tracker has as a constant has another value in this stream.
+    """
+    return translation(live.program).bytes_of(live.lane())
 
 
 def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
@@ -62,13 +66,8 @@ def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
         If the number of bytes is not the one that this model and tracker need.
     """
     live = Live(model, tracker)
-    lane = live.lane()
-    needed = sum(8 * lane[name].size for name in lane)
-    if len(state) != needed:
-        raise ValueError(f"from_struct: this model and tracker have a state of {needed} bytes; got {len(state)}.")
-    at = 0
-    for field in lane.values():
-        values = np.frombuffer(state, field.dtype, field.size, at)
-        field[...] = values.reshape(field.shape)
-        at += 8 * field.size
+    made = translation(live.program)
+    if len(state) != made.size(8):
+        raise ValueError(f"from_struct: this model and tracker have a state of {made.size(8)} bytes; got {len(state)}.")
+    made.read(live.lane(), state)
     return live

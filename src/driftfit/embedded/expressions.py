@@ -74,17 +74,26 @@ class Expressions:
         if node.attr == "data" and isinstance(node.value, ast.Attribute) and node.value.attr == "ctypes":
             array = self.value(node.value.value)
             return Value("address", begin_of(array))
+        if node.attr == "shape":
+            return Value("items", constant=[number(size) for size in self.owner(node.value)[0].shape])
         owner = self.value(node.value)
         if owner.kind == "record":
+            self.unit.written.add(node.attr)  # perhaps, by whoever receives the array
             return field(node.attr, self.unit.record[node.attr][0])
-        if owner.kind == "array" and node.attr == "shape":
-            return Value("items", constant=[number(size) for size in owner.shape])
         if owner.kind == "python" and owner.constant in (np, math):
             return lifted(getattr(owner.constant, node.attr))
         return self.refuse(node)  # type: ignore[no-any-return]
 
+    def owner(self, node: ast.expr) -> tuple[Value, str]:
+        """What a bracket or ``.shape`` is applied to, and the name of the field if it is one."""
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            record = self.value(node.value)
+            if record.kind == "record":
+                return field(node.attr, self.unit.record[node.attr][0]), node.attr
+        return self.value(node), ""
+
     def of_subscript(self, node: ast.Subscript) -> Value:
-        owner = self.value(node.value)
+        owner, name = self.owner(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if owner.kind == "tile":
             return Value("record", "s")
@@ -101,7 +110,12 @@ class Expressions:
             self._part(one, size) if isinstance(one, ast.Slice) else self.value(one)
             for one, size in zip(parts, owner.shape, strict=True)
         ]
-        return view(owner, index)
+        if not name:
+            return view(owner, index)
+        if isinstance(node.ctx, ast.Store) or any(isinstance(one, range) for one in index):
+            self.unit.written.add(name)
+        start = self.unit.start_of(name)
+        return view(owner, index) if start is None else number(start)
 
     def _part(self, node: ast.Slice, size: int) -> range:
         """The part of an axis that a slice selects."""
@@ -154,6 +168,9 @@ class Expressions:
         if type(operator) in BITS:
             return Value(kind, f"({one.text} {BITS[type(operator)]} {other.text})")
         sign = ARITHMETIC[type(operator)]
+        if kind == "real" and sign in "*/" and 1.0 in (other.constant, one.constant if sign == "*" else None):
+            kept = other if one.constant == 1.0 and sign == "*" else one  # a factor of one changes no bit
+            return kept if kept.kind == "real" else Value("real", _real(kept))
         if kind != "real":
             kind = "real" if isinstance(operator, ast.Div) else joined(kind, "int")
             if isinstance(operator, ast.Div):
@@ -313,7 +330,10 @@ def _folded(operator: ast.operator, one: Any, other: Any) -> Any:
     node = ast.fix_missing_locations(
         ast.Expression(ast.BinOp(ast.Name("a", ast.Load()), operator, ast.Name("b", ast.Load())))
     )
-    return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+    if isinstance(one, float) or isinstance(operator, ast.Div):  # dividing by zero is no error in a step
+        one, other = np.float64(one), np.float64(other)
+    with np.errstate(all="ignore"):
+        return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
 
 
 def _compared(operator: ast.cmpop, one: Any, other: Any) -> bool:

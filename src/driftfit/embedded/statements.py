@@ -107,6 +107,10 @@ class Body(Expressions):
         signature = f"static {result} {name}({', '.join([*self.parameters, *outs]) or 'void'})"
         taken = {parameter.split("*")[-1].split()[-1] for parameter in self.parameters}
         own = {self.safe(one): kind for one, kind in self.kinds.items() if self.safe(one) not in taken}
+        for one in [one for one in own if not self._reads(one)]:  # constants went to the places that would read it
+            self.lines = [line for line in self.lines if not re.fullmatch(rf"\s*{one} = -?\d+;", line)]
+            if not any(re.search(rf"\b{one}\b", line) for line in self.lines):
+                del own[one]
         declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
         unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
         said = (ast.get_docstring(self.tree) or "").split("\n")[0]
@@ -203,8 +207,15 @@ class Body(Expressions):
             return
         self.kinds[name] = joined(value.kind, self.kinds.get(name, "bool"))
         most = value.most if fixed else None
-        self.locals[name] = Value(self.kinds[name], self.safe(name), most=most)
+        whole = value.known and self.kinds[name] != "real"
+        self.locals[name] = value if whole else Value(self.kinds[name], self.safe(name), most=most)
         self.line(f"{self.safe(name)} = {value.text};")
+
+    def forget(self, node: ast.stmt) -> None:
+        """The values of variables that a statement with branches or turns may have changed are not known after it."""
+        for name in {one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)}:
+            if name in self.kinds and name in self.locals and self.locals[name].known:
+                self.locals[name] = Value(self.kinds[name], self.safe(name))
 
     def on_augassign(self, node: ast.AugAssign) -> None:
         target = self.value(node.target)
@@ -221,10 +232,12 @@ class Body(Expressions):
             return self.block(node.body if test.constant else node.orelse)
         self.line(f"if ({bare(test.text)}) {{")
         one, ended = self.nested(node.body)
+        self.forget(node)
         other, other_ended = Counter[str](), False
         if node.orelse:
             self.line("} else {")
             other, other_ended = self.nested(node.orelse)
+            self.forget(node)
         self.line("}")
         self.ops[-1] += one if one.total() >= other.total() else other
         return ended and other_ended
@@ -246,12 +259,14 @@ class Body(Expressions):
         top = self.largest(high)
         turns = max(0, top - (low.constant if low.known else 0))
         turns = -(-turns // abs(step))
-        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         sign = "<" if step > 0 else ">"
         move = f"{name}++" if step == 1 else f"{name}--" if step == -1 else f"{name} += {step}"
         bound = f"(int)({stop.text})" if stop.kind == "long" else stop.text
+        self.forget(node)
+        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         self.line(f"for (int {name} = {start.text}; {name} {sign} {bound}; {move}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
 
@@ -260,10 +275,12 @@ class Body(Expressions):
         return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
+        self.forget(node)
         with self.lazily():
             test = self.value(node.test)
         self.line(f"while ({bare(test.text)}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         turns = self.unit.largest
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})

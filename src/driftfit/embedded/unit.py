@@ -32,13 +32,27 @@ class Function:
 class Unit:
     """What the functions of one file share."""
 
-    def __init__(self, record: Array) -> None:
+    def __init__(self, record: Array, constant: frozenset[str] = frozenset()) -> None:
         self.record = record
+        self.constant = constant
+        """Fields that are assumed to keep the values that they start with."""
+        self.written: set[str] = set()
+        """Fields that a translated function may write."""
+        self.replaced: set[str] = set()
+        """Fields whose value stands in the text in their place."""
         self.functions: dict[Any, Function] = {}
         self.tables: dict[str, str] = {}
         self.names: Counter[str] = Counter()
         self.largest = max((size for name in record.dtype.names or () for size in record[name].shape), default=1)
         """The largest extent in the record: the upper bound of loops about which nothing else is known."""
+
+    def start_of(self, name: str) -> Any:
+        """The value that every entry of a constant field has; None if there is no such value."""
+        values = self.record[name][0].ravel()
+        if name not in self.constant or len(np.unique(values.view(np.int64))) != 1:  # 0.0 is not -0.0
+            return None
+        self.replaced.add(name)
+        return values[0].item()
 
     def table(self, values: Any) -> tuple[str, str]:
         """(name, kind) of a table of constants."""

@@ -15,8 +15,7 @@ Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: half a second at n 
 from __future__ import annotations
 
 import numpy as np
-from scipy import special
-from scipy.stats import qmc
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.calibration import limit_of
@@ -56,7 +55,7 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
     rng = np.random.default_rng(seed)
     (N, n), T = rows.phi.shape, SAMPLES // RECORDS + START
     root, block = np.linalg.cholesky(frozen.cov), _block(frozen, rows.x)
-    drawn = special.ndtri(qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
+    drawn = scipy.special.ndtri(scipy.stats.qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
     made = []
     for z in drawn:
         known, later = _played(frozen, rows.x[_blocks(rng, N, N, block)], rng), _blocks(rng, N, T, block)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
@@ -29,7 +29,7 @@ from driftfit.judge.alarms.reference import burn, first_third, stretch
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
 from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.trackers.bank.results.results import Hypotheses
 
@@ -51,7 +51,7 @@ def samples_of(run: Track) -> tuple[Array, Array]:
     steps = run.program.steps._replace(store=collect)
     tile = run.fresh()
     out = np.empty(len(run), output_type(tile, COLLECTED))
-    run.program.drivers(steps=steps).run(tile, *lane_of(run.record), out)
+    run.program.drivers(steps=steps).run(tile, *lanes_of(run.record), out)
     noise = np.broadcast_to(run.known.noise, len(run))
     return out["phi"][..., 0], np.column_stack([out["y"], out["ok"], noise, out["dt"]])
 
@@ -197,7 +197,7 @@ def chance_of(run: Track, rule: AlarmRule) -> Chance:
         rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
 
         def of_band(highest: Array, J: int) -> float:
-            each = [chance(rate, z, special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
+            each = [chance(rate, z, scipy.special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
             return min(1.0, len(each) * min(each))
 
         return of_band
@@ -206,8 +206,8 @@ def chance_of(run: Track, rule: AlarmRule) -> Chance:
         W, slack = rule.window, rule.slack
         loud, aside = W + (highest[0] - W) / slack, highest[1] / slack
         each = (
-            chance(power_rate(W), loud, special.chdtrc(W, max(loud, 0.0)), J),
-            chance(mean_rate(W), aside, 2.0 * special.ndtr(-aside / np.sqrt(W)), J),
+            chance(power_rate(W), loud, scipy.special.chdtrc(W, max(loud, 0.0)), J),
+            chance(mean_rate(W), aside, 2.0 * scipy.special.ndtr(-aside / np.sqrt(W)), J),
         )
         return min(1.0, 2.0 * min(each))
 

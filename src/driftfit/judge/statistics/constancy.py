@@ -42,14 +42,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
-from driftfit.judge.statistics.supremum import suprema, together
+from driftfit.judge.statistics.supremum import TIED, suprema, together
 from driftfit.judge.statistics.wild import wild_supremum
 
 POINTS = 48
@@ -167,14 +167,14 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     """
     N, n = X.shape
     w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
-    basis = linalg.qr(rows, mode="economic")[0]
+    basis = scipy.linalg.qr(rows, mode="economic")[0]
     w = w - basis @ (basis.T @ w)
     for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
         lagged = np.zeros((N, n))
         lagged[k:] = X[:-k]
         lagged[: len(found.ar)] = 0.0
         lagged -= basis @ (basis.T @ lagged)
-        Q, R, _ = linalg.qr(lagged, mode="economic", pivoting=True)
+        Q, R, _ = scipy.linalg.qr(lagged, mode="economic", pivoting=True)
         new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
         explained = new.T @ w
         gain = -N * np.log1p(-explained @ explained / (w @ w))
@@ -220,8 +220,8 @@ def _summed(scores: Array, lags: int) -> Array:
 def _profile(left: Array, right: Array, ends: Array) -> Array:
     """sum over s < end of left_s right_s', (m, n, n)."""
     starts = np.concatenate([[0], ends[:-1]])
-    blocks = [left[a:b].T @ right[a:b] for a, b in zip(starts, ends, strict=True)]
-    total: Array = np.cumsum(np.array(blocks), axis=0)
+    blocks = np.add.reduceat(left[:, :, None] * right[:, None, :], starts, axis=0)
+    total: Array = np.cumsum(blocks, axis=0)
     return total
 
 
@@ -244,22 +244,23 @@ def _thinned(cov: Array, points: Array) -> Array:
 
 def _turned(cov: Array, M: Array) -> Array:
     """Covariance (m, n, m, n) of a path whose rows are multiplied by M (n, n)."""
-    turned: Array = np.ascontiguousarray(np.swapaxes(M @ np.swapaxes(cov, 1, 2) @ M.T, 1, 2))
-    return turned
+    m, n = cov.shape[:2]
+    left = (M @ cov.reshape(m, n, m * n)).reshape(-1, n)
+    return (left @ M.T).reshape(m, len(M), m, len(M))
 
 
 def _weights(cov: Array) -> Array:
-    """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
-    weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
+    """Weights (.., m) of the chi-squares of the mean square of a path with covariance (.., m, m) over its m points."""
+    weights: Array = np.maximum(np.linalg.eigvalsh(cov), 0.0)
     return weights
 
 
 def _each(S: Array, cov: Array, var: Array) -> tuple[Array, Array]:
     """Statistic and p-value of each parameter separately."""
-    m, n = S.shape
+    m = len(S)
     L = np.mean(S * S, axis=0) / var
-    p = [tail(_weights(cov[:, i, :, i]) / (m * var[i]), L[i]) for i in range(n)]
-    return L, np.array(p)
+    weights = _weights(np.moveaxis(np.diagonal(cov, axis1=1, axis2=3), -1, 0)) / (m * var[:, None])
+    return L, np.array([tail(*one) for one in zip(weights, L, strict=True)])
 
 
 def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
@@ -275,6 +276,6 @@ def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
 def _dates(path: Array, std: Array) -> tuple[Array, Array]:
     """The positions at which each standardised path is furthest from zero, without the edges."""
     N = len(path)
-    z = path / np.where(std > 0.0, std, np.inf)
+    z = path / np.where(std > np.sqrt(TIED) * std.max(axis=0), std, np.inf)
     low, high = int(EDGE * N), max(int((1.0 - EDGE) * N), int(EDGE * N) + 1)
     return low + np.argmax(np.abs(z[low:high]), axis=0) + 1, z

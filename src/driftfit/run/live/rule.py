@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
@@ -164,7 +164,7 @@ def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
 def normal_scores(g: Array, known: Array) -> Array:
     """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
     share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
-    return np.where(np.isfinite(g), -special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
+    return np.where(np.isfinite(g), -scipy.special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
 
 
 def moving_sums(values: Array, window: int) -> Array:
