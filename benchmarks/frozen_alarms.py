@@ -225,7 +225,7 @@ def delays(records: int, faults: tuple[str, ...]) -> Table:
     return table
 
 
-def main(records: int = 24, lengths: tuple[int, ...] = (1000,), faults: tuple[str, ...] = FAULTS) -> None:
+def main(records: int = 24, lengths: tuple[int, ...] = (300, 1000), faults: tuple[str, ...] = FAULTS) -> None:
     Console(width=120).print(delays(records, faults))
     Console(width=120).print(rates(lengths, max(2 * records // 3, 2)))
 
