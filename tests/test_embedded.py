@@ -71,14 +71,14 @@ class Step(ctypes.Structure):
 class Exported:
     """The tracker in a shared library, with a state of its own."""
 
-    def __init__(self, folder, live):
+    def __init__(self, folder, live, **options):
         target = folder / "tracker.so"
         command = ["gcc", *STRICT, "-O2", "-shared", "-fPIC", "-o", str(target), str(folder / "tracker.c"), "-lm"]
         subprocess.run(command, check=True)
         self.library = ctypes.CDLL(str(target))
         for name in ("tracker_update", "tracker_predict"):
             getattr(self.library, name).restype = Step
-        self.size = len(to_struct(live))
+        self.size = len(to_struct(live, **options))
         self.buffer, self.scratch = ctypes.create_string_buffer(self.size), ctypes.create_string_buffer(self.size)
         self.library.tracker_init(self.buffer)
 
@@ -110,19 +110,19 @@ def same_numbers(one, other):
     return bool(np.all((one == other) | nan))
 
 
-def agree(folder, model, tracker, T):
+def agree(folder, model, tracker, T, **options):
     """Run both over a record with holes, an outage and inputs that fall silent, and compare every step and state."""
-    export_c(model, tracker, folder)
+    export_c(model, tracker, folder, **options)
     live = Live(model, tracker)
-    ours = Exported(folder, live)
-    assert same_numbers(ours.state, to_struct(live))
+    ours = Exported(folder, live, **options)
+    assert same_numbers(ours.state, to_struct(live, **options))
     y, u = record(live.model, T, seed=3)
     u[2 * T // 5 : 3 * T // 5] = 0.0
     steps, found = np.empty((T, 4)), np.empty((T, 4))
     for t in range(T):
         steps[t] = live.update(float(y[t]), u[t, : live.model.m])
         found[t] = ours.update(float(y[t]), u[t])
-        assert t % 97 or same_numbers(ours.state, to_struct(live)), t
+        assert t % 97 or same_numbers(ours.state, to_struct(live, **options)), t
     np.testing.assert_array_equal(found, steps)
     assert 0.5 * T < steps[:, 3].sum() < T
     return live, ours
@@ -143,6 +143,33 @@ def test_other_models_and_settings_do_too(tmp_path, name):
 
 
 @needs_gcc
+@pytest.mark.parametrize("name", ["blocks", "start", "directional", "two inputs", "polynomials"])
+def test_a_fixed_rate_changes_no_bit(tmp_path, name):
+    model, tracker = OTHERS.get(name, (ARX(2, 2), None))
+    if tracker is None:
+        tracker = ready({"blocks": ExtendedKalman, "start": Kalman}[name])
+        model = tracker.own_model(2, 2, 1) or model
+    live, ours = agree(tmp_path, model, tracker, 1_000, fixed_rate=True)
+    header = (tmp_path / "tracker.h").read_text()
+    kept = set(re.findall(r"\b(interval|noise|drift);", header))
+    assert kept <= ({"noise"} if name in ("blocks", "polynomials") else set())  # which their steps change meanwhile
+    assert ours.size < len(to_struct(live))
+    there = from_struct(model, tracker, ours.state, fixed_rate=True)
+    m = live.model.m
+    assert bits(there.update(0.1, np.full(m, 0.2))) == bits(live.update(0.1, np.full(m, 0.2)))
+    live.lane()["interval"][...] = 2.0
+    with pytest.raises(ValueError, match=r"the field 'interval' is \[?2"):
+        to_struct(live, fixed_rate=True)
+
+
+def test_numbers_that_are_only_zero_or_one_are_integers_in_c(tmp_path):
+    export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), tmp_path, fixed_rate=True)
+    header, source = ((tmp_path / f"tracker.{end}").read_text() for end in "hc")
+    assert set(re.findall(r"    int (\w+);", header)) == {"started", "dt", "valid", "seen", "ok"}
+    assert "(s->dt > " not in source  # 0 or 1: never a gap
+
+
+@needs_gcc
 def test_states_travel_both_ways(tmp_path):
     live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1), 500)
     there = from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), ours.state)
@@ -151,7 +178,7 @@ def test_states_travel_both_ways(tmp_path):
     assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
     ctypes.memmove(ours.buffer, to_struct(live), ours.size)
     assert bits(ours.update(0.4, [0.5])) == bits(live.update(0.4, 0.5))
-    with pytest.raises(ValueError, match="a state of 1280 bytes; got 3"):
+    with pytest.raises(ValueError, match="a state of 1264 bytes; got 3"):
         from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), b"abc")
 
 
@@ -167,7 +194,7 @@ def test_a_controllers_state_opens_as_a_saved_stream(tmp_path):
 
 def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
     given, nothing = (Live(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=p0)) for p0 in (1.0, None))
-    assert len(to_struct(given)) == 448 < len(to_struct(nothing)) == 1280  # without the fields of the diffuse start
+    assert len(to_struct(given)) == 432 < len(to_struct(nothing)) == 1264  # without the fields of the diffuse start
     export_c(ARX(2, 2), given.program.tracker, tmp_path)
     source = (tmp_path / "tracker.c").read_text()
     assert "refresh" not in source
@@ -373,7 +400,7 @@ def test_the_command_writes_the_same(tmp_path):
 def test_readme_and_header_say_what_there_is(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
-    assert "1280 bytes in double precision" in readme
+    assert "1264 bytes in double precision" in readme
     counted = re.search(r"at most\s+(\d+) multiplications, (\d+) additions and 1 division\.", readme)
     assert 60 <= int(counted[1]) <= 100  # 2.5 n^2 + 8 n or so
     assert 60 <= int(counted[2]) <= 100

@@ -4,7 +4,8 @@
     to_xarray(fleet)    the same and one dimension more, `unit`, over the union of all times (absent samples are NaN)
 
 Variables: ``theta``, ``theta_std`` (time, parameter); ``y``, ``prediction``, ``innovation``, ``innovation_std``,
-``used`` (time); ``u`` (time, input). Units are attributes. Times are UTC where the record had a time zone; ``attrs`` names it.
+``used`` (time); ``u`` (time, input). Units are attributes. Times are UTC where the record had a time zone; ``attrs``
+names it.
 
 Needs xarray (``pip install "driftfit[xarray]"``).
 """

@@ -40,7 +40,12 @@ def serve(
             return
         if demo == (file is not None):
             raise ValueError("name a configuration, as in driftfit serve plant.toml, or try driftfit serve --demo.")
-        config, home = start.configured(start.DEMO if file is None else file, port, folder)
+        try:
+            config, home = start.configured(start.DEMO if file is None else file, port, folder)
+        except start.ProblemsError as error:
+            for problem in error.messages:
+                typer.echo(f"driftfit: {problem}", err=True)
+            raise typer.Exit(2) from None
         if check:
             say(start.described(config), soft_wrap=True)
             return

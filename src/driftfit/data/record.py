@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, time as clock
+from datetime import UTC
+from datetime import time as clock
 from typing import Any
 from zoneinfo import ZoneInfo
 

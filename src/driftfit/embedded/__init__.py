@@ -19,7 +19,7 @@ from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
 
-def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
+def export_c(model: Model, tracker: Tracker, path: str | PathLike[str], *, fixed_rate: bool = False) -> None:
     """Write a tracker as C99 into a folder: ``tracker.h``, ``tracker.c``, a self-test, an S-function and ``README.md``.
 
     Parameters
@@ -28,6 +28,11 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
         As for `Live`: the model must declare its inputs if there are several. All trackers except `Bank`.
     path : path
         The folder; it is created if it does not exist, and files of these names are replaced.
+    fixed_rate : bool
+        Samples come at one fixed rate and nothing else is known of them: the fields ``interval``, ``noise`` and
+        ``drift`` of the next sample are 1, as constants of the code. The results are the same, in less time and
+        memory. (``noise`` remains where the steps themselves change it within a sample, as those of
+        `AdaptiveKalman` do.)
 
     Raises
     ------
@@ -43,22 +48,26 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str]) -> None:
     if len(model.outputs) > 1:
         raise ValueError(f"export_c: one output at a time; export a tracker for each of {', '.join(model.outputs)}.")
     bound = model.bind(model.m)
-    write(Path(path), files_of(Program(bound, check_ready(tracker)), f"{bound!r}, {tracker!r}"))
+    write(Path(path), files_of(Program(bound, check_ready(tracker)), f"{bound!r}, {tracker!r}", fixed_rate))
 
 
-def to_struct(live: Live) -> bytes:
+def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:
     """The state of a stream as the bytes of ``tracker_state`` (double precision, the byte order of this computer).
+
+    ``fixed_rate`` must be as it was in `export_c`.
 
     Raises
     ------
     ValueError
         If a field that the exported tracker has as a constant has another value in this stream.
     """
-    return translation(live.program).bytes_of(live.lane())
+    return translation(live.program, fixed_rate).bytes_of(live.lane())
 
 
-def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
+def from_struct(model: Model, tracker: Tracker, state: bytes, *, fixed_rate: bool = False) -> Live:
     """A stream that continues from the bytes of a ``tracker_state`` of the double-precision build.
+
+    ``fixed_rate`` must be as it was in `export_c`.
 
     Raises
     ------
@@ -66,8 +75,9 @@ def from_struct(model: Model, tracker: Tracker, state: bytes) -> Live:
         If the number of bytes is not the one that this model and tracker need.
     """
     live = Live(model, tracker)
-    made = translation(live.program)
-    if len(state) != made.size(8):
-        raise ValueError(f"from_struct: this model and tracker have a state of {made.size(8)} bytes; got {len(state)}.")
+    made = translation(live.program, fixed_rate)
+    size = made.layout(8).itemsize
+    if len(state) != size:
+        raise ValueError(f"from_struct: this model and tracker have a state of {size} bytes; got {len(state)}.")
     made.read(live.lane(), state)
     return live

@@ -8,12 +8,13 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from driftfit.embedded.unit import TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, begin_of, field, joined, lifted, number, view
+from driftfit.embedded.values import RANK, Value, assigned, begin_of, joined, lifted, narrow, number, plain, view
 from driftfit.engine import kernel, simd
 
 ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
@@ -78,8 +79,9 @@ class Expressions:
             return Value("items", constant=[number(size) for size in self.owner(node.value)[0].shape])
         owner = self.value(node.value)
         if owner.kind == "record":
-            self.unit.written.add(node.attr)  # perhaps, by whoever receives the array
-            return field(node.attr, self.unit.record[node.attr][0])
+            for one in (self.unit.written, self.unit.beyond):  # perhaps, by whoever receives the array
+                one.add(node.attr)
+            return self.unit.field(node.attr)
         if owner.kind == "python" and owner.constant in (np, math):
             return lifted(getattr(owner.constant, node.attr))
         return self.refuse(node)  # type: ignore[no-any-return]
@@ -89,7 +91,7 @@ class Expressions:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             record = self.value(node.value)
             if record.kind == "record":
-                return field(node.attr, self.unit.record[node.attr][0]), node.attr
+                return self.unit.field(node.attr), node.attr
         return self.value(node), ""
 
     def of_subscript(self, node: ast.Subscript) -> Value:
@@ -114,6 +116,8 @@ class Expressions:
             return view(owner, index)
         if isinstance(node.ctx, ast.Store) or any(isinstance(one, range) for one in index):
             self.unit.written.add(name)
+        if any(isinstance(one, range) for one in index):
+            self.unit.beyond.add(name)
         start = self.unit.start_of(name)
         return view(owner, index) if start is None else number(start)
 
@@ -135,7 +139,7 @@ class Expressions:
             return lifted(inner)
         name, kind = self.unit.table(table.constant)
         strides = [int(np.prod(np.shape(table.constant)[axis + 1 :])) for axis in range(len(index))]
-        at = " + ".join(f"{one.text} * {stride}" for one, stride in zip(index, strides, strict=True))
+        at = " + ".join(f"({one.text} * {stride})" for one, stride in zip(index, strides, strict=True))
         most = int(np.max(table.constant)) if kind == "int" else None
         return Value(kind, f"{name}[{at}]", most=most)
 
@@ -146,6 +150,7 @@ class Expressions:
         if isinstance(node.op, ast.Not):
             return number(not value.constant) if value.known else Value("bool", f"(!{value.text})")
         if isinstance(node.op, ast.USub):
+            value = plain(value)
             return number(-value.constant) if value.known else Value(value.kind, f"(-{value.text})")
         return self.refuse(node)  # type: ignore[no-any-return]
 
@@ -155,6 +160,7 @@ class Expressions:
 
     def binary(self, operator: ast.operator, one: Value, other: Value) -> Value:
         """One operation on two numbers."""
+        one, other = plain(one), plain(other)
         kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
         if one.known and other.known and kind in RANK:
             return number(_folded(operator, one.constant, other.constant))
@@ -165,6 +171,9 @@ class Expressions:
             return self._square(one, other)
         if isinstance(operator, ast.LShift | ast.RShift):
             return _shifted(operator, one, other)
+        if type(operator) in BITS and kind == "bool" and (one.known or other.known):
+            fixed, rest = (one, other) if one.known else (other, one)
+            return rest if fixed.constant == isinstance(operator, ast.BitAnd) else fixed
         if type(operator) in BITS:
             return Value(kind, f"({one.text} {BITS[type(operator)]} {other.text})")
         sign = ARITHMETIC[type(operator)]
@@ -187,6 +196,8 @@ class Expressions:
 
     def of_compare(self, node: ast.Compare) -> Value:
         values = [self.value(one) for one in (node.left, *node.comparators)]
+        if len(values) == 2 and values[0].kind == "flag" and values[1].known:
+            return _of_flag(values[0], [_compared(node.ops[0], one, values[1].constant) for one in (0.0, 1.0)])
         if all(one.known for one in values):
             truths = [
                 _compared(operator, one.constant, other.constant)
@@ -219,8 +230,10 @@ class Expressions:
             return self.value(node.body if test.constant else node.orelse)
         with self.lazily():
             one, other = self.value(node.body), self.value(node.orelse)
-        kind = joined(one.kind, other.kind)
-        return Value(kind, f"({test.text} ? {one.text} : {other.text})")
+        kind = joined(narrow(one), narrow(other))
+        if kind == "flag" and one.known and other.known and one.constant != other.constant:
+            return replace(_of_flag(test, [bool(other.constant), bool(one.constant)]), kind="flag")
+        return Value(kind, f"({test.text} ? {assigned(one, kind)} : {assigned(other, kind)})")
 
     # functions
 
@@ -229,7 +242,7 @@ class Expressions:
         if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
             return self._reinterpreted(node)
         function = self.value(node.func).constant
-        arguments = [self.value(one) for one in node.args]
+        arguments = [plain(self.value(one)) for one in node.args]
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
         if function in FOUR or function is simd.reached:
@@ -334,6 +347,13 @@ def _folded(operator: ast.operator, one: Any, other: Any) -> Any:
         one, other = np.float64(one), np.float64(other)
     with np.errstate(all="ignore"):
         return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+
+
+def _of_flag(flag: Value, truths: list[bool]) -> Value:
+    """The truth value that is the first where a flag is 0, and the second where it is 1."""
+    if truths[0] == truths[1]:
+        return number(truths[0])
+    return Value("bool", flag.text if truths[1] else f"(!{flag.text})")
 
 
 def _compared(operator: ast.cmpop, one: Any, other: Any) -> bool:

@@ -11,7 +11,7 @@ from driftfit.embedded.selftest import selftest
 from driftfit.embedded.simulink import SFUNCTION
 from driftfit.embedded.translation import Translation, translation
 from driftfit.embedded.unit import Unit
-from driftfit.embedded.values import number
+from driftfit.embedded.values import assigned, number
 from driftfit.run.program import Program
 
 HEADER = """\
@@ -35,9 +35,7 @@ typedef double tracker_real;
 /* theta: {names} */
 
 /* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
-   data have not told apart yet). Known of the next samples, and kept until changed: interval (nominal intervals since
-   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
-   drift). */
+   data have not told apart yet). {known} */
 typedef struct {{
 {fields}
 }} tracker_state;
@@ -64,6 +62,12 @@ void tracker_reset(tracker_state *s);
 #endif
 """
 
+KNOWN = """Known of the next samples, and kept until changed: interval (nominal intervals since
+   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
+   drift)."""
+FIXED_RATE = """Samples come at a fixed rate and are all alike: one is left out by passing NAN,
+   not by leaving out the call."""
+
 SOURCE = """\
 /* {what}; see tracker.h. */
 #include "tracker.h"
@@ -81,6 +85,12 @@ typedef tracker_real real;
 #define WIDE(wide, narrow) ((real)(wide))
 #define R_SQRT(x) sqrt(x)
 #define R_ABS(x) fabs(x)
+#endif
+
+#if defined(__GNUC__) /* a copy of tracker_update in tracker_predict would cost code, and a call per sample */
+#define NOT_INLINED __attribute__((noinline))
+#else
+#define NOT_INLINED
 #endif
 
 """
@@ -106,16 +116,16 @@ SUPPORT = {
     "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
     "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
     "four_plus": """static four four_plus(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] + b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] + b.at[i]; }
     return a;
 }""",
     "four_times": """static four four_times(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] * b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] * b.at[i]; }
     return a;
 }""",
     "four_reached": """static int64_t four_reached(four a, four b) {
     int64_t count = 0;
-    for (int i = 0; i < 4; i++) count += a.at[i] >= b.at[i];
+    for (int i = 0; i < 4; i++) { count += a.at[i] >= b.at[i]; }
     return count;
 }""",
 }
@@ -149,19 +159,20 @@ for (;;) {{
 """
 
 
-def files_of(program: Program, what: str) -> dict[str, str]:
+def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     """The text of every file, by its name."""
     from driftfit import __version__
 
-    made, m = translation(program), program.model.m
+    made, m = translation(program, fixed_rate), program.model.m
     names = ", ".join(program.names)
     header = HEADER.format(
-        what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made)
-    )
+        what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made),
+        known=FIXED_RATE if fixed_rate else KNOWN,
+    )  # fmt: skip
     source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps.doubts)))
     readme = README.format(
-        what=what, names=names, doubles=made.size(8), singles=made.size(4), ops=_said(made.entry.operations),
-        ordinary=_after_the_start(made),
+        what=what, names=names, doubles=made.layout(8).itemsize, singles=made.layout(4).itemsize,
+        ops=_said(made.entry.operations), ordinary=_after_the_start(made),
     )  # fmt: skip
     test = selftest(program.model, program.tracker)
     return {
@@ -172,9 +183,8 @@ def files_of(program: Program, what: str) -> dict[str, str]:
 def _fields(made: Translation) -> str:
     lines = []
     for name in made.names:
-        array = made.start[name][0]
-        kind = "int64_t" if array.dtype.kind == "i" else "tracker_real"
-        lines.append(f"    {kind} {name}{'' if array.size == 1 else f'[{array.size}]'};")
+        size = made.start[name][0].size
+        lines.append(f"    {made.type_of(name)} {name}{'' if size == 1 else f'[{size}]'};")
     return "\n".join(lines)
 
 
@@ -198,7 +208,8 @@ def _support(steps: str) -> list[str]:
 def _initial(made: Translation) -> str:
     lines = []
     for name in made.names:
-        values = ", ".join(number(one).text for one in made.start[name][0].ravel().tolist())
+        kind = "flag" if name in made.unit.flags else "real"
+        values = ", ".join(assigned(number(one), kind) for one in made.start[name][0].ravel().tolist())
         lines.append(f"    {values}," if made.start[name][0].size == 1 else f"    {{{values}}},")
     return "\n".join(lines)
 
@@ -210,12 +221,12 @@ def _face(made: Translation, memory: set[str]) -> str:
             continue
         size = made.start[name][0].size
         line = f"s->{name} = START.{name};" if size == 1 else (
-            f"for (int i = 0; i < {size}; i++) s->{name}[i] = START.{name}[i];"
+            f"for (int i = 0; i < {size}; i++) {{ s->{name}[i] = START.{name}[i]; }}"
         )  # fmt: skip
         copies.append(f"    {line}")
     return "\n".join([
         "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
-        "tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
+        "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
         "    tracker_step step;",
         f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
         "    return step;", "}", "",

@@ -21,7 +21,7 @@ from typing import Any
 
 from driftfit.embedded.expressions import Expressions
 from driftfit.embedded.unit import TYPES, Function, TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, bare, begin_of, joined, lifted, renamed
+from driftfit.embedded.values import RANK, Value, assigned, bare, begin_of, joined, lifted, narrow, plain, renamed
 
 RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if int long register return
@@ -189,8 +189,16 @@ class Body(Expressions):
         elif isinstance(target, ast.Name):
             self.assign_name(target.id, value)
         else:
-            self.line(f"{self.value(target).text} = {value.text};")
-            self.ops[-1]["store"] += 1
+            self.store(target, value)
+
+    def store(self, target: ast.expr, value: Value) -> None:
+        """Assign a number to an element of an array."""
+        place = self.value(target)
+        if place.kind == "flag" and narrow(value) not in ("bool", "flag"):
+            assert isinstance(target, ast.Subscript)
+            self.unit.beyond.add(self.owner(target.value)[1])
+        self.line(f"{place.text} = {assigned(value, place.kind)};")
+        self.ops[-1]["store"] += 1
 
     def held(self, value: Value) -> Value:
         """Store a value in a separate variable, so that a later assignment does not change it."""
@@ -205,11 +213,12 @@ class Body(Expressions):
         if value.kind not in RANK or (fixed and value.known):
             self.locals[name] = value
             return
-        self.kinds[name] = joined(value.kind, self.kinds.get(name, "bool"))
+        self.kinds[name] = joined(narrow(value), self.kinds.get(name, "bool"))
         most = value.most if fixed else None
         whole = value.known and self.kinds[name] != "real"
         self.locals[name] = value if whole else Value(self.kinds[name], self.safe(name), most=most)
-        self.line(f"{self.safe(name)} = {value.text};")
+        if value.text != self.safe(name):
+            self.line(f"{self.safe(name)} = {assigned(value, self.kinds[name])};")
 
     def forget(self, node: ast.stmt) -> None:
         """The values of variables that a statement with branches or turns may have changed are not known after it."""
@@ -219,12 +228,7 @@ class Body(Expressions):
 
     def on_augassign(self, node: ast.AugAssign) -> None:
         target = self.value(node.target)
-        value = self.binary(node.op, target, self.value(node.value))
-        if isinstance(node.target, ast.Name):
-            self.assign_name(node.target.id, value)
-        else:
-            self.line(f"{target.text} = {value.text};")
-            self.ops[-1]["store"] += 1
+        self.assign(node.target, self.binary(node.op, target, self.value(node.value)))
 
     def on_if(self, node: ast.If) -> bool:
         test = self.value(node.test)
@@ -290,7 +294,7 @@ class Body(Expressions):
             self.line("return;")
             return True
         value = self.value(node.value)
-        items = value.constant if value.kind == "items" else [value]
+        items = [plain(one) for one in (value.constant if value.kind == "items" else [value])]
         kinds = tuple(one.kind for one in items)
         self.returns = tuple(map(joined, kinds, self.returns)) if self.returns else kinds
         if len(items) == 1:

@@ -308,7 +308,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Any:
     """The loop over the samples of a record."""
 
     @driver
@@ -351,7 +351,7 @@ def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Dri
     return run
 
 
-def _updates(driver: Any, sample: Any) -> tuple[Driver, Driver]:
+def _updates(driver: Any, sample: Any) -> tuple[Any, Any]:
     """One sample of a stream, with an array of inputs and with a single one."""
 
     @driver

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from driftfit.service.settings.config import Config, read
+from driftfit.service.settings.config import Config, ProblemsError, read
 from driftfit.service.supervisor import Service, log_to_stderr
 
+__all__ = ["DEMO", "ProblemsError", "configured", "described", "greeting", "run"]
 DEMO = Path(__file__).parent / "demo.toml"
 
 

@@ -50,6 +50,8 @@ class Engine:
         """Notified when results have been stored."""
         self.problem = ""
         self.samples = 0
+        self.told = 0
+        """The last group whose results were stored by this process."""
         self.next = self.journal.next_number()
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of a batch to the results of its samples."""
@@ -227,6 +229,7 @@ class Engine:
         self.problem = ""
         self.positions |= self._pending.positions
         results = bool(self._pending.results)
+        self.told = max([self.told, *(first for first, *_ in self._pending.results)])
         self._pending = Pending()
         if results:
             with self.news:

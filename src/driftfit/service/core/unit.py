@@ -208,7 +208,15 @@ class Unit:
             "ignored": 0 if live is None else live.ignored,
             "limits": {name: [None if math.isinf(v) else v for v in pair]
                        for name, pair in zip(self.settings.columns, self.limits, strict=True)},
+            "hypotheses": self._hypotheses(),
         }  # fmt: skip
+
+    def _hypotheses(self) -> dict[str, float] | None:
+        """Present probabilities of the events of a `Bank`; None for other trackers."""
+        if self.live is None or not self.live.tracker.weighs:
+            return None
+        now = self.live.hypotheses
+        return dict(zip(now.names, now.lag_prob[0].tolist(), strict=False))
 
     def state(self) -> bytes:
         """The state as bytes."""

@@ -63,6 +63,17 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
     return values[(values[:, 0] >= start) & (values[:, 0] <= stop)]
 
 
+def latest(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
+    """All columns (T, c) of the last blocks, and of what came after them."""
+    query = "select last, count, rows from block where unit = ? order by first desc limit ?"
+    found = journal.db.execute(query, (unit, blocks)).fetchall()[::-1]
+    end = max((last for last, _, _ in found), default=-1)
+    parts = [np.frombuffer(rows).reshape(count, -1) for _, count, rows in found]
+    tail = [row for row in recent if row[0] > end]
+    parts += [columns_of(tail)] if tail else []
+    return np.vstack(parts) if parts else np.zeros((0, 0))
+
+
 def _count(journal: Journal, unit: int, start: float, stop: float) -> int:
     query = "select coalesce(sum(count), 0) from block where unit = ? and stop >= ? and start <= ?"
     return int(journal.db.execute(query, (unit, start, stop)).fetchone()[0])

@@ -15,6 +15,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from driftfit.service.core.blocks import columns_of
 from driftfit.service.page.feed import Feed
+from driftfit.service.page.history import latest
 
 EVERY = 0.4
 """Seconds between two messages."""
@@ -76,9 +77,12 @@ class Sockets:
         if number is None:
             return {"view": "unit", "unit": view["unit"], "status": said, "missing": True}
         unit, after = view["unit"], view["at"]
-        rows = [row for row in await feed.recent(number) if row[0] > after]
+        recent = await feed.recent(number)
+        rows = [row for row in recent if row[0] > after]
+        columns = columns_of(rows).T.tolist() if rows else []
+        if after == 0:
+            columns = (await asyncio.to_thread(latest, feed.journal, number, recent)).T.tolist()
         if unit == view["unit"] and rows:
             view["at"] = max(row[0] for row in rows)
-        columns = columns_of(rows).T.tolist() if rows else []
         on = rows[-1][10] if rows else None
         return {"view": "unit", "unit": unit, "status": said, "columns": columns, "alarm": on}

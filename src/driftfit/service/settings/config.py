@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from driftfit.data.clock import Clock
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
+from driftfit.run.live.rule import KINDS
 from driftfit.service.settings.expressions import model_of, tracker_of
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import PageOptions, ServiceOptions, build, kinds
@@ -23,7 +24,6 @@ from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
 
-ALARMS = ("band", "innovation", "probability")
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 Made = TypeVar("Made")
 
@@ -302,8 +302,8 @@ def _alarm(given: Any, dt: float | None) -> AlarmSettings | None:
     on = given.get("on", ["innovation"])
     on = (on,) if isinstance(on, str) else tuple(on)
     for kind in on:
-        if kind not in ALARMS:
-            raise ValueError(f"on: there is no alarm {kind!r}; {near(str(kind), ALARMS)}")
+        if kind not in KINDS:
+            raise ValueError(f"on: there is no alarm {kind!r}; {near(str(kind), KINDS)}")
     whole = {key: given.get(key, default) for key, default in (("reference", 500), ("window", 50), ("hold", 0))}
     for key, value in whole.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < (key != "hold"):

@@ -66,10 +66,13 @@ class Sink(ABC):
     """A sink of results and events."""
 
     name: str
-    gather: ClassVar[float] = 0.0
-    """Seconds for which results are collected into one batch."""
     most: ClassVar[int] = 5_000
     """Results of one batch at which it is not collected further."""
+
+    @property
+    def gather(self) -> float:
+        """Seconds for which results are collected into one batch."""
+        return 0.0
 
     def check(self) -> None:
         """Raise ValueError or ImportError if the options cannot work."""

@@ -26,8 +26,14 @@ class Parquet(Sink):
     """A folder of files."""
 
     path: str
-    gather: ClassVar[float] = 60.0
+    seconds: float = 60.0
+    """Time that one file covers."""
     most: ClassVar[int] = 100_000
+
+    @property
+    def gather(self) -> float:
+        """The time of one file."""
+        return self.seconds
 
     def open(self) -> Writer:
         """Make the folder."""

@@ -63,7 +63,8 @@ def smooth_and_weigh(walk: Walk) -> tuple[Path, float] | None:
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
-    volume = float(np.linalg.slogdet(work["U"][0])[1]) - float(np.sum(np.log(np.einsum("tii->ti", a))))
+    pivots = np.einsum("tii->ti", steps["a"])
+    volume = float(np.linalg.slogdet(work["U"][0])[1]) - float(np.sum(np.log(pivots)))
     work["C"], work["theta"] = C, C @ work["z"][0]
     theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
     backwards(work, walk.phi, samples, each, steps, theta, var, left)

@@ -208,11 +208,11 @@ const events = (found) => {
   for (const one of found) {
     const tr = body.insertRow();
     const { who, why, ...rest } = one.detail;
-    make("td", new Date(one.at * 1000).toLocaleString(), tr, "number");
+    make("td", new Date(one.at * 1000).toLocaleString(), tr);
     make("span", rest.do && one.kind === "action" ? rest.do : one.kind, make("td", "", tr),
       `pill ${["alarm", "failed"].includes(one.kind) ? "bad" : ""}`);
     make("td", who ?? "", tr);
-    delete rest.do;
+    delete rest.do; delete rest.time;
     const text = Object.entries(rest).filter(([, v]) => v !== null && String(v) !== "")
       .map(([k, v]) => `${k} ${typeof v === "number" ? short(v) : typeof v === "object" ? JSON.stringify(v) : v}`);
     make("td", [why, ...text].filter(Boolean).join(", "), tr);

@@ -40,7 +40,7 @@ export class Charts {
   past(found, about) {
     this.names = about.about.names; this.y = about.about.y;
     const n = this.names.length;
-    const column = (kind, k) => found[kind].map((one) => one[k]);
+    const column = (kind, k) => found[kind][k] ?? [];
     const many = (kind, from, to) => Array.from({ length: to - from }, (_, k) => column(kind, from + k));
     this.draw({ x: column("mean", 0), y: column("mean", 1), y_hat: column("mean", 2), e: column("mean", 3),
       e_std: column("mean", 4), ends: { y: [column("low", 1), column("high", 1)], e: [column("low", 3), column("high", 3)] },
@@ -57,7 +57,7 @@ export class Charts {
       data: [c.x, c.ends ? c.ends.y[0] : c.y.map(() => null), c.ends ? c.ends.y[1] : c.y.map(() => null), c.y_hat, c.y] };
     const band = c.e_std.map((s) => (s === null ? null : Z * s));
     const innovation = { title: "Innovation (output minus prediction), with 95 % band", key: "*e", line: "", second: "innovation",
-      full: true, data: [c.x, band.map((v) => (v === null ? null : -v)), band, c.x.map(() => null), c.e] };
+      full: true, data: [c.x, band.map((v) => (v === null ? null : -v)), band, c.e] };
     [output, ...parts, innovation].forEach((one, k) => {
       if (this.plots[k]) this.plots[k].plot.setData(one.data); else this.plots.push(this.make(one));
     });
@@ -76,8 +76,8 @@ export class Charts {
     const dates = one.data[0][0] > 1e8;
     const when = (_, v) => (v === null ? "–" : dates ? new Date(v * 1000).toLocaleString() : round(v));
     const series = [{ label: dates ? "time" : "sample", value: when },
-      { ...hidden, label: "low", value }, { ...hidden, label: "high", value },
-      { label: one.line || "centre", stroke: main, width: 1.8, points: { show: false }, value, show: Boolean(one.line) }];
+      { ...hidden, label: "low", value }, { ...hidden, label: "high", value }];
+    if (one.line) series.push({ label: one.line, stroke: main, width: 1.8, points: { show: false }, value });
     if (one.second) series.push({ label: one.second, stroke: second, width: one.line ? 1 : 1.2, points: { show: false }, value });
     const plot = new uPlot({
       ...this.size(part), series, bands: [{ series: [2, 1], fill: color("--band") }], scales: { x: { time: dates } },

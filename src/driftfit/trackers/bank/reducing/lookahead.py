@@ -4,12 +4,12 @@
            w_l P[e_l, e'] N(y; z'm_l + b_e', r_e' / s + z'(C_l + Q_e') z)
 
 A minimum of averages is at most the average of minima, so ER_s <= R*: waiting never costs information, only time. Of
-several samples y is the mean, which knows less than all of them: the risk is at most ER_s where they have one regressor
-and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that looks one sample
-ahead then never begins to wait. The integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union of
-them. The next regressors are not known; the last one before the events that are open stands for it. One that the leaves
-have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x nodes;
-used only while a decision is open.
+several samples y is the mean, which knows less than all of them: the risk is at most ER_s where they have one
+regressor and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that
+looks one sample ahead then never begins to wait. The integral runs over nodes at mean +- 6 standard deviations of
+every component, by the trapezoidal rule on the union of them. The next regressors are not known; the last one before
+the events that are open stands for it. One that the leaves have already been fitted to, as the present one, promises
+too little: they agree about it. Cost: components x nodes; used only while a decision is open.
 """
 
 from __future__ import annotations
