@@ -59,7 +59,19 @@ def record(model: str, kind: str, rng: np.random.Generator, T: int, jump: float)
 
 def rates(records: int, lengths: tuple[int, ...]) -> Table:
     table = Table(box=SIMPLE_HEAD, show_edge=False, title=f"Level {LEVEL:g}, {records} records a cell, %", width=108)
-    heads = ("model", "noise", "T", "joint", "mean square", "break", "stretch", "at 0.1 %", "named", "finds 0.5")
+    heads = (
+        "model",
+        "noise",
+        "T",
+        "joint",
+        "mean square",
+        "break",
+        "stretch",
+        "wild",
+        "at 0.1 %",
+        "named",
+        "finds 0.5",
+    )
     for head in heads:
         table.add_column(head, justify="left" if head in ("model", "noise") else "right")
     all_rates = []

@@ -160,7 +160,9 @@ def test_verdict_and_tables_of_eighty_columns(table, monkeypatch):
 
 def test_detect_scores_labels_and_writes_alarms(table):
     options = ["--reference", "150", "--every", "1000", "--labels", "leak"]
-    said = run("detect", *DATED, *options, "--out", "alarms.csv", "--plot", "a.png", "--report", "page.html")
+    said = run(
+        "detect", *DATED, *options, "--kind", "band", "--out", "alarms.csv", "--plot", "a.png", "--report", "page.html"
+    )
     alarms = expected().detect("band", reference=150, every=1000)
     score = alarms.score(simulate()[2])
     assert score.found == 1
@@ -172,7 +174,7 @@ def test_detect_scores_labels_and_writes_alarms(table):
     assert "Faults and alarms" in page
     assert "2024-03-01 11:20:00" in page  # the label begins
     assert "1 of 1 labelled intervals found" in page
-    said = run("detect", *DATED, "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
+    said = run("detect", *DATED, "--kind", "band", "--reference", "b1[valve]=0.5:1.5", "--from", "2024-03-01 08:10")
     assert "b1[valve]" in said
     assert "leave out --by" in fails("detect", *DATED, "--labels", "leak", "--by", "leak")
     assert "name=low:high" in fails("detect", *DATED, "--reference", "a1=x:y")

@@ -21,7 +21,7 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
-from driftfit.judge.statistics.scale import core
+from driftfit.judge.statistics.robust import core
 from driftfit.run.live.rule import AlarmRule, normal_scores
 from driftfit.trackers.kalman import INDEPENDENT
 

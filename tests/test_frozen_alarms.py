@@ -6,7 +6,6 @@ from scipy import stats
 from support import arx_record, rows_of
 
 from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
-from driftfit.judge.alarms import bootstrap
 from driftfit.judge.alarms.frozen import frozen_model, noise_model
 from driftfit.judge.alarms.onsets import onsets
 from driftfit.run.live.likelihood_ratio import (
@@ -138,9 +137,8 @@ def noise_of(kind, T, rng):
 
 
 @pytest.mark.parametrize("kind", ["normal", "t3", "AR(.6)", "GARCH"])
-def test_rates_of_false_alarms(kind, monkeypatch):
+def test_rates_of_false_alarms(kind):
     """Four references of 1000 samples, 5000 more from each, one alarm in 100 set: within four standard errors."""
-    monkeypatch.setattr(bootstrap, "SAMPLES", 64_000)
     begun = {"glr": [], "cusum": []}
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -153,9 +151,8 @@ def test_rates_of_false_alarms(kind, monkeypatch):
 
 
 @pytest.mark.parametrize(("unit", "name", "size"), [(1.0, "gain", 0.6), (1e-4, "intercept", -1.0), (1e5, "noise", 2.0)])
-def test_a_change_is_found_named_and_sized(unit, name, size, monkeypatch):
+def test_a_change_is_found_named_and_sized(unit, name, size):
     """With one false alarm in 1000 samples; in the units of y, whatever they are."""
-    monkeypatch.setattr(bootstrap, "SAMPLES", 128_000)
     late, covered, since = [], [], []
     for seed in range(5):
         rng = np.random.default_rng(seed)

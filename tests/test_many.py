@@ -226,7 +226,7 @@ def test_without_faults_few_series_are_accused():
 )
 def test_what_a_fleet_cannot_be_watched_for(fleet, settings, match):
     with pytest.raises(ValueError, match=match):
-        fleet.detect(**settings)
+        fleet.detect(**{"kind": "band"} | settings)
 
 
 def test_a_page_about_nothing_says_so(tmp_path):

@@ -38,7 +38,7 @@ from driftfit.judge.plots import Health, draw_diagnosis
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.constancy import Constancy, constancy
 from driftfit.judge.statistics.paired import paired
-from driftfit.judge.statistics.scale import core
+from driftfit.judge.statistics.robust import core
 from driftfit.judge.statistics.whiteness import Whiteness, crossing, whiteness
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, table_of

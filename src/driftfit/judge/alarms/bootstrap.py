@@ -9,7 +9,7 @@ everything that is estimated: a stream carries these errors for ever.
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
 
-Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: SAMPLES samples, a second at n = 4.
+Source: Kunsch (1989) for blocks; Wu (1986) for signs. Cost: half a second at n = 4.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from driftfit.run.live.likelihood_ratio import (
     scan_scores,
 )
 
-RECORDS, SAMPLES = 128, 128_000
+RECORDS, SAMPLES = 64, 64_000
 """Simulated records, and samples of all together."""
 START = SHORT << (LEVELS - 1)
 """Samples at the beginning of a record that are not counted: the longest window is not complete."""

@@ -22,7 +22,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST
 from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.onsets import onsets
-from driftfit.judge.statistics.scale import core
+from driftfit.judge.statistics.robust import core
 from driftfit.models.arx import ARX
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track, burn_in

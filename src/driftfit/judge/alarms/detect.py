@@ -176,11 +176,11 @@ class Alarms(Printed):
         table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", *sizes, names=3)
         for t in map(int, self.onsets[:20]):
             j, change = self.rule.cause(self.statistic[t]), self.change(t)
-            numbers = (value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j))
+            cells = [value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j)]
             if change is not None:
                 half = 0.5 * (change.high - change.low)
-                numbers = (*numbers, f"{change.size:.3g}", f"{half:.2g}", self.run.time_text(change.since))
-            table.add_row(*self.span(t), Text(self.cause(t)), *numbers)
+                cells += [f"{change.size:.3g}", f"{half:.2g}", self.run.time_text(change.since)]
+            table.add_row(*self.span(t), Text(self.cause(t)), *cells)
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")

@@ -34,8 +34,7 @@ import scipy
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
-from driftfit.judge.statistics.robust import cholesky, huber
-from driftfit.judge.statistics.scale import deviation, median
+from driftfit.judge.statistics.robust import cholesky, deviation, huber, median
 
 HELD = 3.0
 """y is limited to this many noise levels around the fit."""

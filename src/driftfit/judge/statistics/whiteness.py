@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.statistics.scale import deviation
+from driftfit.judge.statistics.robust import deviation
 
 
 class Whiteness(NamedTuple):

@@ -139,7 +139,7 @@ class LiveAlarm:
             "rule": describe(self.rule), "active": self.active, "begun": self.begun, "samples": self.samples,
             "statistic": self.statistic.tolist(), "wait": self._wait, "left": self._left,
             "scores": list(self._scores), "onsets": [list(onset) for onset in self._onsets],
-            "memory": [b64encode(part).decode() for part in self._memory] if self.rule.kind in FROZEN else [],
+            "memory": [b64encode(part.tobytes()).decode() for part in self._memory] if self.rule.kind in FROZEN else [],
         }  # fmt: skip
 
     @classmethod

@@ -116,7 +116,8 @@ def cube_root(x: float) -> float:
 @shared
 def cube_deviate(ratio: float, shape: float) -> float:
     """A gamma variable of this shape over its mean as a normal deviate (Wilson and Hilferty 1931)."""
-    return (cube_root(ratio) - (1.0 - 1.0 / (9.0 * shape))) * 3.0 * np.sqrt(shape)
+    z: float = (cube_root(ratio) - (1.0 - 1.0 / (9.0 * shape))) * 3.0 * np.sqrt(shape)
+    return z
 
 
 @shared
