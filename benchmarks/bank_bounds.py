@@ -2,8 +2,10 @@
 
 Compiled code does not check whether an index is within its array. Here it does: a separate process with its own cache
 compiles the routines with a check at every index, of scalars and of SIMD vectors, which records the line of a violation
-and continues. Banks are then drawn at random, with every reduction, kind of change, sensor, prior and form, and with
-records that have outages, gaps in time, fault codes and repeated readings; and the tests of banks are run as well.
+and continues. Arrays are moved apart in the memory of a bank, with NaN in between, so that an address beyond its array
+gives NaN, or is seen to have been written to. Banks are then drawn at random, with every reduction, kind of change,
+sensor, prior and form, one output and two, and with records that have outages, gaps in time, fault codes, repeated
+readings and regressors that begin late; and the tests of banks are run as well.
 Prints every violation with its line, and every bank that was not finite.
 
 Run: python benchmarks/bank_bounds.py [--quick] [--banks N]. Compiling both forms with checks takes some minutes;
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import math
 import os
 import subprocess
 import sys
@@ -23,6 +26,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+APART = 64
+"""Entries between the arrays of a bank."""
+
+
+def heavy(y: float, y_hat: float, h: float, r: float, last: float) -> tuple[float, float, float]:
+    """A sensor of one's own, with Laplacian noise."""
+    width, far = 2.0 * math.sqrt(h + r), abs(y - y_hat)
+    return -math.log(2.0 * width) - far / width, r * max(1.0, far / math.sqrt(r)), y_hat
 
 
 def watch() -> tuple[Any, list[str]]:
@@ -66,11 +78,49 @@ def watch() -> tuple[Any, list[str]]:
         last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
         beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
         note(builder, beyond, last, size)
-        return builder.bitcast(builder.gep(inside.data, [at]), simd._EIGHT.as_pointer())
+        return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
 
     cgutils.do_boundscheck = checked
     simd._place = place
     return noted, sites
+
+
+def move_apart() -> None:
+    """Put `APART` NaN after every array of banks made from now on."""
+    from driftfit.trackers.bank import bank, memory
+    from driftfit.trackers.bank.layout import REPORTED, ROW, WINDOWS
+
+    packed = bank.packed
+    inside = [name for name in memory.PACKED if name not in REPORTED]
+
+    def apart(arrays: Any, numbers: Any) -> dict[str, Any]:
+        state = packed(arrays, numbers)
+        old, table = state["memory"], state["table"]
+        size = len(old) + APART * (len(inside) + 1)
+        new, shifts = np.full(2 ** int(np.ceil(np.log2(size))), np.nan), {}
+        order = sorted(inside, key=lambda name: (table[ROW[name], 0], inside.index(name)))
+        for k, name in enumerate(order):
+            at, size = table[ROW[name], 0] // 8, int(table[ROW[name], 1] * table[ROW[name], 2])
+            shifts[name] = APART * (k + 1)
+            new[at + shifts[name] : at + shifts[name] + size] = old[at : at + size]
+        for name in (*inside, *WINDOWS):
+            table[ROW[name], 0] += 8 * shifts["scratch" if name in WINDOWS else name]
+        return {**state, "memory": new}
+
+    bank.packed = apart
+
+
+def trespassed(lane: Any) -> list[str]:
+    """The arrays after which something was written."""
+    from driftfit.trackers.bank.layout import PACKED, REPORTED, ROW
+
+    said = []
+    for name in PACKED:
+        start, rows, columns = lane["table"][ROW[name]]
+        after = start // 8 + rows * columns
+        if name not in REPORTED and not np.isnan(lane["memory"][after : after + APART]).all():
+            said.append(f"written beyond {name}")
+    return said
 
 
 def found(noted: Any, sites: list[str]) -> list[str]:
@@ -89,11 +139,15 @@ def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, d
 
     n = 2 if quick else int(rng.choice([1, 2, 3, 4, 5, 9]))
     na = int(rng.integers(0, 2 if quick else 3)) if rng.random() < 0.5 else 0
-    model = ARX(na, n, nk=int(rng.integers(0, 2))) if na else Regression(n)
-    bank = bank_of(rng, n + na, form, arx=na > 0)
+    ny = 2 if rng.random() < 0.2 else 1
+    model = ARX(na, n, nk=int(rng.integers(0, 2)), ny=ny) if na else Regression(n, ny=ny)
+    bank = bank_of(rng, n + ny * na, form)
     T = int(rng.integers(1, 90))
     u = rng.standard_normal((T, n if not na else 1))
     y = u.sum(axis=1) * np.where(np.arange(T) < T // 2, 1.0, 2.5) + 0.3 * rng.standard_normal(T)
+    if rng.random() < 0.4:  # regressors that begin late, so that a bank runs in the coordinates of its start
+        for k in range(u.shape[1]):
+            u[: int(rng.integers(T)), k] = 0.0
     if rng.random() < 0.5:
         y[rng.random(T) < 0.2] = np.nan
         y[T // 3 : T // 2] = np.nan
@@ -103,22 +157,26 @@ def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, d
         y = np.round(y)
     if rng.random() < 0.2:
         y[int(rng.integers(T))] = 9999.0
-    more = {"y": y, "u": u}
+    more = {"y": y if ny == 1 else np.stack([y, -y], axis=1), "u": u}
     if rng.random() < 0.4:
         more["time"] = np.cumsum(rng.choice([1.0, 0.5, 2.0, 20.0], T))
-    if rng.random() < 0.2:
-        more["prob"] = np.where(rng.random((T, 1)) < 0.5, np.nan, rng.dirichlet(np.ones(len(bank.all_changes)), T))
+    if ny == 1 and rng.random() < 0.2:
+        Hd = len(bank.all_changes)
+        each = rng.dirichlet(np.ones(Hd), T)
+        chain = rng.dirichlet(np.ones(Hd), (T, Hd))
+        more["prob"] = chain if rng.random() < 0.5 else np.where(rng.random((T, 1)) < 0.5, np.nan, each)
     return model, bank, more
 
 
-def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
+def bank_of(rng: np.random.Generator, n: int, form: str) -> Any:
     """A random bank for n parameters; invalid combinations are redrawn."""
     from driftfit import Bank, Change, Sensor
 
     while True:
         changes = [Change(float(rng.choice([0.0, 1e-4])))]
+        walks = rng.random() < 0.5
         for _ in range(int(rng.integers(0, 3))):
-            kind = int(rng.integers(0, 6))
+            kind = int(rng.integers(0, 3 if walks else 6))
             p = float(rng.choice([0.0, 0.01, 0.1]))
             changes.append([
                 Change(1.0, prob=p), Change(size=3.0, prob=p), Change(1.0, prob=p, which=[int(rng.integers(n))]),
@@ -128,11 +186,11 @@ def bank_of(rng: np.random.Generator, n: int, form: str, arx: bool) -> Any:
         nominal = [Sensor.nominal(0.1), Sensor.nominal(), Sensor.nominal(guess=0.1), Sensor.nominal(limit=30.0)]
         sensors = [nominal[int(rng.integers(4))]]
         others = [Sensor.outlier(prob=0.05), Sensor.outlier(kind="additive", prob=0.05), Sensor.offset(value=2.0)]
-        others.append(Sensor.frozen(0.01))
-        sensors += [others[k] for k in rng.permutation(4)[: int(rng.integers(0, 3))]]
+        others += [Sensor.frozen(0.01), Sensor.own(heavy, prob=0.05, cleans=True)]
+        sensors += [others[k] for k in rng.permutation(5)[: int(rng.integers(0, 3))]]
         Hd, Hm = len(changes), len(sensors)
         transition = None
-        if rng.random() < 0.3:
+        if rng.random() < 0.5:
             transition = [rng.dirichlet(np.ones(k), k) if rng.random() < 0.7 else None for k in (Hd, Hm)]
         try:
             with warnings.catch_warnings():
@@ -162,9 +220,20 @@ def reduction(rng: np.random.Generator, H: int) -> Any:
     return kinds[int(rng.integers(len(kinds)))]()
 
 
+def faults(run: Any) -> list[str]:
+    """What is wrong with the numbers and the memory of a bank."""
+    wrong = [] if np.isfinite(run.theta).all() and np.isfinite(run.prediction[run.ok]).all() else ["not finite"]
+    wrong, p = wrong + trespassed(run.state), run.hypotheses.mode_prob
+    known = ~np.isnan(p).any(axis=1)  # once the bank has begun
+    proper = (p[known] > -1e-9).all() and (p[known] < 1.0 + 1e-9).all() and (np.diff(known.astype(int)) >= 0).all()
+    return wrong if proper else [*wrong, "not probabilities"]
+
+
 def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
-    """Run this many banks; returns how many had a violation or were not finite."""
+    """Run this many banks; returns how many had a violation or wrong numbers."""
     from driftfit import track
+
+    move_apart()
 
     bad = 0
     for seed in range(banks):
@@ -174,10 +243,10 @@ def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             run = track(model, bank, **record, **({"dt": 1.0} if "time" in record else {}))
-            run.hypotheses.found()
-        wrong = found(noted, sites)
-        if not (np.isfinite(run.theta).all() and np.isfinite(run.prediction[run.ok]).all()):
-            wrong.append("not finite")
+        each = list(run.values()) if len(model.outputs) > 1 else [run]
+        for one in each:
+            one.hypotheses.found()
+        wrong = found(noted, sites) + [said for one in each for said in faults(one)]
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)

@@ -1,10 +1,10 @@
 """Size and speed of exported trackers: code, state, instructions on a Cortex-M4F, and time next to hand-written C.
 
-    python benchmarks/embedded.py            about a minute
-    python benchmarks/embedded.py --quick    two sizes, few samples
+    python -m benchmarks.embedded            four minutes
+    python -m benchmarks.embedded --quick    two sizes, few samples, no AdaptiveKalman
 
-The emulator counts instructions (qemu with -icount: one instruction, one nanosecond of its clock), if it and the cross
-compiler are installed. The filter of filter.c is compiled with the same flags on this computer for comparison.
+The emulator reports what it executes, if it and the cross compiler are installed; `benchmarks/cortex_cycles.py` turns
+that into cycles. The filter of filter.c is compiled with the same flags, for the controller and for this computer.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from statistics import median
 from typing import Annotated, Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.cortex_cycles import counted
 from driftfit import ARX, FLS, RLS, AdaptiveKalman, AugmentedFLS, Kalman
 from driftfit.embedded import export_c
 
@@ -49,8 +49,6 @@ void bench_run(long T, const double *y, const double *u, row *out) {
 """
 
 COUNT = """
-#include <stdint.h>
-#include <stdio.h>
 #ifdef BY_HAND
 #include <math.h>
 #ifdef TRACKER_SINGLE
@@ -72,65 +70,62 @@ static tracker_state state;
 #define UPDATE(y, u) tracker_update(&state, (y), (u))
 static void begin(void) { tracker_init(&state); }
 #endif
-static volatile uint32_t *const TICK = (uint32_t *)0xE000E010; /* control, reload, current value of the system timer */
 static tracker_real noise(void) {
-    static uint32_t seed = 1;
-    seed = seed * 1664525u + 1013904223u;
+    static unsigned long seed = 1;
+    seed = (seed * 1664525ul + 1013904223ul) & 0xfffffffful;
     return (tracker_real)(seed >> 16) / (tracker_real)65536 - (tracker_real)0.5;
 }
 int main(void) {
-    uint32_t before = 0;
+    static tracker_real y[LAST], u[LAST];
+    for (int t = 0; t < LAST; t++) { y[t] = noise(); u[t] = noise(); }
     begin();
-    TICK[1] = 0xFFFFFF; TICK[2] = 0; TICK[0] = 5;
-    for (int t = 0; t < 1100; t++) {
-        tracker_real u[1], y;
-        if (t == 100) before = TICK[2];
-        u[0] = noise();
-        y = noise();
-        UPDATE(y, u);
-    }
-    printf("%lu\\n", (unsigned long)((before - TICK[2]) & 0xFFFFFF));
+    for (int t = 0; t < SAMPLES; t++) UPDATE(y[t], u + t);
     return 0;
 }
 """
-NANOSECONDS_A_TICK = 40  # the board's timer runs at 25 MHz
+KALMAN = Kalman(q=1e-4, r=0.01, p0=1.0)
+FIRST, LAST = 16, 20
+"""The samples between are counted, as the difference of two programs."""
 
 
-def emulated(folder: Path, sources: list[str], flags: list[str]) -> int | None:
-    """Instructions per update on the emulated controller; None if there is no emulator."""
+def emulated(folder: Path, sources: list[str], flags: list[str]) -> tuple[int, int] | None:
+    """(instructions, cycles at most) per update on the emulated controller; None if there is no emulator."""
     if shutil.which("arm-none-eabi-gcc") is None or shutil.which("qemu-system-arm") is None:
         return None
     (folder / "count.c").write_text(COUNT)
     start = ["-nostartfiles", "--specs=rdimon.specs", "-T", str(CORTEX / "memory.ld"), str(CORTEX / "start.c")]
     elf = str(folder / "count.elf")
-    command = ["arm-none-eabi-gcc", *M4F, *flags, *start, "-Wl,--no-warn-rwx-segments", "-o", elf]
-    subprocess.run([*command, *sources, str(folder / "count.c"), "-lm"], check=True)
-    run = ["qemu-system-arm", "-M", "mps2-an386", "-nographic", "-semihosting", "-icount", "shift=0", "-kernel", elf]
-    done = subprocess.run(run, check=True, capture_output=True, text=True, timeout=120)
-    return int(done.stdout) * NANOSECONDS_A_TICK // 1000
+    command = ["arm-none-eabi-gcc", *M4F, *flags, *start, "-Wl,--no-warn-rwx-segments", "-o", elf, f"-DLAST={LAST}"]
+    runs = []
+    for samples in (FIRST, LAST):
+        more = [f"-DSAMPLES={samples}", *sources, str(folder / "count.c"), "-lm"]
+        subprocess.run([*command, *more], check=True)
+        runs.append(counted(elf))
+    before, after = runs
+    return (after[0] - before[0]) // (LAST - FIRST), (after[1] - before[1]) // (LAST - FIRST)
 
 
-def by_hand(folder: Path, n: int, single: bool) -> int | None:
-    """Instructions of filter.c."""
+def by_hand(folder: Path, n: int, single: bool) -> tuple[int, int] | None:
+    """(instructions, cycles at most) of filter.c."""
     size = [f"-DNA={n // 2}", f"-DNB={n - n // 2}", "-DBY_HAND", f"-I{HERE}", "-w"]
     return emulated(folder, [], [*size, *(["-DTRACKER_SINGLE", "-fsingle-precision-constant"] if single else [])])
 
 
-def exported(folder: Path, single: bool) -> tuple[str, str]:
-    """(bytes of code and constants, instructions per update) of the tracker in a folder."""
+def exported(folder: Path, single: bool) -> list[str]:
+    """Bytes of code and constants, instructions and cycles per update, of the tracker in a folder."""
     flags = ["-DTRACKER_SINGLE"] if single else []
     count = emulated(folder, [str(folder / "tracker.c")], flags)
     if count is None:
-        return "-", "-"
+        return ["-"] * 3
     target = str(folder / "tracker.o")
     command = ["arm-none-eabi-gcc", *M4F, *flags, "-c", "-o", target, str(folder / "tracker.c")]
     subprocess.run(command, check=True)
     sizes = subprocess.run(["arm-none-eabi-size", target], check=True, capture_output=True, text=True)
-    return sizes.stdout.splitlines()[1].split()[0], str(count)
+    return [sizes.stdout.splitlines()[1].split()[0], *map(str, count)]
 
 
 def beside_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[float, float]:
-    """Nanoseconds per update: exported, and the loop of filter.c; both must give the same numbers."""
+    """Nanoseconds per update, the best of the repeats: exported, and filter.c; both must give the same numbers."""
     (folder / "loop.c").write_text(LOOP)
     ours, other = str(folder / "ours.so"), str(folder / "other.so")
     subprocess.run(["gcc", *FLAGS, "-o", ours, str(folder / "loop.c"), "-lm"], check=True, cwd=folder)
@@ -157,7 +152,7 @@ def beside_hand_written(folder: Path, n: int, T: int, repeats: int) -> tuple[flo
         for job, taken in zip((first, second), times, strict=True):
             taken.append(timed(job) / T)
     np.testing.assert_allclose(rows[0][50:, :n], rows[1][50:, :n], atol=0.02)  # the start differs a little
-    return median(times[0]), median(times[1])
+    return min(times[0]), min(times[1])
 
 
 def pointer(array: np.ndarray[Any, Any]) -> ctypes.c_void_p:
@@ -173,46 +168,69 @@ def timed(job: Any) -> float:
     return float(perf_counter_ns() - begin)
 
 
-def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples.")] = False) -> None:
-    """Print both tables."""
-    out = Console(width=110)
+def state_and_cost(model: ARX, tracker: Any) -> list[str]:
+    """Bytes of state, bytes of code, instructions and cycles per update, in double and in single precision."""
+    row = []
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        export_c(model, tracker, folder)
+        said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
+        states = [word for word in said.replace(",", "").split() if word.isdigit()]
+        for single in (False, True):
+            row += [states[single], *exported(folder, single)]
+    return row
+
+
+def against_filter(n: int) -> list[str]:
+    """Cycles of filter.c, then those of the exported Kalman and their ratio, with and without the fixed rate."""
+    row = [str(n)]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for single in (False, True):
+            hand = by_hand(folder, n, single)
+            row.append("-" if hand is None else str(hand[1]))
+            for fixed_rate in (False, True):
+                export_c(ARX(n // 2, n - n // 2), KALMAN, folder, fixed_rate=fixed_rate)
+                cycles = exported(folder, single)[2]
+                row += [cycles, "-" if hand is None else f"{int(cycles) / hand[1]:.2f}"]
+    return row
+
+
+def main(quick: Annotated[bool, typer.Option(help="Two sizes, few samples, no AdaptiveKalman.")] = False) -> None:
+    """Print the three tables."""
+    out = Console(width=120)
     sizes = (2, 4) if quick else (2, 4, 6, 8)
     T, repeats = (2_000, 3) if quick else (20_000, 31)
     trackers = {
-        "Kalman": Kalman(q=1e-4, r=0.01, p0=1.0),
+        "Kalman": KALMAN,
         "Kalman, sqrt": Kalman(q=1e-4, r=0.01, p0=1.0, form="sqrt"),
         "RLS": RLS(0.98),
         "FLS": FLS(100.0),
         "AugmentedFLS": AugmentedFLS(10.0),
-        "AdaptiveKalman": AdaptiveKalman(),
     }
+    if not quick:
+        trackers["AdaptiveKalman"] = AdaptiveKalman()
     table = Table(title="On a Cortex-M4F, -O2", show_edge=False)
-    for head in ("tracker", "n", "state, bytes", "code, bytes", "instructions", "state", "code", "instructions"):
-        table.add_column(head, justify="left" if head == "tracker" else "right")
+    numbers = ("state", "code", "instr.", "cycles")
+    for head in ("tracker", "n", *numbers, *numbers):
+        table.add_column(head, justify="left" if head == "tracker" else "right", no_wrap=True)
     for name, tracker in trackers.items():
         for n in sizes if name == "Kalman" else (4,):
-            row = [name, str(n)]
-            with tempfile.TemporaryDirectory() as place:
-                folder = Path(place)
-                export_c(ARX(n // 2, n - n // 2), tracker, folder)
-                said = (folder / "README.md").read_text().split("State: ")[1].split(" with")[0]
-                states = [word for word in said.replace(",", "").split() if word.isdigit()]
-                for single in (False, True):
-                    row += [states[single], *exported(folder, single)]
-                if name == "Kalman":
-                    hand = [by_hand(folder, n, single) for single in (False, True)]
-            table.add_row(*row)
-            if name == "Kalman":
-                counts = ["-" if count is None else str(count) for count in hand]
-                table.add_row("filter.c, by hand", str(n), "", "", counts[0], "", "", counts[1], style="dim")
+            table.add_row(name, str(n), *state_and_cost(ARX(n // 2, n - n // 2), tracker))
     out.print(table)
-    out.print("double precision, then single (-DTRACKER_SINGLE), which the processor has in hardware", style="dim")
+    out.print("bytes of state and code, and per update; first in double precision, then in single (-DTRACKER_SINGLE)")
+    ratios = Table(title="\nCycles per update on a Cortex-M4F, beside filter.c", show_edge=False)
+    for head in ("n", *("by hand", "Kalman", "ratio", "fixed rate", "ratio") * 2):
+        ratios.add_column(head, justify="right", no_wrap=True)
+    for n in sizes if quick else range(2, 9):
+        ratios.add_row(*against_filter(n))
+    out.print(ratios)
     beside = Table(title="\nOn this computer, beside filter.c", show_edge=False)
     for head in ("n", "exported, ns", "by hand, ns", "ratio", "at most 1.3"):
         beside.add_column(head, justify="right")
     for n in sizes:
         with tempfile.TemporaryDirectory() as place:
-            export_c(ARX(n // 2, n - n // 2), trackers["Kalman"], place)
+            export_c(ARX(n // 2, n - n // 2), KALMAN, place)
             ours, other = beside_hand_written(Path(place), n, T, repeats)
         kept = "yes" if ours <= 1.3 * other else "no"
         beside.add_row(str(n), f"{ours:.1f}", f"{other:.1f}", f"{ours / other:.2f}", kept)

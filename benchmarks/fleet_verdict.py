@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from driftfit import ARX, Kalman, track
-from driftfit.run.fleet import Fleet, cores
+from driftfit.run.fleet import Fleet
+from driftfit.run.lanes import cores
 
 T, DRIFTING = 400, 0.1
 

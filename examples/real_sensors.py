@@ -91,6 +91,22 @@ def arcs() -> None:
         print(f"  {f'{half} samples':18}" + "".join(f"{cell:>16.2f}" for cell in cells))
 
 
+def ignition() -> None:
+    """An arc that conducts from 0.7 of the peak voltage on until it passes zero; a half period is 25 samples."""
+    rng, t = np.random.default_rng(4), np.arange(T)
+    u, g = np.sin(np.pi * t / 25.0), np.full(T, 0.02)
+    for k in range(1, T):
+        g[k] = 4.0 if abs(u[k]) > 0.7 or (g[k - 1] > 1.0 and u[k] * u[k - 1] > 0.0) else 0.02
+    i, begins = g * u + 0.05 * rng.normal(size=T), np.append(False, np.diff(g) > 0.0)
+    print("\nAn arc that ignites at 0.7 of the peak voltage: rms error of the prediction of i, one step ahead")
+    print(f"  {'':18}{'all samples':>16}{'at ignition':>16}{'elsewhere':>16}")
+    named = (("AdaptiveKalman", AdaptiveKalman()), ("RLS(0.998)", RLS(0.998)), ("RLS(0.98)", FORGET), ("Kalman", WALK))
+    for name, tracker in named:
+        e = track(Regression(1), tracker, i, u[:, None]).innovation[200:]
+        cells = (rms(e), rms(e[begins[200:]]), rms(e[~begins[200:]]))
+        print(f"  {name:18}" + "".join(f"{c:>16.2f}" for c in cells))
+
+
 def smoothing() -> None:
     """Both parameters are random walks, in noise of standard deviation 0.3; 20 records of 500 samples."""
     print("\nParameters that walk, 20 records: rms error, and share of the truth in 95 % bands")
@@ -114,6 +130,7 @@ def main() -> None:
     codes()
     coarse()
     arcs()
+    ignition()
     smoothing()
 
 

@@ -199,6 +199,44 @@ def of_outputs(model: Any, tracker: Any, seed: int, ny: int) -> Configuration:
     return run
 
 
+def of_output_fleet(
+    model: Any, tracker: Any, seed: int, units: int, halves: bool = False, **known: Any
+) -> Configuration:
+    """A fleet of records with several outputs each, by row; with ``halves`` it is continued halfway."""
+
+    def run() -> Arrays:
+        records = [signals(seed + k, m=2, ny=2) for k in range(units)]
+        y, u = (np.stack(part) for part in zip(*records, strict=True))
+        if getattr(model, "shared", False):
+            u = np.repeat(u[:, :, None, :], 2, axis=2)
+        fleet: Any = None
+        for rows in (slice(0, T // 2), slice(T // 2, T)) if halves else (slice(None),):
+            fleet = track(model, tracker, y[:, rows], u[:, rows], by="row", warm_start=fleet, **known)
+        return {f"{k}: {name}": value for k in range(units) for name, value in written(fleet[k]).items()}
+
+    return run
+
+
+def of_output_stream(model: Any, tracker: Any, seed: int) -> Configuration:
+    """A stream with several outputs that is stored, loaded and continued halfway, with factors of its own."""
+
+    def run() -> Arrays:
+        y, u = signals(seed, m=2, ny=2)
+        given = np.repeat(u[:, None, :], 2, axis=1) if getattr(model, "shared", False) else u
+        live: Any = Live(model, tracker, lag=5, limits={"y1": (-4.0, 4.0)})
+        steps = []
+        for t in range(T):
+            ahead = live.predict(given[t])
+            steps.append([*ahead, *live.update(y[t], given[t], time=1.3 * t, weight=[1.0, 2.0], drift=1.5)])
+            if t == T // 2:
+                live = Live.from_bytes(live.to_bytes())
+        kept = live.smooth()
+        found = {"steps": np.array(steps, dtype=float), "theta": live.theta, "std": live.std}
+        return found | {"lagged theta": kept.theta, "lagged std": kept.std, "ahead": live.forecast(3).theta}
+
+    return run
+
+
 def configurations() -> Iterator[tuple[str, Configuration]]:
     """Eighty of them, by name; the draws are fixed."""
     rng = np.random.default_rng(80)
@@ -229,6 +267,19 @@ def configurations() -> Iterator[tuple[str, Configuration]]:
     for name in ("Kalman", "RLS"):
         yield f"{name}, two outputs", of_outputs(ARX(1, 1, inputs=2, ny=2), SIMPLE[name], 8, 2)
         yield f"{name}, a theta shared", of_outputs(Regression(2, ny=2, shared=True), SIMPLE[name], 9, 2)
+    joint, apart, shared = ARX(1, 1, inputs=2, ny=2), Regression(2, ny=2), Regression(2, ny=2, shared=True)
+    own = {"y1": SIMPLE["Kalman"], "y2": Kalman(q=[1e-4, 1e-3], r=0.04)}
+    limits, excluded = {"y2": (-3.0, 3.0), 0: (-1.5, 1.5)}, [(50, 60)]
+    for kind, model in {"joint": joint, "a theta each": apart, "a theta shared": shared}.items():
+        for units in (3, 40):
+            yield f"fleet of {units} with two outputs, {kind}", of_output_fleet(model, SIMPLE["Kalman"], 300, units)
+        yield f"fleet with two outputs, {kind}, warm start", of_output_fleet(model, SIMPLE["RLS"], 310, 3, True)
+        yield (
+            f"fleet with two outputs, {kind}, uneven time",
+            of_output_fleet(model, SIMPLE["FLS"], 320, 3, time=uneven, limits=limits, exclude=excluded),
+        )
+        yield f"stream with two outputs, {kind}", of_output_stream(model, SIMPLE["Kalman"], 330)
+    yield "two outputs, a tracker each", of_outputs(apart, own, 340, 2)
     yield "Hammerstein-Wiener, Kalman", of_record(BLOCKS, Kalman(q=1e-5, r=0.01, p0=1.0), 10)
     yield "Hammerstein-Wiener, extended", of_record(BLOCKS, ExtendedKalman(q=1e-5, r=0.01), 10)
     yield "Hammerstein-Wiener, output error", of_record(BLOCKS, OutputError(q=1e-5, r=0.01, q_w=1e-4), 10)

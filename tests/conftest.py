@@ -1,5 +1,7 @@
 """Set-up shared by all tests: no display, the same hypothesis examples in every run, and much kept by the compiler."""
 
+import gc
+
 import matplotlib
 from hypothesis import HealthCheck, settings
 
@@ -10,4 +12,5 @@ settings.register_profile(
     "fixed", deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("fixed")
+gc.set_threshold(50_000, 20, 1000)  # what the compiler keeps was searched again and again: a tenth of the suite's time
 kernel.KEPT = 2000  # tests come back to a record type after all others: 0.4 GB for a third of the compiling

@@ -6,8 +6,8 @@ from support import arx_record
 from driftfit import track
 
 VALUES = (
-    1e-320, 1e-300, 1e-200, 1e-160, 1e-100, 1e-80, 1e-50, -1e-40, 1e-37, 1e-20, 0.0, -1e5, 1e10, 1e20, -1e30, 1e37,
-    1e40, -1e60, 1e80, 1e99, 1e101, 1e155, -1e200, 1e308, np.nan, np.inf, -np.inf,
+    1e-320, 1e-300, 1e-200, 1e-160, 1e-100, 1e-80, 1e-50, -1e-40, 1e-37, 1e-20, 0.0, -3e4, -1e5, 1e7, 1e10, 1e20,
+    -1e30, 1e37, 1e40, -1e60, 1e80, 1e99, 1e101, 1e155, -1e200, 1e308, np.nan, np.inf, -np.inf,
 )  # fmt: skip
 AFTER = 100
 """Samples by which a run must have recovered."""

@@ -84,13 +84,13 @@ def test_a_million_dull_samples_and_excitation_back():
 
 def test_flag_is_honest_for_a_constant_regressor():
     rng = np.random.default_rng(1)
-    alone, doubled = Live(Regression(1), AdaptiveKalman()), Live(Regression(1, intercept=True), AdaptiveKalman())
+    alone, tripled = Live(Regression(1), AdaptiveKalman()), Live(Regression(3), AdaptiveKalman())
     for _ in range(300):
         y = 2.0 + 0.1 * rng.normal()
         alone.update(y, 1.0)
-        doubled.update(y, 1.0)
+        tripled.update(y, np.ones(3))
     assert alone.learning.all()
-    assert not doubled.learning.any()
+    assert not tripled.learning.any()
     with pytest.raises(ValueError, match="AdaptiveKalman"):
         Live(Regression(1), Kalman(q=0.0, r=1.0)).learning.any()
 

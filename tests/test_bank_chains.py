@@ -9,6 +9,7 @@ from test_bank import N, R, told
 
 from driftfit import Bank, Live, Regression, track
 from driftfit.trackers.bank.change import Change
+from driftfit.trackers.bank.layout import ROW
 from driftfit.trackers.bank.reduction import GPB, Beam, Decide, Hybrid
 from driftfit.trackers.bank.sensor import Sensor
 
@@ -57,11 +58,13 @@ def every_course(P, initial, q, z, y):
     return found
 
 
-@pytest.mark.parametrize("form", ["covariance", "sqrt"])
+@pytest.mark.parametrize(
+    ("reduce", "form"), [(Beam(200), "covariance"), (Beam(200), "sqrt"), (Decide(4), "covariance")], ids=str
+)
 @pytest.mark.parametrize("name", list(CHAINS))
-def test_a_gap_is_weighed_as_all_courses_of_the_chain(name, form):
+def test_a_gap_is_weighed_as_all_courses_of_the_chain(name, reduce, form):
     """Exact for two modes and one missing sample; of three, two are one course by its moments."""
-    bank, (P, q) = bank_of(name, Beam(200), form=form), CHAINS[name]
+    bank, (P, q) = bank_of(name, reduce, form=form), CHAINS[name]
     closely = (1e-9, 1e-9, 0.05, 0.3) if len(q) == 2 else (1e-9, 0.35, 0.7, 0.7)
     for gap, close in zip((1, 2, 5, 20), closely, strict=True):
         for off in (0.3, 2.0):
@@ -108,7 +111,7 @@ def test_a_gap_is_reported_as_it_widens():
 
 @pytest.mark.parametrize("reduce", [Beam(6), Hybrid(6), Decide(3), GPB(3)], ids=str)
 def test_a_stream_with_gaps_says_what_the_record_says(reduce):
-    """Gaps one after the other, of which `Decide` has no room for all the courses."""
+    """Gaps one after the other, so that leaves of `Decide` with a twin go on as one."""
     rng = np.random.default_rng(4)
     y, z = rng.standard_normal(80), rng.standard_normal((80, N))
     y[rng.random(80) < 0.4] = np.nan
@@ -125,6 +128,22 @@ def test_a_stream_with_gaps_says_what_the_record_says(reduce):
     for t in range(80):
         live.update(y[t], z[t], time=time[t])
         assert same(live.theta, run.theta[t]), t
+
+
+@pytest.mark.parametrize("reduce", [Decide(3), Decide("auto", max_depth=3), GPB(2), Beam(5)], ids=str)
+def test_gaps_one_after_the_other_stay_within_the_table(reduce):
+    """Leaves that are all in one branch lose none by a decision: parted at every gap, they would outgrow the table."""
+    rng = np.random.default_rng(0)
+    y, z = rng.standard_normal(200), rng.standard_normal((200, N))
+    y[100:] += 20.0 * z[100:, 0]
+    y[rng.random(200) < 0.4] = np.nan
+    run, room = track(Regression(N), bank_of("both", reduce), y, z), 2 * reduce.shape(3, 1).parents
+    lane, leaves = run.state, told(run, "leaves")
+    assert lane["table"][ROW["parents"], 2] >= room
+    assert leaves.max() == 3 * room  # as many as there may be, and no more
+    p = told(run, "lag_prob")
+    assert p.min() >= 0.0
+    np.testing.assert_allclose(p[30:].sum(axis=2), 1.0, atol=1e-9)
 
 
 def test_jumps_in_an_outage_are_found_under_a_chain():

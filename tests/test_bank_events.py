@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from support import arx_record, same
-from test_bank import N, R, changes, record
+from test_bank import N, R, changes, record, told
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
+from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import IMM, Beam, Decide, Hybrid
 from driftfit.trackers.bank.sensor import Sensor
 
@@ -222,3 +223,42 @@ def test_several_outputs_have_a_bank_each(bank):
     for t in range(60):
         live.update(both[t], u[t])
     assert same(live.theta, run.theta[-1])
+
+
+def expected(leaves, p, s, r):
+    """The least risk that is expected after the mean of s more samples, by plain integration over a grid."""
+    y = np.linspace(-120.0, 120.0, 40_001)
+    f = np.zeros((2, len(y)))
+    for e, (w, m, C) in enumerate(leaves):
+        for p_next, q in zip(p, (1e-4, 9.0), strict=True):
+            std = np.sqrt(r / s + SIGHT @ (C + q * np.eye(N)) @ SIGHT)
+            f[e] += w * p_next * np.exp(-0.5 * ((y - SIGHT @ m) / std) ** 2) / (std * np.sqrt(2.0 * np.pi))
+    return f.min(axis=0).sum() * (y[1] - y[0])
+
+
+SIGHT = np.array([1.0, -0.5])
+
+
+@pytest.mark.parametrize(("ahead", "decided"), [(1, 34), (4, 31)])
+def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
+    """The decision after one sample of variance 64, against the rule with risks by plain integration."""
+    p, r, cost = np.array([0.8, 0.2]), 64.0, 0.01
+    reduce = Decide("auto", max_depth=6, tau=1e-9, wait_cost=cost, ahead=ahead)
+    bank = Bank([Change(1e-4), Change(9.0, prob=0.2)], [Sensor.nominal(r)], reduce=reduce, p0=0.1)
+    said, rule, near = [], [], []
+    for y in np.linspace(0.0, 30.0, 41):
+        run, leaves = track(Regression(N), bank, [y], [SIGHT]), []
+        for chance, q in zip(p, (1e-4, 9.0), strict=True):
+            C = (0.1 + q) * np.eye(N)
+            s = r + SIGHT @ C @ SIGHT
+            density = np.exp(-0.5 * y * y / s) / np.sqrt(s)
+            leaves.append((chance * density, C @ SIGHT / s * y, C - np.outer(C @ SIGHT, C @ SIGHT) / s))
+        total = sum(leaf[0] for leaf in leaves)
+        leaves = [(w / total, m, C) for w, m, C in leaves]
+        risk = min(leaf[0] for leaf in leaves)
+        gains = [risk - k * cost - expected(leaves, p, k, r) for k in range(1, ahead + 1)]
+        said.append(bool(told(run, "decided")[0, 0, 0] >= 0.0))
+        rule.append(max(gains) <= 0.0)
+        near.append(abs(max(gains)) < 1e-5)
+    assert [a == b or c for a, b, c in zip(said, rule, near, strict=True)] == [True] * 41
+    assert sum(said) == decided

@@ -91,10 +91,6 @@ class NLMS(Tracker):
         return self.kind
 
 
-class Fading(NLMS):
-    kind = steps(fade, follow)
-
-
 class Always(NLMS):
     kind = steps(nothing, always)
 
@@ -108,7 +104,9 @@ class Bold(NLMS):
 
 
 class Hindsight(NLMS):
-    kind = steps(nothing, hindsight)
+    """Two faults, which two checks find."""
+
+    kind = steps(fade, hindsight)
 
 
 class Boastful(NLMS):
@@ -142,17 +140,17 @@ class Loose(Tracker):
 
 @pytest.mark.parametrize("tracker", [Kalman(q=1e-4, r=0.01), RLS(0.99), AugmentedFLS(mu=1.0), NLMS()], ids=repr)
 def test_trackers_that_keep_their_promises(tracker):
-    assert check_tracker(tracker) == []
+    # the model of the contract's tests, which compile it for every tracker of the house
+    assert check_tracker(tracker, ARX(1, 1) if isinstance(tracker, NLMS) else ARX(2, 2)) == []
 
 
 @pytest.mark.parametrize(
     ("tracker", "said"),
     [
-        (Fading(), ["with s.dt[l] = 0 predict must change nothing"]),
         (Always(), ["must be a factor of the gain", "no time passes and no sample is used"]),
         (Careless(), ["index every field with [..., l]", "must be a factor of the gain"]),
         (Bold(), ["make theta not finite"]),
-        (Hindsight(), ["depends on that output", "s.e is not"]),
+        (Hindsight(), ["depends on that output", "s.e is not", "with s.dt[l] = 0 predict must change nothing"]),
         (Boastful(), ["It does not run"]),
         (Deaf(q=1e-4, r=0.01), ["drift_each = True"]),
         (Loose(), ["frozen=True"]),

@@ -13,7 +13,20 @@ import pytest
 from contract_table import forms, ready
 from typer.testing import CliRunner
 
-from driftfit import ARX, FLS, RLS, AdaptiveKalman, Bank, ExtendedKalman, Kalman, Live, Regression, trackers
+from driftfit import (
+    ARX,
+    FLS,
+    RLS,
+    AdaptiveKalman,
+    Bank,
+    ExtendedKalman,
+    HammersteinWiener,
+    Kalman,
+    Live,
+    Polynomial,
+    Regression,
+    trackers,
+)  # fmt: skip
 from driftfit.cli import app
 from driftfit.embedded import export_c, from_struct, to_struct
 from driftfit.embedded.selftest import record
@@ -45,6 +58,7 @@ OTHERS = {
     "second differences": (ARX(1, 1), FLS(100.0, differences=2)),
     "two inputs": (ARX(2, [2, 1], nk=[1, 0], intercept=True), Kalman(q=1e-4, r=0.1)),
     "no input": (ARX(2, 0), Kalman(q=1e-4, r=0.1)),
+    "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }
 
 
@@ -57,14 +71,14 @@ class Step(ctypes.Structure):
 class Exported:
     """The tracker in a shared library, with a state of its own."""
 
-    def __init__(self, folder, live):
+    def __init__(self, folder, live, **options):
         target = folder / "tracker.so"
         command = ["gcc", *STRICT, "-O2", "-shared", "-fPIC", "-o", str(target), str(folder / "tracker.c"), "-lm"]
         subprocess.run(command, check=True)
         self.library = ctypes.CDLL(str(target))
         for name in ("tracker_update", "tracker_predict"):
             getattr(self.library, name).restype = Step
-        self.size = len(to_struct(live))
+        self.size = len(to_struct(live, **options))
         self.buffer, self.scratch = ctypes.create_string_buffer(self.size), ctypes.create_string_buffer(self.size)
         self.library.tracker_init(self.buffer)
 
@@ -96,19 +110,19 @@ def same_numbers(one, other):
     return bool(np.all((one == other) | nan))
 
 
-def agree(folder, model, tracker, T):
+def agree(folder, model, tracker, T, **options):
     """Run both over a record with holes, an outage and inputs that fall silent, and compare every step and state."""
-    export_c(model, tracker, folder)
+    export_c(model, tracker, folder, **options)
     live = Live(model, tracker)
-    ours = Exported(folder, live)
-    assert same_numbers(ours.state, to_struct(live))
+    ours = Exported(folder, live, **options)
+    assert same_numbers(ours.state, to_struct(live, **options))
     y, u = record(live.model, T, seed=3)
     u[2 * T // 5 : 3 * T // 5] = 0.0
     steps, found = np.empty((T, 4)), np.empty((T, 4))
     for t in range(T):
         steps[t] = live.update(float(y[t]), u[t, : live.model.m])
         found[t] = ours.update(float(y[t]), u[t])
-        assert t % 97 or same_numbers(ours.state, to_struct(live)), t
+        assert t % 97 or same_numbers(ours.state, to_struct(live, **options)), t
     np.testing.assert_array_equal(found, steps)
     assert 0.5 * T < steps[:, 3].sum() < T
     return live, ours
@@ -129,6 +143,33 @@ def test_other_models_and_settings_do_too(tmp_path, name):
 
 
 @needs_gcc
+@pytest.mark.parametrize("name", ["blocks", "start", "directional", "two inputs", "polynomials"])
+def test_a_fixed_rate_changes_no_bit(tmp_path, name):
+    model, tracker = OTHERS.get(name, (ARX(2, 2), None))
+    if tracker is None:
+        tracker = ready({"blocks": ExtendedKalman, "start": Kalman}[name])
+        model = tracker.own_model(2, 2, 1) or model
+    live, ours = agree(tmp_path, model, tracker, 1_000, fixed_rate=True)
+    header = (tmp_path / "tracker.h").read_text()
+    kept = set(re.findall(r"\b(interval|noise|drift);", header))
+    assert kept <= ({"noise"} if name in ("blocks", "polynomials") else set())  # which their steps change meanwhile
+    assert ours.size < len(to_struct(live))
+    there = from_struct(model, tracker, ours.state, fixed_rate=True)
+    m = live.model.m
+    assert bits(there.update(0.1, np.full(m, 0.2))) == bits(live.update(0.1, np.full(m, 0.2)))
+    live.lane()["interval"][...] = 2.0
+    with pytest.raises(ValueError, match=r"the field 'interval' is \[?2"):
+        to_struct(live, fixed_rate=True)
+
+
+def test_numbers_that_are_only_zero_or_one_are_integers_in_c(tmp_path):
+    export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), tmp_path, fixed_rate=True)
+    header, source = ((tmp_path / f"tracker.{end}").read_text() for end in "hc")
+    assert set(re.findall(r"    int (\w+);", header)) == {"started", "dt", "valid", "seen", "ok"}
+    assert "(s->dt > " not in source  # 0 or 1: never a gap
+
+
+@needs_gcc
 def test_states_travel_both_ways(tmp_path):
     live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1), 500)
     there = from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), ours.state)
@@ -137,8 +178,31 @@ def test_states_travel_both_ways(tmp_path):
     assert bits(there.update(0.1, 0.2)) == bits(live.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
     ctypes.memmove(ours.buffer, to_struct(live), ours.size)
     assert bits(ours.update(0.4, [0.5])) == bits(live.update(0.4, 0.5))
-    with pytest.raises(ValueError, match="a state of 1336 bytes; got 3"):
+    with pytest.raises(ValueError, match="a state of 1264 bytes; got 3"):
         from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1), b"abc")
+
+
+@needs_gcc
+def test_a_controllers_state_opens_as_a_saved_stream(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), 500)
+    opened = Live.from_bytes(from_struct(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=1.0), ours.state).to_bytes())
+    stored = Live.from_bytes(live.to_bytes())
+    assert bits(opened.theta) == bits(stored.theta)
+    assert same_numbers(to_struct(opened), to_struct(stored))
+    assert bits(opened.update(0.1, 0.2)) == bits(stored.update(0.1, 0.2)) == bits(ours.update(0.1, [0.2]))
+
+
+def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
+    given, nothing = (Live(ARX(2, 2), Kalman(q=1e-3, r=0.1, p0=p0)) for p0 in (1.0, None))
+    assert len(to_struct(given)) == 432 < len(to_struct(nothing)) == 1264  # without the fields of the diffuse start
+    export_c(ARX(2, 2), given.program.tracker, tmp_path)
+    source = (tmp_path / "tracker.c").read_text()
+    assert "refresh" not in source
+    assert re.search(r"s->P\[.*\] \+ \(s->q\[i\] \* time\)", source)  # no factors of one
+    assert "s->r * s->noise" in source  # settings and known factors may change on the controller
+    given.lane()["each"][:] = 1.5
+    with pytest.raises(ValueError, match=r"to_struct: the field 'each' is \[1.5, 1.5"):
+        to_struct(given)
 
 
 @needs_gcc
@@ -160,7 +224,7 @@ def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, f
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["adaptive", "blocks"])
+@pytest.mark.parametrize("name", ["adaptive", "blocks", "start"])
 def test_single_precision_is_close(tmp_path, name):
     said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
     assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
@@ -177,7 +241,8 @@ def test_the_self_test_passes_on_an_emulated_controller(tmp_path, name, flags):
 
 def selftest(folder, name, compiler, run):
     """Compile the self-test and run it; it must pass and print one line."""
-    tracker = AdaptiveKalman() if name == "adaptive" else ready(ExtendedKalman)
+    kinds = {"adaptive": AdaptiveKalman, "blocks": ExtendedKalman, "start": Kalman}
+    tracker = ready(kinds[name])
     export_c(tracker.own_model(2, 2, 1) or ARX(2, 2), tracker, folder)
     target = str(folder / "selftest")
     sources = [str(folder / "tracker.c"), str(folder / "selftest.c")]
@@ -198,6 +263,23 @@ def test_a_wrong_bit_fails_the_self_test(tmp_path):
     assert subprocess.run([str(tmp_path / "st")], capture_output=True, check=False).returncode == 1
 
 
+@needs_gcc
+@pytest.mark.parametrize("inputs", [1, 0])
+def test_the_simulink_block_gives_the_bits_of_a_stream(tmp_path, inputs):
+    model, tracker = ARX(2, 2 * inputs), Kalman(q=1e-3, r=0.1, p0=1.0)
+    export_c(model, tracker, tmp_path)
+    include = [f"-I{ROOT / 'tests' / 'simulink'}", "-DMATLAB_MEX_FILE", "-fsanitize=address,undefined"]
+    sources = [str(tmp_path / name) for name in ("tracker_sfun.c", "tracker.c")]
+    subprocess.run(["gcc", *STRICT, "-O1", *include, "-o", str(tmp_path / "block"), *sources, "-lm"], check=True)
+    y, u = record(model, 200)
+    live, rows = Live(model, tracker), "\n".join(" ".join(map(repr, row)) for row in np.c_[y, u[:, :inputs]].tolist())
+    done = subprocess.run([str(tmp_path / "block")], input=rows, capture_output=True, text=True, check=True)
+    for line, *row in zip(done.stdout.splitlines(), y, u[:, :inputs], strict=True):
+        step = live.update(*row)
+        expected = [*np.c_[live.theta, live.lane()["var"]].ravel(), step[0], step[1], step[2], step[3]]
+        np.testing.assert_array_equal(np.array(line.split(), dtype=float), np.array(expected, dtype=float))
+
+
 def test_what_cannot_be_exported_is_said(tmp_path):
     with pytest.raises(ValueError, match="Bank has no C form"):
         export_c(ARX(1, 1), Bank(), tmp_path)
@@ -208,6 +290,66 @@ def test_what_cannot_be_exported_is_said(tmp_path):
     with pytest.raises(TranslationError, match=r"correct: no translation of `np.tanh"):
         export_c(Regression(1), Odd(), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@kernel
+def slope_of(e):
+    if abs(e) > 1.0:
+        return 1.0 / abs(e)
+    return 1.0
+
+
+@kernel
+def descend(s, l):
+    y_hat, power = 0.0, 1e-3
+    for i in range(s.phi.shape[0]):
+        y_hat += s.phi[i, l] * s.theta[i, l]
+        power += s.phi[i, l] ** 2
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, s.y[l] - y_hat, s.r[l]
+    some = 1
+    for i in range(s.phi.shape[0]):
+        some = some if s.phi[i, l] == 0.0 else 3
+        s.theta[i, l] += s.ok[l] * s.rate[l] * some * slope_of(s.e[l]) * s.e[l] * s.phi[i, l] / power
+    s.leaks[l] += some - 1
+    some = 2
+    s.turns[l] += some
+    s.rate[l] *= 1.0 if s.noise[l] < 2.0 else 0.5
+
+
+@kernel
+def unknown_variance(s, l):
+    for i in range(s.theta.shape[0]):
+        s.var[i, l] = np.nan
+
+
+@kernel
+def still(s, l):
+    """Nothing changes with time."""
+
+
+@dataclass(frozen=True)
+class Descent(Tracker):
+    """A tracker of one's own: normalised gradient steps with bounded errors."""
+
+    rate: float = 0.1
+    covariance = False
+
+    def state(self, n):
+        return {"theta": np.zeros(n), "rate": self.rate, "r": 1.0, "leaks": 0, "turns": 0}
+
+    @property
+    def steps(self):
+        return TrackerSteps(still, descend, unknown_variance)
+
+
+@needs_gcc
+def test_a_tracker_of_ones_own_is_exported_like_any_other(tmp_path):
+    live, ours = agree(tmp_path, ARX(2, 2), Descent(rate=0.1), 1_000)
+    assert "r" not in [name for name in re.findall(r"tracker_real (\w+);", (tmp_path / "tracker.h").read_text())]
+    live.lane()["noise"][...] = 4.0
+    ctypes.memmove(ours.buffer, to_struct(live), ours.size)
+    assert bits(live.update(0.5, 0.3)) == bits(ours.update(0.5, [0.3]))
+    assert same_numbers(ours.state, to_struct(live))
 
 
 @kernel
@@ -258,7 +400,7 @@ def test_the_command_writes_the_same(tmp_path):
 def test_readme_and_header_say_what_there_is(tmp_path):
     export_c(ARX(2, 2), Kalman(q=1e-3, r=0.1), tmp_path)
     readme, header = (tmp_path / "README.md").read_text(), (tmp_path / "tracker.h").read_text()
-    assert "1336 bytes in double precision" in readme
+    assert "1264 bytes in double precision" in readme
     counted = re.search(r"at most\s+(\d+) multiplications, (\d+) additions and 1 division\.", readme)
     assert 60 <= int(counted[1]) <= 100  # 2.5 n^2 + 8 n or so
     assert 60 <= int(counted[2]) <= 100

@@ -12,7 +12,8 @@ import pytest
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
 from driftfit.data.known import Known
 from driftfit.data.record import Records
-from driftfit.run import fleet as fleets
+from driftfit.run import lanes
+from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program
 
 KALMAN = Kalman(q=1e-3, r=0.1)
@@ -54,7 +55,7 @@ def test_series_of_unequal_length_end_in_the_state_they_had_alone():
     length = np.random.default_rng(2).integers(1, 600, 40)
     length[:3] = 600, 256, 1  # the longest, a whole block, one sample
     records = Records(tuple(range(40)), np.arange(40) * 600, length, y.ravel(), u.reshape(-1, 1), Known.of())
-    fleet = fleets.run_fleet([Program(MODEL.bind(1), KALMAN)] * 40, records)
+    fleet = run_fleet([Program(MODEL.bind(1), KALMAN)] * 40, records)
     for key in range(40):
         assert len(fleet[key]) == length[key]
         assert_same(fleet[key], track(MODEL, KALMAN, y[key, : length[key]], u[key, : length[key]]))
@@ -141,9 +142,9 @@ def test_an_interrupt_keeps_what_is_finished(monkeypatch):
         yield next(iter(as_completed(waiting)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fleets, "ThreadPoolExecutor", SlowAfterTheFirst)
-    monkeypatch.setattr(fleets, "as_completed", interrupted)
-    monkeypatch.setattr(fleets, "cores", lambda: 1)
+    monkeypatch.setattr(lanes, "ThreadPoolExecutor", SlowAfterTheFirst)
+    monkeypatch.setattr(lanes, "as_completed", interrupted)
+    monkeypatch.setattr(lanes, "cores", lambda: 1)
     with pytest.warns(UserWarning, match=r"interrupted: \d+ of 70 series are finished"):
         fleet = track(MODEL, KALMAN, y, u, by="row")
     assert fleet.failed

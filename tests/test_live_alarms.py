@@ -29,6 +29,8 @@ def record():
 @pytest.mark.parametrize(
     ("tracker", "kind", "settings"),
     [
+        (K, "glr", {"reference": CUT}),
+        (K, "cusum", {"reference": CUT, "hold": 5}),
         (K, "band", {"reference": CUT}),
         (K, "band", {"reference": {"b1": (0.9, 1.1)}, "hold": 7}),
         (K, "innovation", {"reference": CUT, "window": 20}),
@@ -36,7 +38,7 @@ def record():
         (K, "innovation", {"window": 10, "calibrate": True}),
         (Doubtful(q=1e-4, r=0.01), "probability", {"hold": 3}),
     ],
-    ids=["band", "band given", "innovation", "innovation, no reference", "calibrated", "probability"],
+    ids=["glr", "cusum", "band", "band given", "innovation", "innovation, no reference", "calibrated", "probability"],
 )
 def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     y, u = record
@@ -61,12 +63,15 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
         if alarm.active:
             assert same(alarm.statistic, said.statistic[t]), t
             assert alarm.cause == said.cause(t)
+            now, then = alarm.change, said.change(t)
+            assert now is None or now[1:4] == then[1:4]
         begun += [t] if alarm.begun else []
         told += alarm.onsets()
     assert begun == said.onsets.tolist()
     assert [onset.sample + CUT for onset in told] == begun
     assert [onset.time for onset in told] == [float(t) for t in begun]
-    assert all(onset.statistic > onset.limit == rule.limits[rule.names.index(onset.cause)] for onset in told)
+    assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in told)
+    assert [onset.cause for onset in told] == [said.cause(t) for t in begun]
     assert alarm.onsets() == []
 
 
@@ -118,7 +123,7 @@ def test_alarms_of_several_outputs(record):
     assert all(len(one.onsets) for one in said.values())
     ahead, whole = live.forecast(3, u[:3]), track(whole.model, K, both[: CUT + 120], u[: CUT + 120]).forecast(3, u[:3])
     assert all(same(a, b) for a, b in zip(ahead, whole, strict=True))
-    with pytest.raises(ValueError, match=r"separate theta; got \['speed'\]"):
+    with pytest.raises(ValueError, match=r"by the name of their output; got \['speed'\]"):
         live.detect({"speed": rules["flow"]})
 
 
@@ -197,11 +202,13 @@ def test_a_reference_in_local_time():
     assert said.rule.low == tuple(run.theta[3 * 24 : 7 * 24].min(axis=0).tolist())
 
 
-def test_a_tracker_that_adapts_is_warned_of():
-    y, u = arx_record(200, 3)
+def test_a_tracker_that_adapts_is_judged_by_the_frozen_model():
+    y, u = arx_record(400, 3)
     run = track(ARX(2, 2), AdaptiveKalman(), y, u)
-    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"band\".*tune"):
-        run.detect("innovation")
+    with pytest.warns(UserWarning, match=r"AdaptiveKalman .* follows a fault: .*\"glr\".*tune"):
+        said = run.detect("innovation", reference=200)
+    assert said.kind == "glr"
+    assert said.rule == track(ARX(2, 2), K, y, u).detect(reference=200).rule  # the tracker gives the regressors only
     run.detect("band", reference={"b1": (0.0, 2.0)})  # warnings are errors
 
 

@@ -72,7 +72,7 @@ def test_ranked_by_change_puts_the_largest_share_first(fleet):
     path = np.tile(THETA, (T, 1))
     path[150:, 3] += 0.8
     y, u = arx_record(T, 24, theta=path)
-    said = verdicts({**fleet.runs(), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
+    said = verdicts({**dict(fleet.items()), "<4>": track(ARX(2, 2), K, y, u)}, 0.05)
     rows = said.ranked("change").rows
     assert [row.key for row in rows[:2]] == ["<4>", "<1>"]
     assert rows[0].relative == pytest.approx(2.0, abs=0.5)

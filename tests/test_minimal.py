@@ -278,7 +278,7 @@ def test_an_estimate_that_does_not_increase_is_flagged_and_predicted_with_its_en
     live = Live(SMALL, K)
     for t in range(200):
         live.update(float(s.y[t]), float(s.u[t]))
-    live._tile["theta"][0, 3, 0] = -5.0
+    live.reset(3, theta=-5.0)
     y_hat, _ = live.predict(0.3)
     assert np.isfinite(y_hat)
     assert s.y.min() - np.ptp(s.y) < y_hat < s.y.max() + np.ptp(s.y)

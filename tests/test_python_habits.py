@@ -4,6 +4,8 @@ import builtins
 import copy
 import pickle
 import re
+import subprocess
+import sys
 from multiprocessing import get_context
 
 import numpy as np
@@ -196,3 +198,19 @@ MODEL, TRACKER = "ARX(na=2, nb=2)", "Kalman(q=0.001, r=0.01)"
 def test_classes_and_swapped_arguments_are_named(call, says):
     with pytest.raises(TypeError, match=re.escape(says)):
         call()
+
+
+def test_importing_the_package_loads_nothing_that_is_needed_later():
+    later = (
+        "matplotlib",
+        "pandas",
+        "scipy.linalg",
+        "scipy.optimize",
+        "scipy.signal",
+        "scipy.special",
+        "scipy.stats",
+        "sklearn",
+    )
+    code = f"import sys, driftfit; print([name for name in {later} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -34,15 +34,17 @@ CUBIC = HammersteinWiener(1, 2, 1, input=Polynomial(3), output=Polynomial(3)).bi
 def test_no_reading_leaves_a_trace_that_is_not_a_number(tracker):
     model = model_of(tracker, ARX(2, 2).bind(1))
     found, count = failures(model, tracker, [0, 1, 2, 3, 4, 5, 7, 20], 130)
-    assert count == 432
+    assert count == 464
     assert not found
 
 
 @pytest.mark.filterwarnings("ignore:.*root mean square:UserWarning")
-@pytest.mark.parametrize("tracker", [ready(Kalman), RLS(0.98), ready(ExtendedKalman), ready(OutputError)], ids=repr)
+@pytest.mark.parametrize(
+    "tracker", [ready(Kalman), RLS(0.98), AdaptiveKalman(), ready(ExtendedKalman), ready(OutputError)], ids=repr
+)
 def test_no_power_of_a_reading_leaves_one_either(tracker):
-    """Cubes: what is read as 1e8 stands beside 1e24 in one regressor."""
+    """Cubes: what is read as 1e8 stands beside 1e24 in one regressor. At 11 the adaptive filter has not started yet."""
     values = (-1e-320, 1e-100, 1e-20, 3e4, -3e6, 1e7, 1e8, -1e10, 1e13, 1e37, -1e80, 1e308, float("nan"), float("inf"))
-    found, count = failures(CUBIC, tracker, [0, 1, 2, 3, 4, 5, 7, 20], 130, values)
-    assert count == 224
+    found, count = failures(CUBIC, tracker, [0, 1, 2, 3, 4, 5, 7, 11, 20], 130, values)
+    assert count == 252
     assert not found

@@ -24,6 +24,7 @@ from driftfit import (
     track,
     tune,
 )
+from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
 from driftfit.trackers.parts.noise_levels import OUTLIER, level_chain
@@ -217,6 +218,18 @@ def test_a_conductance_that_switches_is_followed():
     assert errors["AdaptiveKalman"] < 0.3 < errors["RLS"]
 
 
+@pytest.mark.parametrize("constant", [False, True])
+def test_a_regressor_at_zero_is_no_evidence_of_a_jump(constant):
+    rng, t = np.random.default_rng(4), np.arange(2000)
+    u, g = np.sin(np.pi * t / 25.0), np.full(2000, 0.02)  # 1e-14 where it passes zero
+    for k in range(1, 2000):
+        g[k] = 4.0 if abs(u[k]) > 0.7 or (g[k - 1] > 1.0 and u[k] * u[k - 1] > 0.0) else 0.02
+    y = g * u + 0.05 * rng.normal(size=2000)
+    run = track(Regression(1, intercept=constant), AdaptiveKalman(), y, u[:, None])
+    assert np.abs(run.theta[50:]).max() < 20.0  # 1e12 if the jump may be of any size
+    assert np.nanmax(np.abs(run.innovation[50:])) < 5.0
+
+
 def test_noise_that_grows_thirtyfold_is_followed():
     rng = np.random.default_rng(10)
     u = rng.normal(size=(T, 3))
@@ -240,6 +253,28 @@ def test_smoothed_bands_hold_where_the_truth_walks(kind):
             )
     assert 0.93 < np.mean(inside) < 0.97
     assert np.mean(better) < 0.75
+
+
+def test_a_smoothed_path_is_about_as_good_as_with_the_true_drift():
+    lost, inside = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u, theta = rng.normal(size=(2000, 3)), 1.0 + np.cumsum(0.003 * rng.normal(size=(2000, 3)), axis=0)
+        y = np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=2000)
+        path = track(MODEL, AdaptiveKalman(), y, u).smooth()
+        best = track(MODEL, Kalman(q=0.003**2, r=0.09), y, u).smooth()
+        lost.append(np.mean((path.theta - theta) ** 2) / np.mean((best.theta - theta) ** 2))
+        inside.append(np.mean(np.abs(path.theta - theta) < 1.96 * path.std))
+    assert np.mean(lost) < 1.15  # with the drift as estimated sample by sample: 1.19
+    assert np.mean(inside) > 0.91
+
+
+def test_drift_is_pooled_over_time_except_at_jumps():
+    rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
+    rate[7] = 200.0
+    steady = (np.arange(41) > 0) & (np.arange(41) != 7)
+    np.testing.assert_allclose(pooled(rate)[:, 0], np.where(steady, rate[steady].mean(), rate[:, 0]))
+    np.testing.assert_array_equal(pooled(np.zeros((3, 2))), np.zeros((3, 2)))
 
 
 def test_a_fleet_warns_once_of_what_its_series_could_not_learn():
@@ -312,13 +347,13 @@ def test_a_late_direction_enters_all_hypotheses_as_it_enters_the_kalman_filter(r
 def test_the_density_of_a_sample_is_that_of_the_mixture(step):
     """Against sums over modes and levels in numpy, and it integrates to 1 over what the next reading may be."""
     rng = np.random.default_rng(7)
-    x = rng.normal(size=(400, 2))
-    y = x @ [1.0, 0.5] + 0.1 * rng.normal(size=400)
+    x = rng.normal(size=(400, 3))
+    y = x @ [1.0, 0.5, -0.2] + 0.1 * rng.normal(size=400)
     y[200:] += x[200:, 0]
     y[300] += 5.0
     y, first = (np.round(y / step) * step, 100) if step else (y, 20)  # the quantum is known from the 100th on
-    live = Live(Regression(2), AdaptiveKalman())
-    run = track(Regression(2), AdaptiveKalman(), y, x)
+    live = Live(Regression(3), AdaptiveKalman())
+    run = track(Regression(3), AdaptiveKalman(), y, x)
     for t in range(320):
         lane = {name: np.array(value) for name, value in live.lane().items()}
         live.update(y[t], x[t])

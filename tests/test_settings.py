@@ -61,7 +61,7 @@ def test_wrong_settings_are_named(build, says):
 
 @pytest.mark.parametrize("kind", list(found().values()), ids=list(found()))
 def test_missing_settings_are_named_with_the_way_to_give_them(kind):
-    model = model_of(kind, Regression(1))
+    model = model_of(kind, ARX(2, 2))
     for run in (lambda: track(model, kind(), ONES, ONES), lambda: Live(model, kind())):
         if kind.required:
             way_out = f"{kind.__name__}({', '.join(f'{name}=...' for name in kind.required)})"

@@ -12,19 +12,12 @@ LINES, ARGUMENTS = 60, 8
 SOURCES = sorted(HOME.rglob("*.py"))
 KNOWN = {
     "engine/callback.py": ["_call"],
-    "engine/drivers.py": ["drivers"],
-    "judge/statistics/noise.py": ["_segments"],
-    "models/hammerstein_wiener/separation/least_squares.py": ["refine"],
     "models/hammerstein_wiener/trackers/output_error_steps.py": [
         "advance",
         "absorb",
         "output_error_work",
         "machine_output_error",
     ],
-    "run/fleet.py": ["_gather"],
-    "run/track_outputs.py": ["track_outputs"],
-    "smooth/parts/elimination.py": ["forwards", "backwards", "residuals"],
-    "smooth/parts/two_filters.py": ["compiled", "filters", "meet"],
     "trackers/bank/machine/framed.py": ["machine_walks", "machine_enter"],
     "trackers/parts/diffuse.py": ["machine_learn"],
 }

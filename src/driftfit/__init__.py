@@ -3,7 +3,7 @@
 from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
-from driftfit.fleets import Fleet, Outputs, OutputsFleet, Shared
+from driftfit.fleets import Fleet, Outputs, Shared
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -44,6 +44,7 @@ from driftfit.trackers.bank.results.pictures import plot_tree
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
+from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
@@ -75,6 +76,7 @@ __all__ = [
     "Functions",
     "HammersteinWiener",
     "Hybrid",
+    "InstrumentalVariables",
     "Kalman",
     "Legendre",
     "Live",
@@ -83,7 +85,6 @@ __all__ = [
     "Model",
     "OutputError",
     "Outputs",
-    "OutputsFleet",
     "PiecewiseLinear",
     "Polynomial",
     "Regression",

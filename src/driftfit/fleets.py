@@ -1,4 +1,4 @@
-"""Many results with their verbs: fleets, records of several outputs, and fleets of these."""
+"""Many results with their verbs: fleets and records of several outputs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
-from driftfit.run import fleet, outputs, result, shared_outputs, track_outputs
+from driftfit.run import fleet, many, outputs, result, shared_outputs
+from driftfit.run.live.rule import AlarmRule
 from driftfit.show.fleet_summary import FleetSummary, summarise
 from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
 from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
@@ -28,19 +30,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Judged(fleet.Many):
+class Judged(many.Many):
     """Methods of many runs with keys; see `driftfit.judge.fleet_verdict`."""
+
+    def values(self) -> Iterator[Track]:
+        """The results."""
+        return map(_public, super().values())
+
+    def items(self) -> Iterator[tuple[Hashable, Track]]:
+        """Keys and results."""
+        return ((key, _public(run)) for key, run in super().items())
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
-        return verdicts(self.runs(), level, lags, burn)
+        return verdicts(dict(self.items()), level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
         """Diagnose every run, and count how often each diagnostic is out of bounds."""
-        return diagnoses(self.runs())
+        return diagnoses(dict(self.items()))
 
     def detect(
-        self, kind: str = "band", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
+        self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
         **settings: Any,
     ) -> ManyAlarms:  # fmt: skip
         """Alarms of all runs, one false alarm in ``every`` samples of all together, and which runs had a fault.
@@ -48,7 +58,7 @@ class Judged(fleet.Many):
         ``level`` is a false discovery rate; ``reference`` is one for all runs or a mapping from every key to its own.
         Kinds and other settings are those of `driftfit.judge.alarms.detect`.
         """
-        return alarms(self.runs(), kind, every=every, level=level, reference=reference, **settings)
+        return alarms(dict(self.items()), kind, every=every, level=level, reference=reference, **settings)
 
     def report(
         self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
@@ -58,7 +68,7 @@ class Judged(fleet.Many):
 
         ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
-        text = page_of_many(self.runs(), title, self.failed, alarms, labels)
+        text = page_of_many(dict(self.items()), title, self.failed, alarms, labels)
         check_path(path).write_text(text, encoding="utf-8")
 
     def crossing(
@@ -71,7 +81,7 @@ class Judged(fleet.Many):
         within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times if the
         record has them. See `driftfit.use.crossing`.
         """
-        return crossings(self.runs(), self.by, what, below, above, horizon, u, level)
+        return crossings(dict(self.items()), self.by, what, below, above, horizon, u, level)
 
     def to_table(self, kind: str = "polars") -> Any:
         """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
@@ -93,34 +103,23 @@ class Judged(fleet.Many):
 class Fleet(fleet.Fleet, Judged, public=True):
     __doc__ = fleet.Fleet.__doc__
 
-    def __getitem__(self, key: Hashable) -> Track:
-        return _public(super().__getitem__(key))
-
-    def values(self) -> Iterator[Track]:
-        """The results."""
-        return map(_public, super().values())
-
-    def items(self) -> Iterator[tuple[Hashable, Track]]:
-        """Keys and results."""
-        return ((key, _public(run)) for key, run in super().items())
-
     def forecast(self, h: int, u: Any = None) -> polars.DataFrame:
         """The h nominal samples after the end of every series as one polars table, one row per sample.
 
-        Columns: those that identify the series, ``step`` (1 .. h), the time if the record has one, ``y_hat`` and
-        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from keys to future
+        Columns: those that identify the results, ``step`` (1 .. h), the time if the record has one, ``y_hat`` and
+        ``y_std``, and ``theta_<name>``, ``std_<name>`` of every parameter. ``u`` is a mapping from series to future
         inputs (h,) or (h, m), or one array for all; a missing key has no inputs. See `driftfit.use.forecast`.
         """
         from driftfit.show.export import forecasts_table
 
-        return forecasts_table(self.runs(), self.records.labels, h, u)
+        return forecasts_table(self, h, u)
 
     def summary(self) -> FleetSummary:
-        """Series ranked by how much their parameters moved; print it."""
+        """Results ranked by how much their parameters moved; print it."""
         return summarise(self)
 
     def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-        """Small multiples of one parameter for the series that moved most; a matplotlib figure."""
+        """Small multiples of one parameter for the results that moved most; a matplotlib figure."""
         return plot_fleet(self, which, most, level)
 
 
@@ -133,7 +132,7 @@ class Outputs(outputs.Outputs, Judged, public=True):
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> dict[str, Smoothed]:
         """The smoothed path of each output, by name; the arguments are those of `Track.smooth`."""
-        return {name: Smoothed.of(run, keep, order_by, undetermined) for name, run in self.items()}
+        return {name: Smoothed.of(self[name], keep, order_by, undetermined) for name in self.outputs}
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
@@ -167,9 +166,13 @@ class Shared(shared_outputs.Shared, public=True):
         """Diagnose the rows; see `Track.diagnose`."""
         return diagnose(self.rows)
 
-    def report(self, path: str | PathLike[str], title: str | None = None) -> None:
-        """The report on the rows; see `driftfit.show.report`."""
-        report(self.rows, path, title)
+    def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
+        """Alarms of the rows; see `Track.detect`, whose numbers of samples are numbers of rows here."""
+        return detect(self.rows, kind, **settings)
+
+    def report(self, path: str | PathLike[str], title: str | None = None, *, alarms: Alarms | None = None) -> None:
+        """The report on the rows; see `driftfit.show.report`. ``alarms`` of `detect` have a separate section."""
+        report(self.rows, path, title, alarms)
 
     def summary(self) -> SharedSummary:
         """Present parameters, and the one-step error of each output; print it."""
@@ -184,14 +187,6 @@ class Shared(shared_outputs.Shared, public=True):
         from driftfit.show.export import to_table
 
         return to_table(self, kind)
-
-
-class OutputsFleet(track_outputs.OutputsFleet, Judged, public=True):
-    __doc__ = track_outputs.OutputsFleet.__doc__
-
-    def summary(self) -> FleetSummary:
-        """Which outputs of which records moved most; printing it shows the first twenty."""
-        return summarise(self)
 
 
 def _public(run: result.Track) -> Track:

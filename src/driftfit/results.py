@@ -169,7 +169,7 @@ class Track(result.Track, public=True):
         """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""
         return system.long_run(self, at, level)
 
-    def detect(self, kind: str | AlarmRule = "band", **settings: Any) -> Alarms:
+    def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
         """Alarms at a set rate of false alarms, one in ``every`` samples; see `driftfit.judge.alarms.detect`.
 
         ``kind`` may also be the rule of another run, ``alarms.rule``.

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from contract_table import model_of, ready, unusable
+from contract_table import as_arx, model_of, ready, unusable
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from support import BAD, arx_record, damaged, same
+from support import BAD, THETA, arx_record, damaged, same
 
 from driftfit import Live, Regression, track
 from driftfit.trackers import found
@@ -89,19 +89,14 @@ def test_a_sample_of_weight_0_is_not_used(model, tracker):
     assert same(other.theta[102:], run.theta[102:]) == tracker.output_error  # whose regressors do not hold y
 
 
-def test_a_regressor_that_wakes_up_late(tracker):
+def test_a_regressor_that_wakes_up_late(model, tracker):
     """Silence before every direction was seen: exponential forgetting must not run away meanwhile."""
-    rng = np.random.default_rng(6)
-    u = np.zeros((20_000, 2))
-    u[:3, 0] = 1.0, 2.0, 1.0
-    u[-200:] = rng.standard_normal((200, 2))
-    model = model_of(tracker, Regression(2))
-    if model.m == 1:
-        u[1:, 1] = u[:-1, 0]
-    y = u @ [1.0, 2.0] + 0.01 * rng.standard_normal(len(u))
-    run = track(model, tracker, y, u[:, : model.m])
+    y, u = np.zeros((2, 20_000))
+    u[2] = 1.0  # shows two of the four directions
+    y[-200:], u[-200:] = arx_record(200, 6, noise=0.01)
+    run = track(model, tracker, y, u)
     assert np.isfinite(run.theta).all()
-    np.testing.assert_allclose(run.theta[-1, :2], [1.0, 2.0], atol=0.05)
+    np.testing.assert_allclose(as_arx(tracker, run.theta)[-1], THETA, atol=0.05)
 
 
 # Numbers whose squares span less than double precision: beyond that a covariance needs its square-root form.

@@ -36,7 +36,7 @@ def test_live_says_what_the_record_says(model, tracker, known):
     names = {"time": "time", "weights": "weight", "drift": "drift"}
     for t in range(T):
         at = {names[name]: float(value[t]) for name, value in known.items()}
-        drive = float(u[t]) if t % 2 else u[t : t + 1]  # a number, or an array: two compiled entry points
+        drive = float(u[t]) if t % 2 else u[t : t + 1]  # a number, or an array
         got = live.update(None if np.isnan(y[t]) else float(y[t]), drive, **at)
         innovation_std = np.sqrt(got[2])
         assert same(got[:2], (run.prediction[t], run.innovation[t])), t

@@ -18,8 +18,10 @@ from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.fls import FLS
 from driftfit.tracking import track
 from driftfit.tune.tune import tune
+from driftfit.tune.tuned import Tuned
 from lab.reproduce import Claim
 from lab.reproduce.fls import METHODS
+from lab.reproduce.fls.selectors import choose
 from lab.reproduce.fls.verdicts import (
     Accuracy,
     judge_accuracy,
@@ -107,9 +109,7 @@ def weights(seeds: Sequence[int]) -> Claim:
     """Section 6, end."""
     chosen, noise = {}, {}
     for name in MU:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            tuned = [tune((d := example(name, s)).model, FLS(), d.y, d.u) for s in seeds]
+        tuned = [choose(example(name, s), "ml") for s in seeds]
         chosen[name] = float(np.median([t.chosen["mu"] for t in tuned]))
         noise[name] = float(np.median([t.noise for t in tuned]))
     return judge_weights(chosen, noise["sinusoids"])
@@ -126,6 +126,7 @@ def structure() -> Claim:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             tuned = tune(d.model, FLS(), d.y, d.u, method="loo", groups="each", order_by=order)
+        assert isinstance(tuned, Tuned)  # one output
         path = track(d.model, tuned.tracker, d.y, d.u).smooth(order_by=order)
         found.append(rms((path.theta[:, 1] * lagged - lagged**2)[1:]))
     return judge_structure(*found)

@@ -56,7 +56,9 @@ def choose(d: Simulated, method: str) -> Tuned:
     """One tuning, a bound being a result here."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return tune(d.model, FLS(), d.y, d.u, method=method)
+        tuned = tune(d.model, FLS(), d.y, d.u, method=method)
+    assert isinstance(tuned, Tuned)  # one output
+    return tuned
 
 
 def on_example(name: str) -> dict[str, Choice]:

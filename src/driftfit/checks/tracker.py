@@ -20,7 +20,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.run.fleet import FEWEST
+from driftfit.run.lanes import FEWEST
 from driftfit.run.result import root_mean_square
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker

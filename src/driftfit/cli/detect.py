@@ -23,7 +23,7 @@ from driftfit.show.report import check_path
 @reads
 def detect(
     given: Given,
-    kind: Annotated[str, typer.Option(help="band, innovation or probability.")] = "band",
+    kind: Annotated[str, typer.Option(help="glr, cusum, band, innovation or probability.")] = "glr",
     every: Annotated[float, typer.Option(help="Samples in which one false alarm may begin.")] = 10_000.0,
     reference: Annotated[
         list[str] | None,

@@ -16,6 +16,7 @@ from driftfit.cli.track import Plot
 from driftfit.engine.settings import missing_settings
 from driftfit.show.parts.text import facts, table_of
 from driftfit.tune.tune import tune
+from driftfit.tune.tuned import Tuned
 
 PLACES = 5
 """Number of samples that are printed."""
@@ -36,7 +37,9 @@ def smooth(
     tracker = given.chosen_tracker()
     if missing_settings(tracker):
         with progress.status("tuning"):
-            tracker = tune(given.models()[0], tracker, **given.arrays()).tracker
+            tuned = tune(given.models()[0], tracker, **given.arrays())
+        assert isinstance(tuned, Tuned)  # `arrays` are of one output
+        tracker = tuned.tracker
     run = given.run(tracker=tracker)
     said = run.smooth()
     say(facts(("Model", repr(run.model)), ("Tracker", repr(run.tracker)), ("Samples", str(len(run)))))

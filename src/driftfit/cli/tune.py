@@ -29,12 +29,14 @@ def tune(
 ) -> None:
     """Estimate the settings that a tracker is missing: --tracker kalman estimates q and r."""
     from driftfit.tune.tune import tune as find
+    from driftfit.tune.tuned import Tuned
 
     models, shared = given.models(), groups.split(",") if groups and groups != "each" else groups
     with progress.status("tuning"):
         tuned = find(
             models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
         )
+    assert isinstance(tuned, Tuned)  # `arrays` are of one output
     told = [
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),

@@ -29,7 +29,8 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
     given = tracker.values() if isinstance(tracker, Mapping) else tracker
     listed = several and isinstance(given, Sequence | type({}.values())) and not isinstance(given, str)
     for one in given if listed else [tracker]:
-        check_role(owner, "tracker", one, Tracker)
+        for own in one.values() if several and isinstance(one, Mapping) else [one]:
+            check_role(owner, "tracker", own, Tracker)
 
 
 def check_role(owner: str, name: str, value: Any, kind: type[Settings]) -> None:

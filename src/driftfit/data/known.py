@@ -18,6 +18,8 @@ INTERVAL, NOISE, DRIFT, COMMON = 0, 1, 2, 3
 class Known:
     """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more where a tracker takes more.
 
+    Samples of several outputs have columns (T, k, ny) or (1, k, ny); `for_output` gives those of one.
+
     ``interval``, ``noise`` and ``drift`` are its first columns: nominal intervals since the sample before, factors of
     the noise variance, and factors of the drift. ``more`` (T, k - 3) is what `Tracker.beside` made.
     """
@@ -69,7 +71,7 @@ class Known:
 
     def over(self, T: int) -> Known:
         """With a row for each of T samples; not to be written to."""
-        return Known(np.broadcast_to(self.columns, (T, self.columns.shape[1])))
+        return Known(np.broadcast_to(self.columns, (T, *self.columns.shape[1:])))
 
     def changed(self, interval: Any = None, noise: Any = None) -> Known:
         """With other intervals or factors of the noise; those of a single row hold for all."""
@@ -90,4 +92,25 @@ class Known:
 
     def with_more(self, columns: Array) -> Known:
         """With what a tracker is told beside interval, noise and drift, (T, k)."""
-        return Known(np.hstack([self.common.over(len(columns)).columns, columns]))
+        common = self.common.over(len(columns)).columns
+        if common.ndim > 2:
+            columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
+        return Known(np.hstack([common, columns]))
+
+    def for_outputs(self, noise: Array) -> Known:
+        """The same for each of several outputs, which have separate factors of the noise variance (T, ny)."""
+        T, ny = noise.shape
+        columns = np.repeat(self.over(T).columns[:, :, None], ny, axis=2)
+        columns[:, NOISE] = noise
+        return Known(columns)
+
+    def for_output(self, output: int) -> Known:
+        """Of one of several outputs."""
+        return Known(self.columns[..., output])
+
+    def in_rows(self, T: int) -> Known:
+        """(T ny, k): every output as a sample; between those of one instant no time passes."""
+        ny = self.columns.shape[2]
+        columns = np.moveaxis(self.over(T).columns, 1, 2).reshape(T * ny, -1)
+        columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
+        return Known(columns)

@@ -174,12 +174,12 @@ def _in_utc(moment: Any, given: Any, zone: str | None) -> Any:
 def marked(
     keys: Sequence[Any], owner: Array, outside: Mapping[str, Array], excluded: Array
 ) -> dict[Any, dict[str, int]]:
-    """Counts by key and by reason; ``owner`` (N,) is the number of each sample's series."""
-    reasons = {f"of {name} outside its limits": flags for name, flags in outside.items()}
+    """Counts by key and by reason, from counts (N,) of each sample; ``owner`` (N,) is the number of its series."""
+    reasons = {f"of {name} outside its limits": numbers for name, numbers in outside.items()}
     reasons |= {"excluded": excluded}
     counts: dict[Any, dict[str, int]] = {}
-    for reason, flags in reasons.items():
-        found = np.bincount(owner[flags], minlength=len(keys))
+    for reason, numbers in reasons.items():
+        found = np.bincount(owner, weights=numbers, minlength=len(keys))
         for k in np.flatnonzero(found).tolist():
             counts.setdefault(keys[k], {})[reason] = int(found[k])
     return counts

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC
+from datetime import time as clock
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -63,12 +64,12 @@ PLAIN = Labels()
 
 
 def time_text(time: Any, zone: str | None) -> str:
-    """A time as text, dates in a time zone."""
+    """A time as text, dates in a time zone; midnight without a zone is the date alone."""
     if not isinstance(time, np.datetime64):
         return f"{time:g}"
     text = time.astype("datetime64[us]").item()
     if zone is None:
-        return f"{text:%Y-%m-%d %H:%M:%S}"
+        return f"{text:%Y-%m-%d}" if text.time() == clock(0) else f"{text:%Y-%m-%d %H:%M:%S}"
     return f"{text.replace(tzinfo=UTC).astimezone(ZoneInfo(zone)):%Y-%m-%d %H:%M:%S %Z}"
 
 
@@ -87,7 +88,10 @@ class Reading:
 
 @dataclass(frozen=True)
 class Record:
-    """One checked series: ``y`` (T,), ``u`` (T, m), what is ``known`` of every sample, ``time`` (T,) or None."""
+    """One checked series: ``y`` (T,), ``u`` (T, m), what is ``known`` of every sample, ``time`` (T,) or None.
+
+    ``y`` is (T, ny) for several outputs.
+    """
 
     y: Array
     u: Array
@@ -117,6 +121,8 @@ class Records:
     samples from ``first[k]`` on and is called ``keys[k]``. ``dropped`` and ``missing`` count, per key, rows that
     never became samples and numbers that were taken as missing. ``drifts`` (N, k) are
     factors of the drift for each parameter or change, until the tracker has made columns of ``known`` of them (`told`).
+    Series with several ``outputs`` have ``y`` (N, ny), ``known`` of each, and ``u`` (N, m), or (N, ny, m) if the
+    outputs share one theta (`in_rows`).
     """
 
     keys: tuple[Hashable, ...]
@@ -130,11 +136,44 @@ class Records:
     dropped: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
     drifts: Array | None = None
     missing: Mapping[Hashable, Mapping[str, int]] = field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+
+    @property
+    def ny(self) -> int:
+        """Outputs of every series."""
+        return max(len(self.outputs), 1)
 
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
         rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
         return Record(self.y, self.u, self.known, self.time, self.labels_of(k)).part(rows)
+
+    def only(self, k: int) -> Records:
+        """Series k alone; its arrays are views."""
+        one = self.part(k)
+        first, length = np.zeros(1, dtype=int), np.array([len(one)])
+        return replace(
+            self,
+            keys=self.keys[k : k + 1],
+            first=first,
+            length=length,
+            y=one.y,
+            u=one.u,
+            known=one.known,
+            time=one.time,
+        )
+
+    def in_rows(self) -> Records:
+        """Series with several outputs as series of one output, whose samples are the outputs of every instant in order.
+
+        For outputs that share one theta: correcting with one of them after the other, while no time passes, equals the
+        correction with all of them.
+        """
+        N, ny = self.y.shape
+        time = None if self.time is None else np.repeat(self.time, ny)
+        y, u = np.ascontiguousarray(self.y).ravel(), np.ascontiguousarray(self.u).reshape(N * ny, -1)
+        known, first, length = self.known.in_rows(N), self.first * ny, self.length * ny
+        return replace(self, first=first, length=length, y=y, u=u, known=known, time=time, outputs=())
 
     def told(self, model: Model, trackers: Sequence[Tracker], prob: Any = None) -> Records:
         """With what is known beside interval, noise and drift as columns of ``known``, for these trackers."""
@@ -169,7 +208,8 @@ class Records:
         found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
-            warn_of_gaps(clock, self.time, self.known.interval, self.first, reach or model.reach, zone)
+            gaps = self.known.interval.reshape(len(self.known), -1)[:, 0]
+            warn_of_gaps(clock, self.time, gaps, self.first, reach or model.reach, zone)
         return found
 
     def _restricted(self, inputs: Sequence[str], reading: Reading) -> Records:
@@ -177,15 +217,17 @@ class Records:
         if not reading.limits and not reading.exclude:
             return self
         y, u, keys = self.y.copy(), self.u.copy(), self.keys
+        N, m = len(y), u.shape[-1]
         owner = np.repeat(np.arange(len(keys)), self.length)
-        limits = Limits(reading.limits or {}, (self.labels.y,), inputs, u.shape[1])
-        out_y, out_u = limits.outside(y[:, None], u)
-        number = np.arange(len(y)) - self.first[owner]
+        limits = Limits(reading.limits or {}, self.outputs or (self.labels.y,), inputs, m)
+        out_y, out_u = limits.outside(y.reshape(N, -1), u)
+        number = np.arange(N) - self.first[owner]
         excluded = within_each(reading.exclude, keys, owner, self.time, number, self.labels.zone)
-        flags = np.hstack([out_y, out_u]) & ~excluded[:, None]
-        missing = marked(keys, owner, dict(zip(limits.names, flags.T, strict=True)), excluded)
-        y[out_y[:, 0] | excluded] = np.nan
-        u[out_u | excluded[:, None]] = np.nan
+        counts = np.hstack([out_y, out_u.reshape(N, -1, m).sum(axis=1)]) * ~excluded[:, None]
+        missing = marked(keys, owner, dict(zip(limits.names, counts.T, strict=True)), excluded)
+        y[out_y.reshape(y.shape)] = np.nan
+        u[out_u] = np.nan
+        y[excluded], u[excluded] = np.nan, np.nan
         return replace(self, y=y, u=u, missing=missing)
 
 

@@ -1,4 +1,4 @@
-"""Expressions of steps in C: names, numbers, array elements, arithmetic, and the few functions that steps call."""
+"""Expressions of steps in C: names, numbers, array elements and arithmetic."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from driftfit.embedded.unit import TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, begin_of, field, joined, lifted, number, view
-from driftfit.engine import kernel, simd
+from driftfit.embedded.values import RANK, Value, assigned, begin_of, joined, lifted, narrow, number, plain, view
 
 ARITHMETIC = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "%"}
 BITS = {ast.BitAnd: "&", ast.BitOr: "|"}
 COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
-FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_plus", simd.times: "four_times"}
 
 
 class Expressions:
-    """The part of the translator that turns expressions into values; `driftfit.embedded.statements` has the rest."""
+    """The part of the translator that turns expressions into values; calls and statements build on it."""
 
     stored: Counter[str]
     ops: list[Counter[str]]
@@ -42,7 +41,7 @@ class Expressions:
         yield
         self.lazy -= 1
 
-    def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
+    def call(self, node: ast.Call, statement: bool) -> Value:
         raise NotImplementedError
 
     def refuse(self, node: ast.AST) -> Any:
@@ -74,17 +73,27 @@ class Expressions:
         if node.attr == "data" and isinstance(node.value, ast.Attribute) and node.value.attr == "ctypes":
             array = self.value(node.value.value)
             return Value("address", begin_of(array))
+        if node.attr == "shape":
+            return Value("items", constant=[number(size) for size in self.owner(node.value)[0].shape])
         owner = self.value(node.value)
         if owner.kind == "record":
-            return field(node.attr, self.unit.record[node.attr][0])
-        if owner.kind == "array" and node.attr == "shape":
-            return Value("items", constant=[number(size) for size in owner.shape])
+            for one in (self.unit.written, self.unit.beyond):  # perhaps, by whoever receives the array
+                one.add(node.attr)
+            return self.unit.field(node.attr)
         if owner.kind == "python" and owner.constant in (np, math):
             return lifted(getattr(owner.constant, node.attr))
         return self.refuse(node)  # type: ignore[no-any-return]
 
+    def owner(self, node: ast.expr) -> tuple[Value, str]:
+        """What a bracket or ``.shape`` is applied to, and the name of the field if it is one."""
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            record = self.value(node.value)
+            if record.kind == "record":
+                return self.unit.field(node.attr), node.attr
+        return self.value(node), ""
+
     def of_subscript(self, node: ast.Subscript) -> Value:
-        owner = self.value(node.value)
+        owner, name = self.owner(node.value)
         parts = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if owner.kind == "tile":
             return Value("record", "s")
@@ -101,7 +110,14 @@ class Expressions:
             self._part(one, size) if isinstance(one, ast.Slice) else self.value(one)
             for one, size in zip(parts, owner.shape, strict=True)
         ]
-        return view(owner, index)
+        if not name:
+            return view(owner, index)
+        if isinstance(node.ctx, ast.Store) or any(isinstance(one, range) for one in index):
+            self.unit.written.add(name)
+        if any(isinstance(one, range) for one in index):
+            self.unit.beyond.add(name)
+        start = self.unit.start_of(name)
+        return view(owner, index) if start is None else number(start)
 
     def _part(self, node: ast.Slice, size: int) -> range:
         """The part of an axis that a slice selects."""
@@ -121,7 +137,7 @@ class Expressions:
             return lifted(inner)
         name, kind = self.unit.table(table.constant)
         strides = [int(np.prod(np.shape(table.constant)[axis + 1 :])) for axis in range(len(index))]
-        at = " + ".join(f"{one.text} * {stride}" for one, stride in zip(index, strides, strict=True))
+        at = " + ".join(f"({one.text} * {stride})" for one, stride in zip(index, strides, strict=True))
         most = int(np.max(table.constant)) if kind == "int" else None
         return Value(kind, f"{name}[{at}]", most=most)
 
@@ -132,6 +148,7 @@ class Expressions:
         if isinstance(node.op, ast.Not):
             return number(not value.constant) if value.known else Value("bool", f"(!{value.text})")
         if isinstance(node.op, ast.USub):
+            value = plain(value)
             return number(-value.constant) if value.known else Value(value.kind, f"(-{value.text})")
         return self.refuse(node)  # type: ignore[no-any-return]
 
@@ -141,6 +158,7 @@ class Expressions:
 
     def binary(self, operator: ast.operator, one: Value, other: Value) -> Value:
         """One operation on two numbers."""
+        one, other = plain(one), plain(other)
         kind = joined(one.kind, other.kind) if {one.kind, other.kind} <= RANK.keys() else one.kind
         if one.known and other.known and kind in RANK:
             return number(_folded(operator, one.constant, other.constant))
@@ -151,9 +169,15 @@ class Expressions:
             return self._square(one, other)
         if isinstance(operator, ast.LShift | ast.RShift):
             return _shifted(operator, one, other)
+        if type(operator) in BITS and kind == "bool" and (one.known or other.known):
+            fixed, rest = (one, other) if one.known else (other, one)
+            return rest if fixed.constant == isinstance(operator, ast.BitAnd) else fixed
         if type(operator) in BITS:
             return Value(kind, f"({one.text} {BITS[type(operator)]} {other.text})")
         sign = ARITHMETIC[type(operator)]
+        if kind == "real" and sign in "*/" and 1.0 in (other.constant, one.constant if sign == "*" else None):
+            kept = other if one.constant == 1.0 and sign == "*" else one  # a factor of one changes no bit
+            return kept if kept.kind == "real" else Value("real", _real(kept))
         if kind != "real":
             kind = "real" if isinstance(operator, ast.Div) else joined(kind, "int")
             if isinstance(operator, ast.Div):
@@ -170,6 +194,8 @@ class Expressions:
 
     def of_compare(self, node: ast.Compare) -> Value:
         values = [self.value(one) for one in (node.left, *node.comparators)]
+        if len(values) == 2 and values[0].kind == "flag" and values[1].known:
+            return _of_flag(values[0], [_compared(node.ops[0], one, values[1].constant) for one in (0.0, 1.0)])
         if all(one.known for one in values):
             truths = [
                 _compared(operator, one.constant, other.constant)
@@ -202,88 +228,10 @@ class Expressions:
             return self.value(node.body if test.constant else node.orelse)
         with self.lazily():
             one, other = self.value(node.body), self.value(node.orelse)
-        kind = joined(one.kind, other.kind)
-        return Value(kind, f"({test.text} ? {one.text} : {other.text})")
-
-    # functions
-
-    def call(self, node: ast.Call, statement: bool) -> Value:
-        """A call of another step, or of one of the functions that every step may use."""
-        if isinstance(node.func, ast.Attribute) and node.func.attr == "view":
-            return self._reinterpreted(node)
-        function = self.value(node.func).constant
-        arguments = [self.value(one) for one in node.args]
-        if function in (kernel.floats, kernel.wholes, kernel.cubes):
-            return self._at_address(arguments)
-        if function in FOUR or function is simd.reached:
-            return self._of_four(function, arguments)
-        if hasattr(function, "py_func"):
-            return self.called(function.py_func, arguments, statement)
-        return self._builtin(node, function, arguments)
-
-    def _at_address(self, arguments: list[Value]) -> Value:
-        """An array with these extents; only the first of them may be unknown."""
-        extents = [self.unit.largest if one.constant is None else int(one.constant) for one in arguments[1:]]
-        strides = [int(np.prod(extents[axis + 1 :])) for axis in range(len(extents))]
-        return Value("array", arguments[0].text, shape=tuple(extents), strides=tuple(strides))
-
-    def _builtin(self, node: ast.Call, function: Any, arguments: list[Value]) -> Value:
-        if function in (min, max):
-            made = arguments[0]
-            for one in arguments[1:]:
-                made = self._extreme(function, made, one)
-            return made
-        (one,) = arguments
-        if function is len:
-            return number(len(one.constant) if one.kind == "table" else one.shape[0])
-        if one.known and one.kind in RANK:
-            return number(function(one.constant))
-        if function is abs:
-            self.ops[-1]["add"] += 1
-            return (
-                Value("real", f"R_ABS({one.text})") if one.kind == "real" else Value(one.kind, f"whole_abs({one.text})")
-            )
-        if function in (np.sqrt, math.sqrt):
-            self.ops[-1]["square root"] += 1
-            return Value("real", f"R_SQRT({one.text})")
-        if function in (np.int64, int):
-            return Value("long", f"((int64_t){one.text})")
-        if function in (np.float64, float):
-            return Value("real", f"((real){one.text})")
-        if function is bool:
-            return Value("bool", f"({one.text} != 0)")
-        return self.refuse(node)  # type: ignore[no-any-return]
-
-    def _extreme(self, function: Any, one: Value, other: Value) -> Value:
-        """Python's rule: return the second only if it is beyond the first, which decides NaN and signed zeros."""
-        if one.known and other.known:
-            return number(function(one.constant, other.constant))
-        kind = joined(one.kind, other.kind)
-        bounds = [value.most for value in (one, other)]
-        known = [bound for bound in bounds if bound is not None]
-        most = min(known) if function is min and known else max(known) if len(known) == 2 else None
-        self.ops[-1]["compare"] += 1
-        prefix = "real_" if kind == "real" else "whole_"
-        return Value(kind, f"{prefix}{function.__name__}imum({one.text}, {other.text})", most=most)
-
-    def _reinterpreted(self, node: ast.Call) -> Value:
-        """Reinterpret the bits of a number as another type."""
-        assert isinstance(node.func, ast.Attribute)
-        inner, to = self.value(node.func.value), self.value(node.args[0]).constant
-        return (
-            Value("real", f"from_bits({inner.text})") if to is np.float64 else Value("long", f"bits_of({inner.text})")
-        )
-
-    def _of_four(self, function: Any, arguments: list[Value]) -> Value:
-        """Four numbers at once are a structure of four."""
-        self.ops[-1]["multiply" if function is simd.times else "add"] += 4
-        if function is simd.reached:
-            one, other = arguments
-            return Value("long", f"four_reached({one.text}, {other.text})", most=4)
-        if function is simd.load_four:
-            array, row, _ = arguments
-            return Value("four", f"four_at({view(array, [row, range(4)]).text})")
-        return Value("four", f"{FOUR[function]}({', '.join(one.text for one in arguments)})")
+        kind = joined(narrow(one), narrow(other))
+        if kind == "flag" and one.known and other.known and one.constant != other.constant:
+            return replace(_of_flag(test, [bool(other.constant), bool(one.constant)]), kind="flag")
+        return Value(kind, f"({test.text} ? {assigned(one, kind)} : {assigned(other, kind)})")
 
 
 def _real(value: Value) -> str:
@@ -313,7 +261,17 @@ def _folded(operator: ast.operator, one: Any, other: Any) -> Any:
     node = ast.fix_missing_locations(
         ast.Expression(ast.BinOp(ast.Name("a", ast.Load()), operator, ast.Name("b", ast.Load())))
     )
-    return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+    if isinstance(one, float) or isinstance(operator, ast.Div):  # dividing by zero is no error in a step
+        one, other = np.float64(one), np.float64(other)
+    with np.errstate(all="ignore"):
+        return eval(compile(node, "constant", "eval"), {"a": one, "b": other})
+
+
+def _of_flag(flag: Value, truths: list[bool]) -> Value:
+    """The truth value that is the first where a flag is 0, and the second where it is 1."""
+    if truths[0] == truths[1]:
+        return number(truths[0])
+    return Value("bool", flag.text if truths[1] else f"(!{flag.text})")
 
 
 def _compared(operator: ast.cmpop, one: Any, other: Any) -> bool:

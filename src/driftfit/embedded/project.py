@@ -1,4 +1,4 @@
-"""The files of an exported tracker: ``tracker.h``, ``tracker.c``, ``selftest.c`` and ``README.md``."""
+"""The files of an exported tracker: its source, a self-test, a block for Simulink and ``README.md``."""
 
 from __future__ import annotations
 
@@ -7,17 +7,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from driftfit.data.storage import fields
 from driftfit.embedded.selftest import selftest
-from driftfit.embedded.statements import translate
-from driftfit.embedded.unit import Function, Unit
-from driftfit.embedded.values import Value, number
-from driftfit.engine.drivers import drivers
-from driftfit.engine.kernel import Array
-from driftfit.models.base import Model
-from driftfit.trackers.base import Tracker
+from driftfit.embedded.simulink import SFUNCTION
+from driftfit.embedded.translation import Translation, translation
+from driftfit.embedded.unit import Unit
+from driftfit.embedded.values import assigned, number
+from driftfit.run.program import Program
 
 HEADER = """\
 /* {what}
@@ -40,9 +35,7 @@ typedef double tracker_real;
 /* theta: {names} */
 
 /* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
-   data have not told apart yet). Known of the next samples, and kept until changed: interval (nominal intervals since
-   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
-   drift). */
+   data have not told apart yet). {known} */
 typedef struct {{
 {fields}
 }} tracker_state;
@@ -69,6 +62,12 @@ void tracker_reset(tracker_state *s);
 #endif
 """
 
+KNOWN = """Known of the next samples, and kept until changed: interval (nominal intervals since
+   the sample before), noise (factor of the noise variance; INFINITY: do not use the sample) and drift (factor of the
+   drift)."""
+FIXED_RATE = """Samples come at a fixed rate and are all alike: one is left out by passing NAN,
+   not by leaving out the call."""
+
 SOURCE = """\
 /* {what}; see tracker.h. */
 #include "tracker.h"
@@ -88,6 +87,12 @@ typedef tracker_real real;
 #define R_ABS(x) fabs(x)
 #endif
 
+#if defined(__GNUC__) /* a copy of tracker_update in tracker_predict would cost code, and a call per sample */
+#define NOT_INLINED __attribute__((noinline))
+#else
+#define NOT_INLINED
+#endif
+
 """
 
 SUPPORT = {
@@ -97,34 +102,30 @@ SUPPORT = {
     "whole_maximum": "static int64_t whole_maximum(int64_t a, int64_t b) { return b > a ? b : a; }",
     "whole_abs": "static int64_t whole_abs(int64_t a) { return a < 0 ? -a : a; }",
     "real_square": "static real real_square(real a) { return a * a; }",
-    "from_bits": """#ifndef TRACKER_SINGLE
-static double from_bits(int64_t bits) {
+    "from_bits": """static double from_bits(int64_t bits) {
     union { int64_t whole; double number; } both;
     both.whole = bits;
     return both.number;
-}
-#endif""",
-    "bits_of": """#ifndef TRACKER_SINGLE
-static int64_t bits_of(double number) {
+}""",
+    "bits_of": """static int64_t bits_of(double number) {
     union { int64_t whole; double number; } both;
     both.number = number;
     return both.whole;
-}
-#endif""",
+}""",
     "four": "typedef struct { real at[4]; } four;",
     "four_of": "static four four_of(real x) { four v = {{x, x, x, x}}; return v; }",
     "four_at": "static four four_at(const real *x) { four v = {{x[0], x[1], x[2], x[3]}}; return v; }",
     "four_plus": """static four four_plus(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] + b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] + b.at[i]; }
     return a;
 }""",
     "four_times": """static four four_times(four a, four b) {
-    for (int i = 0; i < 4; i++) a.at[i] = a.at[i] * b.at[i];
+    for (int i = 0; i < 4; i++) { a.at[i] = a.at[i] * b.at[i]; }
     return a;
 }""",
     "four_reached": """static int64_t four_reached(four a, four b) {
     int64_t count = 0;
-    for (int i = 0; i < 4; i++) count += a.at[i] >= b.at[i];
+    for (int i = 0; i < 4; i++) { count += a.at[i] >= b.at[i]; }
     return count;
 }""",
 }
@@ -133,15 +134,15 @@ static int64_t bits_of(double number) {
 README = """\
 # {what}
 
-`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give.
+`tracker.h`, `tracker.c`: the tracker in C99; `selftest.c`: recorded samples and the bits that they must give;
+`tracker_sfun.c`: an S-function that makes it a Simulink block.
 
     cc -std=c99 -O2 -ffp-contract=off -o selftest tracker.c selftest.c -lm && ./selftest
 
 * Parameters: {names}.
 * State: {doubles} bytes in double precision, {singles} with `-DTRACKER_SINGLE`. No heap, no global state, no recursion.
 * An update takes at most {ops}.
-  Loops are counted at their longest, and of two branches the dearer. After the start a sample takes at most
-  {ordinary}.
+  Loops are counted at their longest, and of two branches the dearer.{ordinary}
 * From the library: `sqrt` and `fabs` where they are used; with `-DTRACKER_SINGLE` also `expf` and `logf`.
 * `-ffp-contract=off` keeps products and sums apart, which gcc in its default mode may fuse; never use `-ffast-math`.
 
@@ -158,73 +159,88 @@ for (;;) {{
 """
 
 
-def files_of(model: Model, tracker: Tracker, tile: Array, what: str) -> dict[str, str]:
+def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
     """The text of every file, by its name."""
     from driftfit import __version__
 
-    unit = Unit(tile)
-    u = Value("array", "u", shape=(model.m,), strides=(1,))
-    update = drivers(model.steps, tracker.steps_for(model)).update.function
-    entry = translate(unit, update, [Value("tile"), Value("real", "y"), u])
-    names = ", ".join(tracker.names_for(model))
+    made, m = translation(program, fixed_rate), program.model.m
+    names = ", ".join(program.names)
     header = HEADER.format(
-        what=what, version=__version__, n=len(tile["theta"][0]), m=model.m, names=names, fields=_fields(tile)
-    )
-    source = SOURCE.format(what=what) + _source(unit, entry, tile, set(model.memory()))
-    size = sum(tile[name][0].size for name in fields(tile))
-    wholes = sum(tile[name][0].size for name in fields(tile) if tile.dtype[name].base.kind == "i")
-    readme = README.format(
-        what=what, names=names, doubles=8 * size, singles=4 * size + 4 * wholes, ops=_said(entry.operations),
-        ordinary=_said(_ordinary(unit)),
+        what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made),
+        known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
-    return {"tracker.h": header, "tracker.c": source, "selftest.c": selftest(model, tracker), "README.md": readme}
+    source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps.doubts)))
+    readme = README.format(
+        what=what, names=names, doubles=made.layout(8).itemsize, singles=made.layout(4).itemsize,
+        ops=_said(made.entry.operations), ordinary=_after_the_start(made),
+    )  # fmt: skip
+    test = selftest(program.model, program.tracker)
+    return {
+        "tracker.h": header, "tracker.c": source, "selftest.c": test, "tracker_sfun.c": SFUNCTION, "README.md": readme
+    }  # fmt: skip
 
 
-def _fields(tile: Array) -> str:
+def _fields(made: Translation) -> str:
     lines = []
-    for name in fields(tile):
-        array = tile[name][0]
-        kind = "int64_t" if array.dtype.kind == "i" else "tracker_real"
-        lines.append(f"    {kind} {name}{'' if array.size == 1 else f'[{array.size}]'};")
+    for name in made.names:
+        size = made.start[name][0].size
+        lines.append(f"    {made.type_of(name)} {name}{'' if size == 1 else f'[{size}]'};")
     return "\n".join(lines)
 
 
-def _source(unit: Unit, entry: Function, tile: Array, memory: set[str]) -> str:
+def _source(made: Translation, memory: set[str]) -> str:
     """Tables, functions and the public interface."""
-    steps = "\n\n".join(function.text for function in unit.functions.values())
-    support = [text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)]
-    start = f"static const tracker_state START = {{\n{_initial(tile)}\n}};"
-    tables = [body % name for body, name in unit.tables.items()]
-    return "\n\n".join([*support, *tables, start, steps, _face(entry, tile, memory)]) + "\n"
+    steps = "\n\n".join(function.text for function in made.unit.functions.values())
+    support = _support(steps)
+    start = f"static const tracker_state START = {{\n{_initial(made)}\n}};"
+    tables = [body % name for body, name in made.unit.tables.items()]
+    return "\n\n".join([*support, *tables, start, steps, _face(made, memory)]) + "\n"
 
 
-def _initial(tile: Array) -> str:
+def _support(steps: str) -> list[str]:
+    """The functions that the steps call; those that only the double-precision build calls are not in the other."""
+    in_single = re.sub(r"^#else\n.*?^#endif", "", steps, flags=re.S | re.M)
+    used = {name: text for name, text in SUPPORT.items() if re.search(rf"\b{name}\b", steps)}
+    return [text if re.search(rf"\b{name}\b", in_single) else f"#ifndef TRACKER_SINGLE\n{text}\n#endif"
+            for name, text in used.items()]  # fmt: skip
+
+
+def _initial(made: Translation) -> str:
     lines = []
-    for name in fields(tile):
-        values = ", ".join(number(one).text for one in tile[name][0].ravel().tolist())
-        lines.append(f"    {values}," if tile[name][0].size == 1 else f"    {{{values}}},")
+    for name in made.names:
+        kind = "flag" if name in made.unit.flags else "real"
+        values = ", ".join(assigned(number(one), kind) for one in made.start[name][0].ravel().tolist())
+        lines.append(f"    {values}," if made.start[name][0].size == 1 else f"    {{{values}}},")
     return "\n".join(lines)
 
 
-def _face(entry: Function, tile: Array, memory: set[str]) -> str:
-    own = [name for name in fields(tile) if name not in memory]
+def _face(made: Translation, memory: set[str]) -> str:
     copies = []
-    for name in own:
-        size = tile[name][0].size
+    for name in made.names:
+        if name in memory:
+            continue
+        size = made.start[name][0].size
         line = f"s->{name} = START.{name};" if size == 1 else (
-            f"for (int i = 0; i < {size}; i++) s->{name}[i] = START.{name}[i];"
+            f"for (int i = 0; i < {size}; i++) {{ s->{name}[i] = START.{name}[i]; }}"
         )  # fmt: skip
         copies.append(f"    {line}")
     return "\n".join([
         "void tracker_init(tracker_state *s) {", "    *s = START;", "}", "",
-        "tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
+        "NOT_INLINED tracker_step tracker_update(tracker_state *s, tracker_real y, const tracker_real *u) {",
         "    tracker_step step;",
-        f"    {entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
+        f"    {made.entry.name}(s, y, u, &step.y_hat, &step.e, &step.variance, &step.ok);",
         "    return step;", "}", "",
         "tracker_step tracker_predict(const tracker_state *s, tracker_state *scratch, const tracker_real *u) {",
         "    *scratch = *s;", "    return tracker_update(scratch, NAN, u);", "}", "",
         "void tracker_reset(tracker_state *s) {", *copies, "}",
     ])  # fmt: skip
+
+
+def _after_the_start(made: Translation) -> str:
+    """What a sample takes after the start, if the start takes more."""
+    ordinary = _said(_ordinary(made.unit))
+    differs = ordinary != _said(made.entry.operations)
+    return f" After the start a sample takes at most\n  {ordinary}." if differs else ""
 
 
 def _ordinary(unit: Unit) -> Counter[str]:
@@ -248,8 +264,3 @@ def write(path: Path, texts: dict[str, Any]) -> None:
     path.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (path / name).write_text(text, encoding="utf-8")
-
-
-def record_bytes(tile: Array) -> bytes:
-    """The state as it is stored in the structure of the double-precision build."""
-    return b"".join(np.ascontiguousarray(tile[name][0]).tobytes() for name in fields(tile))

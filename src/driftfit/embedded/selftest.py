@@ -58,7 +58,7 @@ int main(void) {{
 }}
 """
 
-BOUND = 0.05
+BOUND = 0.001
 """Largest error of single precision, as a share of the largest result."""
 
 

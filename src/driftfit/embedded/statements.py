@@ -1,27 +1,13 @@
-"""Translate steps to C: the Python source of a compiled function, and of all that it calls, for the shapes of a record.
-
-The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
-Known integers, tables and functions become constants of the text, branches that a constant excludes are left out, and a
-function is written once for each set of shapes with which it is called. A step may use what `driftfit.engine.kernel`
-allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so the double-precision build
-gives the same bits as the compiled steps if the C compiler neither contracts nor reorders them.
-
-The number of operations is counted along the way: loops at their longest, and the more expensive of two branches.
-"""
+"""Statements of steps in C: assignments, branches, loops and returns."""
 
 from __future__ import annotations
 
 import ast
-import inspect
-import math
-import re
-import textwrap
 from collections import Counter
-from typing import Any
 
-from driftfit.embedded.expressions import Expressions
-from driftfit.embedded.unit import TYPES, Function, TranslationError, Unit
-from driftfit.embedded.values import RANK, Value, bare, begin_of, joined, lifted, renamed
+from driftfit.embedded.calls import Calls
+from driftfit.embedded.unit import TranslationError
+from driftfit.embedded.values import RANK, Value, assigned, bare, joined, lifted, narrow, plain
 
 RESERVED = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if int long register return
@@ -31,104 +17,18 @@ RESERVED = frozenset(
 """Words that cannot be names of variables or functions in C."""
 
 
-def translate(unit: Unit, source: Any, arguments: list[Value]) -> Function:
-    """The C function of a Python function for these arguments; it is translated on the first call."""
-    captured = tuple(id(cell.cell_contents) for cell in source.__closure__ or ())
-    key = (source.__code__, captured, tuple(one.key() for one in arguments))
-    if key not in unit.functions:
-        unit.names[source.__name__] += 1
-        count = unit.names[source.__name__]
-        name = f"{source.__name__.lstrip('_')}{'' if count == 1 else f'_{count}'}"
-        unit.functions[key] = Body(unit, source, arguments).function(
-            f"{name}_" if name in RESERVED or hasattr(math, name) else name
-        )
-    return unit.functions[key]
+class Statements(Calls):
+    """The part of the translator that turns statements into lines."""
 
-
-class Body(Expressions):
-    """One function during its translation."""
-
-    def __init__(self, unit: Unit, source: Any, arguments: list[Value]) -> None:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(source))).body[0]
-        if not isinstance(tree, ast.FunctionDef):
-            raise TranslationError(f"{source.__name__} is not a function of its own.")
-        super().__init__(unit, source)
-        self.tree = tree
-        self.parameters: list[str] = []
-        self.kinds: dict[str, str] = {}
-        self.returns: tuple[str, ...] = ()
-        stores = (node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
-        self.stored = Counter(stores)
-        self.given = self._parameters(arguments)
-
-    def _parameters(self, arguments: list[Value]) -> dict[str, Value]:
-        """The arguments by name; those with known values do not appear in the signature."""
-        named = {}
-        for argument, one in zip(self.tree.args.args, arguments, strict=True):
-            name = self.safe(argument.arg)
-            if one.kind in ("record", "tile"):
-                self.parameters.append("tracker_state *s")
-                named[argument.arg] = Value("record", "s") if one.kind == "record" else one
-            elif one.kind == "array":
-                constant = "const " if one.text == "u" else ""
-                self.parameters.append(f"{constant}{TYPES[one.element]} *{name}")
-                named[argument.arg] = renamed(one, name)
-            elif one.kind == "address":
-                self.parameters.append(f"real *{name}")
-                named[argument.arg] = renamed(one, name)
-            elif one.known and one.kind != "real":
-                named[argument.arg] = one
-            elif one.kind in RANK:
-                self.parameters.append(f"{TYPES[one.kind]} {name}")
-                named[argument.arg] = Value(one.kind, name, most=one.most)
-                if argument.arg in self.stored:  # a parameter that is modified
-                    self.kinds[argument.arg] = one.kind
-            else:
-                raise TranslationError(f"{self.source.__name__}: an argument of kind {one.kind}.")
-        return named
+    given: dict[str, Value]
+    kinds: dict[str, str]
+    returns: tuple[str, ...]
+    lines: list[str]
+    temporaries: int
 
     def safe(self, name: str) -> str:
         """A name that is valid for a variable in C."""
         return f"{name}_" if name in RESERVED else name
-
-    def function(self, name: str) -> Function:
-        """Translate repeatedly until the kinds of variables and of the returned value are stable."""
-        while True:
-            before = dict(self.kinds), self.returns
-            self.locals, self.ops, self.temporaries = dict(self.given), [Counter()], 0
-            self.lines: list[str] = []
-            self.block(self.tree.body)
-            if before == (self.kinds, self.returns):
-                return self._written(name)
-
-    def _written(self, name: str) -> Function:
-        outs = [f"{TYPES[kind]} *out{i}" for i, kind in enumerate(self.returns)] if len(self.returns) > 1 else []
-        result = TYPES[self.returns[0]] if len(self.returns) == 1 else "void"
-        signature = f"static {result} {name}({', '.join([*self.parameters, *outs]) or 'void'})"
-        taken = {parameter.split("*")[-1].split()[-1] for parameter in self.parameters}
-        own = {self.safe(one): kind for one, kind in self.kinds.items() if self.safe(one) not in taken}
-        declared = [f"    {TYPES[kind]} {one};" for one, kind in own.items()]
-        unread = [f"    (void){one};" for one in [*sorted(taken), *own] if not self._reads(one)]
-        said = (ast.get_docstring(self.tree) or "").split("\n")[0]
-        comment = [f"/* {said} */"] if said else []
-        text = "\n".join([*comment, f"{signature} {{", *declared, *unread, *self.lines, "}"])
-        if ".view(" in ast.unparse(self.tree):
-            text = self._of_doubles(name, text)
-        return Function(name, self.returns, text, self.ops[0])
-
-    def _of_doubles(self, name: str, text: str) -> str:
-        """A function that works on the bits of doubles; single precision uses that of the C library, for speed."""
-        if self.source.__name__ not in ("exp", "log"):
-            raise TranslationError(f"{self.source.__qualname__}: only exp and log may work on the bits of numbers.")
-        text = re.sub(r"\breal\b", "double", re.sub(r"\bR\(", "(", text))
-        short = f"static real {name}(real x) {{ return {self.source.__name__}f(x); }}"
-        return f"#ifdef TRACKER_SINGLE\n{short}\n#else\n{text}\n#endif"
-
-    def _reads(self, name: str) -> bool:
-        """Whether a variable is used anywhere except on the left of an assignment."""
-        return any(re.search(rf"\b{name}\b", re.sub(rf"^\s*{name} = ", "", line)) for line in self.lines)
-
-    # statements
 
     def line(self, text: str) -> None:
         self.lines.append(f"{'    ' * len(self.ops)}{text}")
@@ -185,8 +85,16 @@ class Body(Expressions):
         elif isinstance(target, ast.Name):
             self.assign_name(target.id, value)
         else:
-            self.line(f"{self.value(target).text} = {value.text};")
-            self.ops[-1]["store"] += 1
+            self.store(target, value)
+
+    def store(self, target: ast.expr, value: Value) -> None:
+        """Assign a number to an element of an array."""
+        place = self.value(target)
+        if place.kind == "flag" and narrow(value) not in ("bool", "flag"):
+            assert isinstance(target, ast.Subscript)
+            self.unit.beyond.add(self.owner(target.value)[1])
+        self.line(f"{place.text} = {assigned(value, place.kind)};")
+        self.ops[-1]["store"] += 1
 
     def held(self, value: Value) -> Value:
         """Store a value in a separate variable, so that a later assignment does not change it."""
@@ -201,19 +109,22 @@ class Body(Expressions):
         if value.kind not in RANK or (fixed and value.known):
             self.locals[name] = value
             return
-        self.kinds[name] = joined(value.kind, self.kinds.get(name, "bool"))
+        self.kinds[name] = joined(narrow(value), self.kinds.get(name, "bool"))
         most = value.most if fixed else None
-        self.locals[name] = Value(self.kinds[name], self.safe(name), most=most)
-        self.line(f"{self.safe(name)} = {value.text};")
+        whole = value.known and self.kinds[name] != "real"
+        self.locals[name] = value if whole else Value(self.kinds[name], self.safe(name), most=most)
+        if value.text != self.safe(name):
+            self.line(f"{self.safe(name)} = {assigned(value, self.kinds[name])};")
+
+    def forget(self, node: ast.stmt) -> None:
+        """The values of variables that a statement with branches or turns may have changed are not known after it."""
+        for name in {one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)}:
+            if name in self.kinds and name in self.locals and self.locals[name].known:
+                self.locals[name] = Value(self.kinds[name], self.safe(name))
 
     def on_augassign(self, node: ast.AugAssign) -> None:
         target = self.value(node.target)
-        value = self.binary(node.op, target, self.value(node.value))
-        if isinstance(node.target, ast.Name):
-            self.assign_name(node.target.id, value)
-        else:
-            self.line(f"{target.text} = {value.text};")
-            self.ops[-1]["store"] += 1
+        self.assign(node.target, self.binary(node.op, target, self.value(node.value)))
 
     def on_if(self, node: ast.If) -> bool:
         test = self.value(node.test)
@@ -221,10 +132,12 @@ class Body(Expressions):
             return self.block(node.body if test.constant else node.orelse)
         self.line(f"if ({bare(test.text)}) {{")
         one, ended = self.nested(node.body)
+        self.forget(node)
         other, other_ended = Counter[str](), False
         if node.orelse:
             self.line("} else {")
             other, other_ended = self.nested(node.orelse)
+            self.forget(node)
         self.line("}")
         self.ops[-1] += one if one.total() >= other.total() else other
         return ended and other_ended
@@ -246,12 +159,14 @@ class Body(Expressions):
         top = self.largest(high)
         turns = max(0, top - (low.constant if low.known else 0))
         turns = -(-turns // abs(step))
-        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         sign = "<" if step > 0 else ">"
         move = f"{name}++" if step == 1 else f"{name}--" if step == -1 else f"{name} += {step}"
         bound = f"(int)({stop.text})" if stop.kind == "long" else stop.text
+        self.forget(node)
+        self.locals[node.target.id] = Value("int", name, most=top - 1 if step > 0 else top)
         self.line(f"for (int {name} = {start.text}; {name} {sign} {bound}; {move}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
 
@@ -260,10 +175,12 @@ class Body(Expressions):
         return value.most if value.most is not None else self.unit.largest
 
     def on_while(self, node: ast.While) -> None:
+        self.forget(node)
         with self.lazily():
             test = self.value(node.test)
         self.line(f"while ({bare(test.text)}) {{")
         ops, _ = self.nested(node.body)
+        self.forget(node)
         self.line("}")
         turns = self.unit.largest
         self.ops[-1] += Counter({kind: count * turns for kind, count in ops.items()})
@@ -273,7 +190,7 @@ class Body(Expressions):
             self.line("return;")
             return True
         value = self.value(node.value)
-        items = value.constant if value.kind == "items" else [value]
+        items = [plain(one) for one in (value.constant if value.kind == "items" else [value])]
         kinds = tuple(one.kind for one in items)
         self.returns = tuple(map(joined, kinds, self.returns)) if self.returns else kinds
         if len(items) == 1:
@@ -284,36 +201,8 @@ class Body(Expressions):
             self.line("return;")
         return True
 
-    # calls of other steps
-
-    def called(self, source: Any, arguments: list[Value], statement: bool) -> Value:
-        """A call; its result is stored in a variable before the statement that uses it."""
-        function = translate(self.unit, source, arguments)
-        self.ops[-1] += function.operations
-        passed = [text for one in arguments if (text := _passed(one))]
-        if len(function.returns) > 1:
-            names = [self.temporary(kind) for kind in function.returns]
-            self.line(f"{function.name}({', '.join([*passed, *(f'&{name}' for name in names)])});")
-            pairs = zip(function.returns, names, strict=True)
-            return Value("items", constant=[Value(kind, name) for kind, name in pairs])
-        text = f"{function.name}({', '.join(passed)})"
-        if not function.returns:
-            return Value("nothing", text)
-        if self.lazy or statement:
-            return Value(function.returns[0], text)
-        return self.held(Value(function.returns[0], text))
-
     def temporary(self, kind: str) -> str:
         self.temporaries += 1
         name = f"t{self.temporaries}"
         self.kinds[name] = joined(kind, self.kinds.get(name, "bool"))
         return name
-
-
-def _passed(value: Value) -> str:
-    """The expression passed for an argument; nothing if its value is known."""
-    if value.kind in ("record", "tile"):
-        return "s"
-    if value.kind in ("array", "address"):
-        return begin_of(value)
-    return "" if value.known and value.kind != "real" else value.text

@@ -2,6 +2,7 @@
 
 real    a floating-point number: double, or float if the source is compiled for it
 int     an integer from a loop or a constant; long, a 64-bit integer from the record; bool, a truth value
+flag    a floating-point number that is 0 or 1, which C keeps as an int: comparing doubles in software is slow
 record  the state; tile, an array of one state
 array   numbers in memory: their start, their shape, and the stride of every axis
 address the address of the first number of an array
@@ -19,7 +20,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 
-RANK = {"bool": 0, "int": 1, "long": 2, "real": 3, "four": 4}
+RANK = {"bool": 0, "flag": 1, "int": 2, "long": 3, "real": 4, "four": 5}
 """Kinds of numbers, from narrow to wide."""
 
 BIGGEST_SINGLE, SMALLEST_SINGLE = 1e18, 1e-30
@@ -77,7 +78,26 @@ def literal(x: float) -> str:
 
 def joined(*kinds: str) -> str:
     """The kind of number that can represent all of these."""
-    return max(kinds, key=lambda kind: RANK[kind])
+    widest = max(kinds, key=lambda kind: RANK[kind])
+    return "real" if "flag" in kinds and widest in ("int", "long") else widest
+
+
+def narrow(value: Value) -> str:
+    """The kind of a value, with constants that are a floating-point 0 or 1 among the flags."""
+    unit = value.kind == "real" and value.known and (value.constant == 1.0 or literal(value.constant) == "R(0.0)")
+    return "flag" if unit else value.kind
+
+
+def plain(value: Value) -> Value:
+    """A flag as the floating-point number that it is; other values as they are."""
+    return Value("real", f"({value.text} ? R(1.0) : R(0.0))") if value.kind == "flag" else value
+
+
+def assigned(value: Value, kind: str) -> str:
+    """The text of a value that is assigned to something of this kind."""
+    if kind == "flag" and narrow(value) == "flag":
+        return str(int(value.constant)) if value.known else value.text
+    return plain(value).text
 
 
 def lifted(value: Any) -> Value:
@@ -89,9 +109,9 @@ def lifted(value: Any) -> Value:
     return Value("python", constant=value)
 
 
-def field(name: str, array: Array) -> Value:
+def field(name: str, array: Array, flag: bool = False) -> Value:
     """A field of the record, whose last axis is the only lane."""
-    element = "long" if array.dtype.kind == "i" else "real"
+    element = "long" if array.dtype.kind == "i" else "flag" if flag else "real"
     return Value("array", f"s->{name}", shape=array.shape, strides=_strides(array.shape), element=element,
                  scalar=array.size == 1)  # fmt: skip
 
@@ -113,7 +133,7 @@ def view(array: Value, index: Sequence[Value | range]) -> Value:
                 offset.append(str(one.start * stride))
         elif one.constant != 0:
             offset.append(one.text if stride == 1 else f"{one.text} * {stride}")
-    at = " + ".join(offset)
+    at = " + ".join(f"({one})" if " * " in one and len(offset) > 1 else one for one in offset)
     if shape:
         begin = f"({begin_of(array)} + {at})" if at else begin_of(array)
         return Value("array", begin, shape=tuple(shape), strides=tuple(strides), element=array.element)

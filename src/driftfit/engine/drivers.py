@@ -18,7 +18,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numba
@@ -109,10 +109,11 @@ class TrackerSteps(NamedTuple):
     happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
     ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
     that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's ``outputs`` name from the record
-    ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user knows of a sample beside interval,
-    noise and drift from the columns of ``known`` after the third, where there are some. ``note(o, s, l)`` copies what
-    the tracker's ``noted`` names when a run is replayed for a smoother.
+    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
+    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
+    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
+    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -123,6 +124,8 @@ class TrackerSteps(NamedTuple):
     told: Any = nothing_told
     note: Any = nothing_more
     machines: tuple[Any, ...] = ()
+    instead: tuple[tuple[Any, Any], ...] = ()
+    doubts: bool = False
 
 
 def _common(n: int, m: int) -> dict[str, Any]:
@@ -203,6 +206,19 @@ class Drivers(NamedTuple):
     update: Any
     update_one: Any
 
+    def updater(self, tile: Array, m: int) -> Any:
+        """The entry point for one sample of tiles of this type: ``f(tile, y, u)``, u as `one_or_all` gives it.
+
+        A number is read faster than an array, and a model of one input needs no second routine for arrays.
+        """
+        update, u = (self.update_one, types.float64) if m == 1 else (self.update, INPUTS)
+        return update.entry(tile_type(tile), types.float64, u)
+
+
+def one_or_all(u: Array) -> Any:
+    """The inputs (m,) of a sample as the step of a stream takes them: a number if m is 1, an array otherwise."""
+    return u.item() if u.size == 1 else u
+
 
 def _advance(tracker: TrackerSteps) -> Any:
     """predict, correct, report for all lanes of a tile; lanes in square-root form take ``begin`` instead."""
@@ -249,16 +265,30 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
     every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
-    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u; both take what is known from
-    the fields ``interval``, ``noise`` and ``drift`` of the record, and return (y_hat, e, s, ok).
+    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
+    take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     regress, push, ready = model
     ready(1)
     for machine in tracker.machines:
         machine.load()
-    told = tracker.told
-    store, keep_more = tracker.store, covariance if keep == "cov" else nothing_more
-    advance = _advance(tracker)
+    driver = partial(Driver, instead=tracker.instead)
+    sample = _sample(regress, push, _advance(tracker))
+    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+
+    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        inputs = {"y": y, "u": u, "known": known}
+        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
+        _check_shapes(tile, len(out), **inputs)
+        ready(tile["theta"].shape[2])
+        run(tile, *inputs.values(), out)
+
+    return Drivers(checked, *_updates(driver, sample))
+
+
+def _sample(regress: Step, push: Step, advance: Any) -> Any:
+    """One sample of all lanes, whose signals and known factors are in the record."""
 
     @kernel
     def sample(s: State) -> None:
@@ -275,7 +305,13 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
             s.s[l] = v if valid else np.nan
             s.e[l] = e if s.ok[l] > 0.0 else np.nan
 
-    @Driver
+    return sample
+
+
+def _run(driver: Any, sample: Any, told: Any, store: Any, keep_more: Any) -> Any:
+    """The loop over the samples of a record."""
+
+    @driver
     def run(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         s = tile[0]
         n, L = s.theta.shape
@@ -312,7 +348,13 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
                 store(o, s, l)
                 keep_more(o, s, l)
 
-    @Driver
+    return run
+
+
+def _updates(driver: Any, sample: Any) -> tuple[Any, Any]:
+    """One sample of a stream, with an array of inputs and with a single one."""
+
+    @driver
     def update(tile: Array, y: float, u: Array) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -322,7 +364,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    @Driver
+    @driver
     def update_one(tile: Array, y: float, u: float) -> tuple[float, float, float, bool]:
         s = tile[0]
         s.y[0] = y
@@ -331,15 +373,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         sample(s)
         return s.y_hat[0], s.e[0], s.s[0], s.ok[0] > 0.0
 
-    def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
-        ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
-
-    return Drivers(checked, update, update_one)
+    return update, update_one
 
 
 def _check_shapes(tile: Array, T: int, y: Array, u: Array, known: Array) -> None:

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+LOAD_GLOBAL = dis.opmap["LOAD_GLOBAL"]
+
 
 def identity(function: FunctionType) -> str:
     """A name for a function that changes when its code, or anything that it uses, changes.
@@ -41,8 +43,16 @@ def used_globals(function: FunctionType) -> dict[str, Any]:
 
 
 def _globals(code: CodeType) -> set[str]:
-    """Global names that code reads, also in the functions and comprehensions inside it; not those of attributes."""
-    names = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
+    """Global names that code reads, also in the functions and comprehensions inside it; not those of attributes.
+
+    `dis.get_instructions` gives the same, and took a third of the time of importing the package.
+    """
+    names, extended = set(), 0
+    for operation, argument in zip(code.co_code[::2], code.co_code[1::2], strict=True):
+        argument |= extended << 8
+        if operation == LOAD_GLOBAL:
+            names.add(code.co_names[argument >> 1])
+        extended = argument if operation == dis.EXTENDED_ARG else 0
     return names.union(*(_globals(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 

@@ -21,7 +21,7 @@ import hashlib
 import math
 import os
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Lock
 from types import FunctionType
 from typing import Any
@@ -189,9 +189,13 @@ class Driver:
     (`MOST_ENTRIES`); one that is needed again comes back from disk in milliseconds.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], instead: Sequence[tuple[Machine, Machine]] = ()) -> None:
+        """``instead``: machines that the function calls, each with the one that is called in its place. The code on
+        disk is the same for all of them.
+        """
         assert isinstance(function, FunctionType)
         self.function = function
+        self._instead = {called.symbol: other.symbol for called, other in instead}
         self._identity = identity(function)
         self._entries: dict[Any, Any] = {}
 
@@ -231,7 +235,7 @@ class Driver:
             if code.lasting:
                 disk_cache.write(name, tuple(code))
             internals.forget(KEPT)
-        return internals.load(internals.Code(*code))
+        return internals.load(internals.Code(*code), self._instead)
 
     def let_go(self, found: Any) -> None:
         """Forget an entry point; who holds it may go on using it."""

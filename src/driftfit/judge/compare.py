@@ -58,14 +58,14 @@ class Errors(NamedTuple):
     scored: Array
 
 
-def errors(run: Track, burn: int | None = None) -> Errors:
+def errors(run: Track, burn: int | None = None, steady: Array | None = None) -> Errors:
     """One-step errors of a run, of persistence, of constants without and with lags, and of constant ARX.
 
     Where lags are missing, the constants without lags predict. The first ``burn`` samples are not scored; by default
-    max(50, 5 n).
+    max(50, 5 n). ``steady`` are the constants of the run, if they are known.
     """
     y, u = np.where(np.abs(run.y) < LARGEST, run.y, np.nan), run.u
-    steady = constant_least_squares(run.model, run.record)
+    steady = constant_least_squares(run.model, run.record) if steady is None else steady
     gaps = run.known.interval
     known = run.known.changed(interval=np.where(gaps > 0.0, gaps, 1.0), noise=1.0)  # 0 before the lags were filled
     small = ARX(2, 1 if u.shape[1] else 0, inputs=u.shape[1], intercept=True)

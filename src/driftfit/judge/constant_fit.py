@@ -11,15 +11,16 @@ routine on the arrays of one lane, compiled once for all models. Cost per sample
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from driftfit.data.record import Record
-from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, unknown
+from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, repeat_tile, unknown
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 
 FLAT = 1e-11
 """A diagonal entry below this share of its column counts as zero."""
@@ -71,16 +72,22 @@ def learn(s: State, l: int) -> None:
 STEPS = TrackerSteps(stay, learn, unknown, None, collect)
 
 
+@lru_cache(64)
+def _start(model: Model) -> Array:
+    """The tile of a model before its first sample."""
+    n = model.n
+    state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
+    return make_tile(n, model.m, model.memory(), [state])
+
+
 def constant_least_squares(model: Model, record: Record) -> Array:
     """Fit constants over a record; return (T,) records of phi, y, dt, valid, e, ok and more.
 
     Missing lags are replaced by the predictions of these constants.
     """
-    n = model.n
-    state = {"theta": np.zeros(n), "R": np.zeros((n, n + 1)), "row": np.zeros(n + 1), "size": np.zeros(n), "used": 0.0}
-    tile = make_tile(n, model.m, model.memory(), [state])
+    tile = repeat_tile(_start(model), 1)
     out = np.empty(len(record), output_type(tile, COLLECTED))
-    drivers(model.steps, STEPS).run(tile, *lane_of(replace(record, known=record.known.common)), out)
+    drivers(model.steps, STEPS).run(tile, *lanes_of(replace(record, known=record.known.common)), out)
     return out
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.excitation import Excitation
@@ -97,7 +97,7 @@ def _levels(axis: Axes, said: Health) -> None:
 def _quantiles(axis: Axes, said: Health) -> None:
     z = np.sort(said.z[np.isfinite(said.z)])
     if len(z):
-        normal = special.ndtri((np.arange(len(z)) + 0.5) / len(z))
+        normal = scipy.special.ndtri((np.arange(len(z)) + 0.5) / len(z))
         axis.plot(normal, normal, color=GREY, lw=0.9)
         axis.plot(normal, np.clip(z, -12.0, 12.0), ls="", marker=".", ms=3.0, color=BLUE)
     axis.set_xlabel("normal quantile", fontsize=9)

@@ -22,9 +22,9 @@ class Rows(NamedTuple):
     """(N,)"""
 
 
-def regressors(run: Track) -> Rows:
-    """The record as samples of a regression for the model of a run."""
-    out = constant_least_squares(run.model, run.record)
+def regressors(run: Track, steady: Array | None = None) -> Rows:
+    """The record as samples of a regression for the model of a run; ``steady`` are its constants, if they are known."""
+    out = constant_least_squares(run.model, run.record) if steady is None else steady
     at = np.flatnonzero(out["ok"][:, 0] > 0.0)
     noise = run.known.part(at).noise
     root = 1.0 / np.sqrt(noise)

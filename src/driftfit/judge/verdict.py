@@ -34,6 +34,7 @@ from rich.text import Text
 
 from driftfit.engine.settings import whole
 from driftfit.judge.compare import errors
+from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.judge.regressors import Rows, regressors
 from driftfit.judge.statistics.attribution import Attribution, alike, attribute
 from driftfit.judge.statistics.constancy import Constancy, constancy, least_rows
@@ -282,13 +283,15 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
         if given is not None:
             whole("verdict", name, given, 0)
     burn = burn_in(run.model.n) if burn is None else burn
-    rows = regressors(run)
+    steady = constant_least_squares(run.model, run.record)
+    rows = regressors(run, steady)
     test = constancy(rows.phi, rows.y, lags)
     drifts = None if np.isnan(test.p_joint) else bool(test.p_joint < level)
     steps = attribute(rows.phi, rows.y, test, level, lags) if drifts else None
-    moved = tuple(_moved(run, rows, test, steps, i) for i in range(len(test.p)))
+    names = enumerate(run.model.names)
+    moved = tuple(_moved(run, rows, test, steps, (i, name)) for i, name in names)
     at, similar = alike(rows.phi, test) if drifts and not any(m.moves for m in moved) else (0, ())
-    own, *others, scored = errors(run, burn)
+    own, *others, scored = errors(run, burn, steady)
     rivals = tuple(paired(name, error[scored], own[scored]) for name, error in zip(RIVALS, others, strict=True))
     return Verdict(
         drifts=drifts,
@@ -309,7 +312,8 @@ def verdict(run: Track, level: float = 0.05, lags: int | None = None, burn: int 
     )
 
 
-def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i: int) -> Moved:
+def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, which: tuple[int, str]) -> Moved:
+    i, name = which
     at, own = int(test.at[i]), float(test.p_own[i])
     before = after = std = last = np.nan
     named = steps is not None and bool(steps.moves[i])
@@ -322,4 +326,4 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, i
     sample, *span = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
-    return Moved(run.model.names[i], L, p, own, named, sample, when, before, after, std, last, *span)
+    return Moved(name, L, p, own, named, sample, when, before, after, std, last, *span)

@@ -15,8 +15,9 @@ Several outputs (``ny=2``) have a regression each, all on the same regressors, a
 
     phi_t = [y1_{t-1} .. y1_{t-na}, y2_{t-1} .., u1_{t-nk} .., (1)],   yo_t = phi_t' theta_o,t + v_o,t
 
-The outputs are lanes of one tile, so every tracker runs unchanged. Each lane keeps a copy of the lags of all outputs,
-which ``push`` fills from ``y`` of the other lanes, or from their predictions where y is missing.
+The outputs are lanes of one tile, so every tracker runs unchanged: of G series, lane o G + g is output o of series g.
+Each lane keeps a copy of the lags of all outputs of its series, which ``push`` fills from ``y`` of the other lanes, or
+from their predictions where y is missing.
 
 Source: Ljung, System Identification (1999), eq. 4.7; the filling rule is ours. Cost per sample: O(na + nb), and
 O(ny (ny na + nb)) for the lags of several outputs.
@@ -35,6 +36,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import input_names, one_of, output_names, whole
 from driftfit.models.base import Model
+from driftfit.models.doubted_lags import doubted, no_doubts, shift_doubts
 
 GAP = 1.5
 """Intervals longer than this many nominal ones break the lags."""
@@ -177,6 +179,12 @@ class ARX(Model):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
 
+    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
+        return {**self.memory(), **no_doubts(len(self.outputs), self.na)} if doubts and self.na > 0 else self.memory()
+
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        return _steps(self.na, self.lags, self.intercept, True) if doubts and self.na > 0 else self.steps
+
     @property
     def apply(self) -> Step | None:
         return take_input if all(nk > 0 for _, nk in self.lags) else None
@@ -237,7 +245,7 @@ def take_input(s: State, l: int) -> None:
 
 
 @lru_cache
-def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> ModelSteps:
+def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, doubts: bool = False) -> ModelSteps:
     """The steps for one set of orders, which are constants, so that every loop is unrolled."""
     m = len(lags)
     # without inputs the loops over them never run, but Numba cannot type an empty tuple
@@ -254,7 +262,7 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
             lag = s.y_lag[i, l]
             lag = np.nan if broken else lag
             s.y_lag[i, l] = lag
-            s.phi[i, l] = lag
+            s.phi[i, l] = doubted(s, 0, i, l, lag) if doubts else lag
         for j in range(m):
             # the present input has position 0, so lag k is entry k, and nk = 0 needs no special case
             for i in range(depth - 1, 0, -1):
@@ -275,6 +283,8 @@ def _steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool) -> Model
 
     @kernel
     def push(s: State, l: int) -> None:
+        if doubts:
+            shift_doubts(s, 0, l, l, l, 1, 1)
         for i in range(na - 1, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
         # a prediction of infinite variance carries no information (a diffuse start) and must not become a lag
@@ -325,6 +335,10 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
 
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        doubts = doubts and self.na > 0
+        return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs), doubts)
+
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         raise ValueError("simulate: the outputs of a joint ARX feed each other; one alone cannot be run forward.")
 
@@ -333,7 +347,9 @@ class JointARX(ARX):
 
 
 @lru_cache
-def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int) -> ModelSteps:
+def _joint_steps(
+    na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny: int, doubts: bool = False
+) -> ModelSteps:
     m = len(lags)
     nb = tuple(b for b, _ in lags) or (0,)
     nk = tuple(k for _, k in lags) or (0,)
@@ -347,7 +363,7 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
         for o in range(ny):
             for i in range(na):
                 s.y_lag[o, i, l] = np.nan if broken else s.y_lag[o, i, l]
-                s.phi[o * na + i, l] = s.y_lag[o, i, l]
+                s.phi[o * na + i, l] = doubted(s, o, i, l, s.y_lag[o, i, l]) if doubts else s.y_lag[o, i, l]
         for j in range(m):
             for i in range(depth - 1, 0, -1):
                 s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
@@ -364,13 +380,17 @@ def _joint_steps(na: int, lags: tuple[tuple[int, int], ...], intercept: bool, ny
 
     @kernel
     def push(s: State, l: int) -> None:
-        for o in range(ny):  # lane o belongs to output o
+        series = s.y.shape[0] // ny
+        for o in range(ny):
+            lane = o * series + l % series  # of output o of the same series
+            if doubts:
+                shift_doubts(s, o, l, lane, l % series, series, ny)
             for i in range(na - 1, 0, -1):
                 s.y_lag[o, i, l] = s.y_lag[o, i - 1, l]
-            informed = (s.s[o] != np.inf) | (s.noise[o] == np.inf)
-            fill = s.y_hat[o] if s.valid[o] > 0.0 and informed and s.filled[o, l] < na else np.nan
-            s.filled[o, l] = 0.0 if s.seen[o] > 0.0 else s.filled[o, l] + 1.0
+            informed = (s.s[lane] != np.inf) | (s.noise[lane] == np.inf)
+            fill = s.y_hat[lane] if s.valid[lane] > 0.0 and informed and s.filled[o, l] < na else np.nan
+            s.filled[o, l] = 0.0 if s.seen[lane] > 0.0 else s.filled[o, l] + 1.0
             if na > 0:
-                s.y_lag[o, 0, l] = s.y[o] if s.seen[o] > 0.0 else fill
+                s.y_lag[o, 0, l] = s.y[lane] if s.seen[lane] > 0.0 else fill
 
     return ModelSteps(regress, push)

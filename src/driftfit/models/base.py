@@ -90,6 +90,14 @@ class Model(Settings, ABC):
     def steps(self) -> ModelSteps:
         """The compiled ``regress`` and ``push``."""
 
+    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
+        """`memory` with a tracker that says which readings it took for outliers (`TrackerSteps.doubts`), or without."""
+        return self.memory()
+
+    def steps_for(self, doubts: bool) -> ModelSteps:
+        """`steps` with such a tracker, or without."""
+        return self.steps
+
     @property
     def apply(self) -> Step | None:
         """The compiled step that stores the input of a sample, ``s.u``, after the sample has been processed.
@@ -126,7 +134,7 @@ class Model(Settings, ABC):
     def output_lags(self) -> int | None:
         """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
 
-        None where past outputs stand elsewhere, or in functions of theirs.
+        None where past outputs stand elsewhere, or in functions of theirs; 0 where there are none.
         """
         return None
 

@@ -95,6 +95,10 @@ class Regression(Model):
     def dimensions(self) -> tuple[tuple[int, int | None], ...]:
         return (*((1, j) for j in range(self.m)), *([(1, None)] if self.intercept else []))
 
+    @property
+    def output_lags(self) -> int:
+        return 0
+
     def memory(self) -> Mapping[str, Any]:
         return {}
 

@@ -10,26 +10,21 @@ that the joint run used, with all methods of a Track.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
 from functools import cached_property
-from os import PathLike
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from driftfit.data import storage
-from driftfit.data.known import Known
-from driftfit.data.record import Labels, Record
+from driftfit.data.record import Record
 from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
-from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.fleet import Many
-from driftfit.run.output_lanes import shown
-from driftfit.run.program import Program, State, state_of, tile_of
+from driftfit.run.many import Many
+from driftfit.run.program import Program, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -51,22 +46,24 @@ class Outputs(Many):
         The tracker of each output.
     """
 
-    def __init__(
-        self, programs: Sequence[Program], record: Record, out: Array, tile: Array, starts: Sequence[State] = ()
-    ) -> None:
-        self.programs, self.record, self.starts = tuple(programs), record, tuple(starts)
-        self._out, self._tile = out, tile
-        self.failed = {}
-        self.outputs = self.model.outputs
-        self.names = tuple(one.names for one in self.programs)
+    _kind = "outputs of a record"
+
+    @cached_property
+    def record(self) -> Record:
+        """The record, y (T, ny)."""
+        return self.records.part(0)
 
     @property
-    def model(self) -> Model:
-        return self.programs[0].model
+    def outputs(self) -> tuple[str, ...]:
+        return self.records.outputs
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        return tuple(one.names for one in self._programs)
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
-        return tuple(one.tracker for one in self.programs)
+        return tuple(one.tracker for one in self._programs)
 
     @property
     def y(self) -> Array:
@@ -77,10 +74,6 @@ class Outputs(Many):
         return self.record.u
 
     @property
-    def labels(self) -> Labels:
-        return self.record.labels
-
-    @property
     def timed(self) -> bool:
         """Whether samples have times; otherwise `time` numbers them."""
         return self.record.time is not None
@@ -88,6 +81,9 @@ class Outputs(Many):
     @property
     def by(self) -> tuple[str, ...]:
         return ("output",)
+
+    def _named(self) -> Sequence[Hashable]:
+        return self.records.outputs
 
     def __len__(self) -> int:
         return len(self.record)
@@ -100,10 +96,10 @@ class Outputs(Many):
         raise AttributeError(missing(name, self.outputs[0]) if not name.startswith("_") else name)
 
     def _written(self, name: str) -> Array:
-        """A field of the driver's output, with the output axis before the parameter axis."""
-        return np.moveaxis(self._out[name], -1, 1)
+        """A field of the driver's output, (T, ny, ..)."""
+        return np.stack([lane.written(name) for lane in self._lanes if lane], axis=1)
 
-    @property
+    @cached_property
     def theta(self) -> Array:
         return self._written("theta")
 
@@ -111,11 +107,11 @@ class Outputs(Many):
     def std(self) -> Array:
         return np.sqrt(self._written("var"))
 
-    @property
+    @cached_property
     def prediction(self) -> Array:
         return self._written("y_hat")
 
-    @property
+    @cached_property
     def innovation(self) -> Array:
         return self._written("e")
 
@@ -147,12 +143,12 @@ class Outputs(Many):
         return np.array([track.cov(t) for track in self.values()])
 
     @cached_property
-    def _seen(self) -> Array:
+    def _collected(self) -> Array:
         """The samples as the tracker received them, with the regressors that all outputs share."""
-        steps = self.programs[0].steps._replace(store=collect)
-        tile = tile_of(self.programs, self.starts)
+        steps = self._programs[0].steps._replace(store=collect)
+        tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
         out = np.empty(len(self), output_type(tile, COLLECTED))
-        self.programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
+        self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
     def __getitem__(self, output: str | int) -> Track:
@@ -165,92 +161,44 @@ class Outputs(Many):
     def _tracks(self) -> tuple[Track, ...]:
         return tuple(self._track(lane) for lane in range(len(self.outputs)))
 
-    def _track(self, lane: int) -> Track:
+    def _run(self, j: int) -> Track:
+        return self._tracks[j]
+
+    def _track(self, j: int) -> Track:
         """One output alone, as a regression whose regressors may contain the other outputs."""
-        alone, u = self.programs[lane].alone, self.u
-        known, names, units = Known(self.record.known.columns[..., lane]), self.labels.u, dict(self.labels.units)
+        alone, u, lane = self._programs[j].alone, self.u, self._lanes[j]
+        assert lane is not None
+        known, names, units = self.record.known.for_output(j), self.labels.u, dict(self.labels.units)
         if alone is None:
-            seen, names = self._seen, self.names[lane]
-            alone, known = Program(Regression(names), self.trackers[lane]), known.changed(interval=seen["dt"][:, lane])
+            found, names = self._collected, self.names[j]
+            alone, known = Program(Regression(names), self.trackers[j]), known.changed(interval=found["dt"][:, j])
             held = zip(names, self.model.sources, strict=True)
             units |= {name: units[source] for name, source in held if source in units}
-            u = np.where(seen["valid"][:, lane, None] > 0.0, seen["phi"][..., lane], np.nan)
+            u = np.where(found["valid"][:, j, None] > 0.0, found["phi"][..., j], np.nan)
         tile = alone.tile()
         shapes = {name: value.shape for name, value in state_of(tile).items() if name != "u"}
-        state = state_of(self._tile, lane)
+        state = state_of(lane.tile, lane.lane)
         own = [name for name, shape in shapes.items() if shape == state[name].shape]
         for name in own:
             tile[name][0, ..., 0] = state[name]
-        out = alone.written(tile, len(self), "cov" if "P" in names_of(self._out) else "std")
+        out = alone.written(tile, len(self), "cov" if "P" in names_of(lane.out) else "std")
         for name in names_of(out):
-            out[name][..., 0] = self._out[name][..., lane]
-        start = {name: value for name, value in self.starts[lane].items() if name in own} if self.starts else None
-        others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[lane])
-        missing = {reason: c for reason, c in self.labels.missing.items() if not reason.startswith(others)}
-        labels = replace(self.labels, y=self.outputs[lane], u=names, missing=missing, units=units)
-        record = Record(self.y[:, lane], u, known, self.record.time, labels)
+            out[name][..., 0] = lane.written(name)
+        start = {name: value for name, value in self._starts[j].items() if name in own} if self._starts else None
+        others = tuple(f"of {name} " for name in self.outputs if name != self.outputs[j])
+        missing = {reason: c for reason, c in self.record.labels.missing.items() if not reason.startswith(others)}
+        labels = replace(self.record.labels, y=self.outputs[j], u=names, missing=missing, units=units)
+        record = Record(self.y[:, j], u, known, self.record.time, labels)
         return Track(alone, record, Lane(out, tile), start)
-
-    def keys(self) -> tuple[str, ...]:
-        """Names of the outputs."""
-        return self.outputs
-
-    def values(self) -> tuple[Track, ...]:
-        """The record of each output."""
-        return self._tracks
-
-    def items(self) -> Iterator[tuple[str, Track]]:
-        """Names and records of the outputs."""
-        return zip(self.outputs, self._tracks, strict=True)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.outputs)
 
     def __contains__(self, output: object) -> bool:
         return output in self.outputs
 
-    def runs(self) -> dict[Hashable, Track]:
-        return dict(self.items())
-
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        lanes = range(len(self.outputs))
-        states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
-        return End(self.programs, states, None if self.record.time is None else self.record.time[-1])
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the result to one file without pickle, completely or not at all."""
-        arrays = {"y": self.y, "u": self.u, "known": self.record.known.columns}
-        arrays |= {} if self.record.time is None else {"time": self.record.time}
-        arrays |= {f"out_{name}": self._out[name] for name in names_of(self._out)}
-        arrays |= {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
-        for lane, start in enumerate(self.starts):
-            arrays |= {f"start{lane}_{name}": value for name, value in start.items()}
-        header: dict[str, Any] = {"model": storage.describe(self.model)}
-        header |= {"trackers": [storage.describe(one) for one in self.trackers]}
-        header |= {"keep": "cov" if "P" in names_of(self._out) else "std", "labels": asdict(self.labels)}
-        storage.write(path, {"kind": "outputs of a record", **header}, arrays)
-
-    @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
-        """Read a file that `save` wrote."""
-        header, arrays = storage.read(path, "outputs of a record")
-        model = storage.rebuild(header["model"], Model)
-        programs = [Program(model, storage.rebuild(one, Tracker)) for one in header["trackers"]]
-        tracker, tile = programs[0].tracker, tile_of(programs)
-        storage.restore(path, tracker, arrays, "state_", {n: tile[n][0] for n in storage.fields(tile)})
-        out = programs[0].written(tile, len(arrays["y"]), header["keep"])
-        storage.restore(path, tracker, arrays, "out_", {name: out[name] for name in names_of(out)})
-        lanes = [f"start{lane}_" for lane in range(len(programs))]
-        starts = [{n.removeprefix(lane): arrays[n] for n in arrays if n.startswith(lane)} for lane in lanes]
-        labels = Labels(**header["labels"])
-        record = Record(arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), labels)
-        return cls(programs, record, out, tile, starts if starts[0] else ())
-
-
-def lanes_of(record: Record) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record of outputs, y (T, ny), known (T, k, ny): every lane gets the same inputs u (T, m)."""
-    return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
+        lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
+        states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
+        return End(self._programs, states, self.time[-1] if self.timed else None)
 
 
 def missing(name: str, output: str) -> str:

@@ -6,7 +6,7 @@ No other module makes tiles or drivers of a model and a tracker; a tile of sever
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,11 @@ from rich.progress import Progress
 
 from driftfit.data import storage
 from driftfit.data.record import Record
+from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.models.regression import Regression
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -35,6 +37,13 @@ class Program:
     tracker: Tracker
     output: str | None = None
     """Which of several outputs it belongs to, in one of several lanes."""
+    shared: Model | None = None
+    """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
+
+    @property
+    def whole(self) -> Model:
+        """The model that the user gave, with all its outputs."""
+        return self.model if self.shared is None else self.shared
 
     @property
     def alone(self) -> Program | None:
@@ -56,7 +65,7 @@ class Program:
         if self.output is None:
             return self.tracker.state_for(self.model)
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory(), **self.tracker.state_for(own)}
+        return {**own.memory_for(self.steps.doubts), **self.tracker.state_for(own)}
 
     @property
     def steps(self) -> TrackerSteps:
@@ -70,7 +79,7 @@ class Program:
 
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
-        return drivers(self.model.steps, self.steps if steps is None else steps, keep)
+        return drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
@@ -85,14 +94,14 @@ class Program:
         return np.empty(T, output_type(tile, self.tracker.outputs, keep))
 
     def run(self, tile: Array, record: Record, keep: str = "std") -> Array:
-        """Run a tile of one lane over a record; returns the driver's output, (T,) records of `output_type`."""
+        """Run a tile over a record, a lane for each output; returns the driver's output, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep)
         with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
             task = progress.add_task("tracking", total=T)
             for a in range(0, T, CHUNK):
                 b = min(a + CHUNK, T)
-                self.drivers(keep).run(tile, *lane_of(record.part(slice(a, b))), out[a:b])
+                self.drivers(keep).run(tile, *lanes_of(record.part(slice(a, b))), out[a:b])
                 progress.advance(task, b - a)
         return out
 
@@ -105,15 +114,18 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
     """A tile with a lane for each program (all of one model), at its start or with the given fields."""
     model = programs[0].model
     starts = {one: one.start for one in programs}
-    tile = make_tile(model.n, model.m, model.memory(), [starts[one] for one in programs])
+    memory = model.memory_for(programs[0].steps.doubts)
+    tile = make_tile(model.n, model.m, memory, [starts[one] for one in programs])
     for lane, state in enumerate(states):
         for name, value in state.items():
             tile[name][0, ..., lane] = value
     return tile
 
 
-def lane_of(record: Record) -> tuple[Array, Array, Array]:
-    """(y, u, known) of a record in the form that drivers of a tile of one lane take."""
+def lanes_of(record: Record) -> tuple[Array, Array, Array]:
+    """(y, u, known) of a record in the form that drivers take: a lane for each output, all with the same inputs."""
+    if record.y.ndim > 1:
+        return record.y, np.repeat(record.u[:, :, None], record.y.shape[1], axis=2), record.known.columns
     return record.y[:, None], record.u[:, :, None], record.known.columns[:, :, None]
 
 
@@ -126,3 +138,51 @@ def spread(record: Record, L: int) -> tuple[Array, Array, Array]:
 def state_of(tile: Array, lane: int = 0) -> dict[str, Array]:
     """The fields of a lane, by name, as views."""
     return {name: tile[name][0, ..., lane : lane + 1][..., 0] for name in storage.fields(tile)}
+
+
+def shown(trackers: Sequence[Tracker]) -> str:
+    """The tracker of all outputs, or of each."""
+    return repr(trackers[0]) if len(set(trackers)) == 1 else ", ".join(map(repr, trackers))
+
+
+def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tuple[Program, ...]:
+    """The program of each output of a model with these inputs; outputs that share one theta have one.
+
+    ``tracker`` is one for all, or a mapping from the name of each output to its tracker. ValueError for settings that
+    are incomplete, or that cannot run together.
+    """
+    if len(model.outputs) == 1:
+        if not isinstance(tracker, Tracker):
+            raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
+        return (Program(model.bind(inputs), check_ready(tracker)),)
+    if isinstance(tracker, Mapping) and not model.shared:
+        if set(tracker) != set(model.outputs):
+            raise ValueError(
+                f"trackers were given for {', '.join(map(str, tracker))}, but the outputs are "
+                f"{', '.join(model.outputs)}."
+            )
+        trackers = tuple(tracker[name] for name in model.outputs)
+    else:
+        trackers = (tracker,) * (1 if model.shared else len(model.outputs))
+    for one in trackers:
+        if not isinstance(one, Tracker):
+            raise ValueError(f"several outputs take one tracker, or one for each output by its name; got {tracker!r}.")
+        check_ready(one)
+    if model.shared:
+        return (Program(_row_model(model, tracker, inputs), tracker, shared=model),)
+    bound = model.bind(inputs)
+    programs = tuple(Program(bound, one, name) for one, name in zip(trackers, model.outputs, strict=True))
+    if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:
+        raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
+    return programs
+
+
+def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:
+    """The model of one row of a shared regression."""
+    assert isinstance(model, Regression)
+    if not tracker.covariance:
+        raise ValueError(
+            f"{type(tracker).__name__} carries no covariance, so the rows of an instant could not inform each other; "
+            "use FLS, Kalman or RLS with shared=True."
+        )
+    return replace(model, ny=1, shared=False).bind(inputs)

@@ -16,7 +16,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.program import Program, State, lane_of, state_of
+from driftfit.run.program import Program, State, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -245,7 +245,7 @@ class Track(Plain):
         """The state after sample t, field by field; replays the record up to t, O(t)."""
         tile = self.fresh()
         record = self.record.part(slice(0, t % len(self) + 1))
-        self.program.drivers().run(tile, *lane_of(record), self.program.written(tile, len(record)))
+        self.program.drivers().run(tile, *lanes_of(record), self.program.written(tile, len(record)))
         return state_of(tile)
 
     def fresh(self) -> Array:
@@ -292,9 +292,13 @@ class Track(Plain):
         return cls.from_stored(path, *storage.read(path, "track"))
 
     @classmethod
-    def from_stored(cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        """The inverse of `stored`; ``path`` is named in error messages."""
-        program = Program(storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker))
+    def from_stored(
+        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array],
+        shared: Model | None = None,
+    ) -> Self:  # fmt: skip
+        """The inverse of `stored`; ``path`` is named in error messages, ``shared`` is that of `Program`."""
+        model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
+        program = Program(model, tracker, shared=shared)
         record = Record(
             arrays["y"], arrays["u"], Known(arrays["known"]), arrays.get("time"), Labels(**header["labels"])
         )

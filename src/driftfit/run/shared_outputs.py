@@ -7,7 +7,6 @@ uses the first one.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from os import PathLike
 from typing import Any, Self
 
@@ -16,12 +15,10 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.models.regression import Regression
 from driftfit.run.outputs import missing
 from driftfit.run.public_class import Plain
 from driftfit.run.result import Track
 from driftfit.run.warm_start import End
-from driftfit.trackers.base import Tracker
 
 
 class Shared(Plain):
@@ -31,9 +28,10 @@ class Shared(Plain):
     ``innovation_std``, ``ok`` (T, ny) those of each. ``rows`` is the Track of the T ny rows.
     """
 
-    def __init__(self, rows: Track, model: Model, instants: Array | None) -> None:
-        self.rows, self.model, self.instants = rows, model, instants
-        self.outputs, self.names, self.tracker, self.labels = model.outputs, rows.names, rows.tracker, rows.labels
+    def __init__(self, rows: Track) -> None:
+        self.rows, self.model = rows, rows.program.whole
+        self.outputs, self.names, self.tracker, self.labels = self.model.outputs, rows.names, rows.tracker, rows.labels
+        self.instants = None if rows.record.time is None else self.last_rows(rows.record.time)
 
     def __len__(self) -> int:
         return len(self.rows) // len(self.outputs)
@@ -111,29 +109,15 @@ class Shared(Plain):
 
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        return self.rows.end()._replace(last=None if self.instants is None else self.instants[-1])
+        return self.rows.end()
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file without pickle, completely or not at all."""
         header, arrays = self.rows.stored()
-        arrays |= {} if self.instants is None else {"instants": self.instants}
         storage.write(path, {**header, "kind": "shared outputs", "shared": storage.describe(self.model)}, arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read a file that `save` wrote."""
         header, arrays = storage.read(path, "shared outputs")
-        rows = Track.from_stored(path, header, arrays)
-        return cls(rows, storage.rebuild(header["shared"], Model), arrays.get("instants"))
-
-
-def row_model(model: Model, tracker: Tracker, m: int | None = None) -> Model:
-    """The model of one row of a shared regression on m regressors."""
-    assert isinstance(model, Regression)
-    if not tracker.covariance:
-        raise ValueError(
-            f"{type(tracker).__name__} carries no covariance, so the rows of an instant could not inform each other; "
-            "use FLS, Kalman or RLS with shared=True."
-        )
-    alone = replace(model, ny=1, shared=False)
-    return alone.bind(alone.m if m is None else m)
+        return cls(Track.from_stored(path, header, arrays, storage.rebuild(header["shared"], Model)))

@@ -6,17 +6,16 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
-from driftfit.data.record import Reading, Record, Records, one_series, rows
-from driftfit.data.signals import check_ready
+from driftfit.data.record import Reading, Records, one_series, rows
 from driftfit.engine.settings import one_of
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.outputs import Outputs
-from driftfit.run.program import Program
-from driftfit.run.result import Track, track_record
+from driftfit.run.program import Program, programs_of, tile_of
+from driftfit.run.result import Lane, Track
 from driftfit.run.shared_outputs import Shared
-from driftfit.run.track_outputs import OutputsFleet, track_outputs
 from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
@@ -24,7 +23,7 @@ from driftfit.trackers.base import Tracker
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
 
-Result = Track | Fleet | Outputs | Shared | OutputsFleet
+Result = Track | Fleet | Outputs | Shared
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
 
 
@@ -36,32 +35,47 @@ def track(
     check_roles("track", model, tracker, several=True)
     one_of("track", "keep", keep, ("std", "cov"))
     reading = Reading() if reading is None else reading
-    single = by is None and isinstance(tracker, Tracker) and len(model.outputs) == 1
-    if prob is not None and not single:
-        raise ValueError("track: prob= is for one series and one tracker.")
-    if len(model.outputs) > 1:
-        return track_outputs(model, tracker, y, u, data, by, reading, keep, warm_start)
-    records, failed = records_of(y, u, reading, data, by)
+    model, records, failed = records_of(model, y, u, reading, data, by)
     records = records.for_model(model, reading)
-    bound = model.bind(records.labels.u or records.u.shape[1])
-    bound.inspect(records.y, records.u)
-    if single:
-        assert isinstance(tracker, Tracker)
-        records = records.told(bound, [_checked(tracker, keep)], prob)
-        run = _one(Program(bound, tracker), records.part(0), keep, warm_start)
-        warn_unlearned(run)
-        return run
-    if by is None and not isinstance(tracker, Tracker):
-        names = tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker)))
-        records = records.repeated(names)
-    trackers = _per_series(tracker, records.keys)
-    for one in set(trackers):
-        _checked(one, keep)
-    programs = {one: Program(bound, one) for one in trackers}
-    records = records.told(bound, trackers)
-    fleet = run_fleet([programs[one] for one in trackers], records, keep, failed, warm_start)
-    warn_unlearned(fleet)
-    return fleet
+    many = by is not None or _is_grid(tracker, records)
+    if prob is not None and (many or len(model.outputs) > 1):
+        raise ValueError("track: prob= is for one series and one tracker.")
+    if many and warm_start is not None and not isinstance(warm_start, Fleet):
+        raise ValueError(f"warm_start: with by= or a grid pass the result of such a run; got {warm_start!r}.")
+    if by is None and many:
+        records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
+    programs, records = _prepared(model, _per_series(tracker, records), records, keep, prob)
+    if many:
+        fleet = run_fleet(programs, records, keep, failed, warm_start)
+        warn_unlearned(fleet)
+        return fleet
+    run = _one(programs, records, keep, warm_start)
+    warn_unlearned(run)
+    return run
+
+
+def _prepared(
+    model: Model, trackers: Sequence[Any], records: Records, keep: str, prob: Any
+) -> tuple[list[Program], Records]:
+    """(the program of each output of each series, the records as these take them)."""
+    inputs = records.labels.u or records.u.shape[-1]
+    made = {id(one): programs_of(model, one, inputs) for one in {id(one): one for one in trackers}.values()}
+    programs = [program for one in trackers for program in made[id(one)]]
+    distinct = list(dict.fromkeys(programs for programs in made.values()))
+    for tracker in {program.tracker for some in distinct for program in some}:
+        if keep == "cov" and not tracker.covariance:
+            raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
+    for lane, one in enumerate(distinct[0]):
+        if one.shared is None:
+            y = records.y[:, lane] if records.outputs else records.y
+            (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
+    records = records.told(programs[0].model, [one.tracker for one in programs], prob)
+    return programs, records.in_rows() if model.shared else records
+
+
+def _is_grid(tracker: Trackers, records: Records) -> bool:
+    """Whether several trackers are given, other than one for each output."""
+    return not isinstance(tracker, Tracker) and not (isinstance(tracker, Mapping) and bool(records.outputs))
 
 
 def track_one(
@@ -75,33 +89,35 @@ def track_one(
 
 
 def records_of(
-    y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
-) -> tuple[Records, dict[Hashable, str]]:
-    """The records to be run, from arrays or a table, and the reasons of those that cannot be."""
-    if data is not None:
-        # imported here, because narwhals and polars take as long to import as everything else
-        from driftfit.data.tables import read_records
-
-        return read_records(data, y, u, by, reading)
-    if by not in (None, "row"):
+    model: Model, y: Any, u: Any, reading: Reading, data: Any = None, by: Any = None
+) -> tuple[Model, Records, Mapping[Hashable, str]]:
+    """(the model, its outputs named; the series; the reasons of those without data) from arrays or a table."""
+    if data is None and by not in (None, "row"):
         raise ValueError(
             f"track: by={by!r} names a column of a table, so data= is needed; rows of arrays are by='row'."
         )
-    if reading.units is not None:
+    if data is None and reading.units is not None:
         raise ValueError("track: units= maps the names of columns to their units, so data= is needed.")
-    return (rows if by == "row" else one_series)(y, u, reading), {}
+    failed: Mapping[Hashable, str] = {}
+    if len(model.outputs) > 1:
+        if data is not None:
+            model, records, failed = outputs.of_table(model, y, u, data, by, reading)
+        else:
+            model, records = (outputs.of_rows if by == "row" else outputs.of_arrays)(model, y, u, reading)
+    elif data is not None:
+        # imported here, because narwhals and polars take as long to import as everything else
+        from driftfit.data.tables import read_records
+
+        records, failed = read_records(data, y, u, by, reading)
+    else:
+        records = (rows if by == "row" else one_series)(y, u, reading)
+    return model, records, failed
 
 
-def _checked(tracker: Tracker, keep: str) -> Tracker:
-    """The tracker, if its settings are complete and it can keep what is requested."""
-    if keep == "cov" and not tracker.covariance:
-        raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
-    return check_ready(tracker)
-
-
-def _per_series(tracker: Trackers, keys: Sequence[Hashable]) -> list[Tracker]:
-    """The tracker of each series."""
-    if isinstance(tracker, Tracker):
+def _per_series(tracker: Trackers, records: Records) -> list[Any]:
+    """The tracker of each series: one for all its outputs, or one for each by its name."""
+    keys = records.keys
+    if not _is_grid(tracker, records):
         return [tracker] * len(keys)
     if isinstance(tracker, Mapping):
         absent = [key for key in keys if key not in tracker]
@@ -110,16 +126,23 @@ def _per_series(tracker: Trackers, keys: Sequence[Hashable]) -> list[Tracker]:
                 f"track: settings are missing for {len(absent)} of {len(keys)} series, such as {absent[0]!r}."
             )
         return [tracker[key] for key in keys]
+    assert isinstance(tracker, Sequence)
     if len(tracker) != len(keys):
         raise ValueError(f"track: {len(tracker)} trackers were given for {len(keys)} series.")
     return list(tracker)
 
 
-def _one(program: Program, record: Record, keep: str, before: Run | None) -> Track:
+def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None) -> Track | Outputs | Shared:
     """Run one series."""
-    start = None
+    program, record = programs[0], records.part(0)
+    starts = carried(before, programs)
     if before is not None:
-        (start,) = carried(before, [program])
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
-    return track_record(program, record, keep, start)
+    tile = tile_of(programs, starts)
+    out = program.run(tile, record, keep)
+    if records.outputs:
+        lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
+        return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
+    run = Track(program, record, Lane(out, tile), *starts)
+    return run if program.shared is None else Shared(run)

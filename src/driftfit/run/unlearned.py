@@ -7,24 +7,27 @@ from collections import Counter
 import numpy as np
 
 from driftfit.engine.settings import warn
-from driftfit.run.fleet import Fleet
+from driftfit.run.many import Many
+from driftfit.run.program import Program, State
 from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
 
 
-def warn_unlearned(run: Track | Fleet) -> None:
+def warn_unlearned(run: Track | Shared | Many) -> None:
     """Warn of what `Tracker.unlearned` names."""
-    series = [run] if isinstance(run, Track) else [one for _, one in run.items()]
+    one = run.rows if isinstance(run, Shared) else run
+    ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())
     found, counts, owners = 0, Counter[str](), []
-    for one in series:
-        missed = _missed(one)
+    for program, state in ends:
+        missed = _missed(program, state)
         found += bool(missed)
         counts.update(missed)
-        owners += [type(one.tracker).__name__] if missed else []
+        owners += [type(program.tracker).__name__] if missed else []
     if not found:
         return
     named = ", ".join(counts)
-    if not isinstance(run, Track):
-        named = f"in {found} of {len(series)} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
+    if not isinstance(one, Track):
+        named = f"in {found} of {len(ends)} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
     warn(
         f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
         "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
@@ -33,8 +36,7 @@ def warn_unlearned(run: Track | Fleet) -> None:
     )
 
 
-def _missed(run: Track) -> list[str]:
-    lane = run.state
-    if not np.isinf(lane["var"]).any():
+def _missed(program: Program, state: State) -> list[str]:
+    if not np.isinf(state["var"]).any():
         return []
-    return [name for name, missed in zip(run.names, run.tracker.unlearned(lane), strict=True) if missed]
+    return [name for name, missed in zip(program.names, program.tracker.unlearned(state), strict=True) if missed]

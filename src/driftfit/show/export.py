@@ -9,7 +9,7 @@ metadata of fields in pyarrow, the metadata of the file in Parquet.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,16 +18,15 @@ import numpy as np
 import polars as pl
 
 from driftfit.data.clock import Clock
-from driftfit.data.record import Labels
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
-from driftfit.run.fleet import Fleet, Many
+from driftfit.run.fleet import Fleet
+from driftfit.run.many import Many
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
-from driftfit.run.track_outputs import OutputsFleet
 from driftfit.trackers.base import Tracker
-from driftfit.use.forecast import forecast
+from driftfit.use.forecast import forecast, forecast_outputs
 
 Result = Track | Shared | Many
 Single = Track | Outputs | Shared
@@ -42,7 +41,7 @@ def as_table(result: Result) -> pl.DataFrame:
     records, keys = _records(result)
     columns: dict[str, Any] = {}
     lengths = [len(one) for one in records]
-    for place, name in enumerate(result.by if isinstance(result, Fleet | OutputsFleet) else ()):
+    for place, name in enumerate(result.records.labels.by if isinstance(result, Fleet) else ()):
         values = [key[place] if isinstance(key, tuple) else key for key in keys]
         columns[name] = pl.Series(values).gather(np.repeat(np.arange(len(records)), lengths))
     signals = [_of_track(one) if isinstance(one, Track) else _of_outputs(one) for one in records]
@@ -57,8 +56,9 @@ def as_table(result: Result) -> pl.DataFrame:
 
 def _records(result: Result) -> tuple[list[Single], list[Any]]:
     """(records, keys); no keys for a single one."""
-    if isinstance(result, Fleet | OutputsFleet):
-        return list(result.values()), list(result)
+    if isinstance(result, Fleet):
+        found = result.series()
+        return list(found.values()), list(found)
     assert isinstance(result, Track | Outputs | Shared)
     return [result], []
 
@@ -118,25 +118,45 @@ def units_of(result: Result) -> dict[str, str]:
     return units
 
 
-def forecasts_table(runs: Mapping[Any, Track], labels: Labels, h: int, u: Any) -> pl.DataFrame:
-    """The forecasts of many runs in one table, one row per sample."""
+def forecasts_table(fleet: Fleet, h: int, u: Any) -> pl.DataFrame:
+    """The forecasts of a fleet in one table, one row per sample of each output."""
     parts = []
-    for key, run in runs.items():
-        found = forecast(run, h, u.get(key) if isinstance(u, Mapping) else u)
+    labels = fleet.labels
+    for key, run in fleet.series().items():
         columns: dict[str, Any] = {"step": np.arange(1, h + 1)}
-        ahead = Clock.of(labels.dt, labels.zone).ahead(run.last, h) if run.timed else None
+        last = run.time[-1] if run.timed else None
+        ahead = None if last is None else Clock.of(labels.dt, labels.zone).ahead(last, h)
         if ahead is not None:
             columns[_time_name(run)] = ahead
-        columns |= {"y_hat": found.y_hat, "y_std": found.y_std}
-        for i, name in enumerate(run.names):
-            columns |= {f"theta_{name}": found.theta[:, i], f"std_{name}": found.std[:, i]}
-        keys = zip(labels.by, key if isinstance(key, tuple) else (key,), strict=True)
-        part = pl.DataFrame(columns).select([*(pl.lit(k).alias(name) for name, k in keys), pl.all()])
-        if labels.zone is not None and ahead is not None:
-            shown = pl.col(_time_name(run)).dt.replace_time_zone("UTC").dt.convert_time_zone(labels.zone)
-            part = part.with_columns(shown)
-        parts.append(part)
-    return pl.concat(parts)
+        identity = key if isinstance(key, tuple) else (key,)
+        for more, results in _forecasts(run, h, u.get(key) if isinstance(u, Mapping) else u):
+            named = [pl.lit(k).alias(name) for name, k in zip((*labels.by, "output"), (*identity, *more), strict=False)]
+            part = pl.DataFrame(columns | results).select([*named, pl.all()])
+            if labels.zone is not None and ahead is not None:
+                shown = pl.col(_time_name(run)).dt.replace_time_zone("UTC").dt.convert_time_zone(labels.zone)
+                part = part.with_columns(shown)
+            parts.append(part)
+    return pl.concat(parts, how="diagonal")
+
+
+def _forecasts(run: Single, h: int, u: Any) -> Iterator[tuple[tuple[str, ...], dict[str, Array]]]:
+    """The forecast of each output, and its name if there are several."""
+    if isinstance(run, Track):
+        found = forecast(run, h, u)
+        yield (), _columns(run.names, found.y_hat, found.y_std, found.theta, found.std)
+        return
+    found = forecast_outputs(run, h, u)
+    for j, output in enumerate(run.outputs):
+        own = [part[:, j] for part in (found.y_hat, found.y_std)]
+        paths = [part[:, j] if isinstance(run, Outputs) else part for part in (found.theta, found.std)]
+        yield (output,), _columns(run.names[j] if isinstance(run, Outputs) else run.names, *own, *paths)
+
+
+def _columns(names: Sequence[str], y_hat: Array, y_std: Array, theta: Array, std: Array) -> dict[str, Array]:
+    columns = {"y_hat": y_hat, "y_std": y_std}
+    for i, name in enumerate(names):
+        columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
+    return columns
 
 
 def to_table(result: Result, kind: str = "polars") -> Any:
@@ -192,10 +212,8 @@ def check_ending(path: str | PathLike[str]) -> str:
 def write(result: Result, path: str | PathLike[str]) -> None:
     """Write a result: a table as .csv or .parquet, or a complete run as .npz, depending on the ending of the name."""
     ending = check_ending(path)
-    if ending == ".npz" and isinstance(result, Fleet | OutputsFleet):
-        raise ValueError(f"{path}: an .npz file holds one run; write a fleet as .parquet, or fleet[key].save(...).")
     if ending == ".npz":
-        _records(result)[0][0].save(path)
+        result.save(path)
     elif ending == ".parquet":
         to_parquet(result, path)
     else:

@@ -12,7 +12,7 @@ max_t |theta_t - theta_0| is given in units of its median over the fleet.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +21,8 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
-from driftfit.run.fleet import Fleet
+from driftfit.run.many import Many
 from driftfit.run.result import Track, burn_in, root_mean_square
-from driftfit.run.track_outputs import OutputsFleet
 from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of
 
 SHOWN = 20
@@ -92,15 +91,8 @@ class FleetSummary(Printed):
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
 
 
-def summarise(fleet: Fleet | OutputsFleet) -> FleetSummary:
-    """Build the summary of a fleet."""
-    return summary_of(fleet.runs(), repr(fleet.model), fleet.failed, fleet.dropped)
-
-
-def summary_of(
-    fleet: Mapping[Hashable, Track], model: str, failed: Mapping[Hashable, str], dropped: Mapping[str, int]
-) -> FleetSummary:
-    """Build the summary of runs by key, all with the same number of parameters."""
+def summarise(fleet: Many) -> FleetSummary:
+    """Build the summary of results by key, all with the same number of parameters."""
     runs = list(fleet.values())
     paths = [_path(run) for run in runs]
     excursion = np.array([path.excursion for path in paths])
@@ -112,7 +104,9 @@ def summary_of(
     missing: Counter[str] = Counter()
     for run in runs:
         missing.update(run.labels.missing)
-    return FleetSummary(model, trackers, tuple(units), dict(failed), dict(dropped), scaled, dict(missing))
+    return FleetSummary(
+        repr(fleet.model), trackers, tuple(units), dict(fleet.failed), fleet.dropped, scaled, dict(missing)
+    )
 
 
 @dataclass(frozen=True)

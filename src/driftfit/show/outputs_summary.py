@@ -59,7 +59,7 @@ class SharedSummary(Printed):
 
 def summarise_outputs(run: Outputs) -> OutputsSummary:
     """Build the summary of a record with a theta for each output."""
-    return OutputsSummary({name: summarise(one) for name, one in run.items()})
+    return OutputsSummary({name: summarise(run[name]) for name in run.outputs})
 
 
 def summarise_shared(run: Shared) -> SharedSummary:

@@ -40,32 +40,32 @@ def plot_track(run: Track, level: float = 0.95) -> Figure:
 
 
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-    """One parameter of the series that moved most, one panel per series, all on one scale."""
+    """One parameter of the results that moved most and have it, one panel per result, all on one scale."""
     units = summarise(fleet).units
     if which is None:
         which = Counter(unit.parameter for unit in units[:most]).most_common(1)[0][0]
     if which not in fleet.names:
         raise ValueError(f"plot: no parameter {which!r}; {near(which, fleet.names)}")
-    i = fleet.names.index(which)
-    shown = units[:most]
+    runs = dict(fleet.items())
+    shown = [(unit.key, run) for unit in units if which in (run := runs[unit.key]).names][:most]
     columns = min(4, len(shown))
     rows = -(-len(shown) // columns)
     figure = new_figure(2.6 * columns + 0.6, 1.7 * rows + 0.6)
     axes = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     views = []
-    for axis, unit in zip(axes, shown, strict=False):
-        run = fleet[unit.key]
-        draw_parameter(axis, run, i, level)
+    for axis, (key, run) in zip(axes, shown, strict=False):
+        draw_parameter(axis, run, run.names.index(which), level)
         views.append(axis.get_ylim())
-        axis.set_title(key_text(unit.key), fontsize=9)
+        axis.set_title(key_text(key), fontsize=9)
         axis.tick_params(labelsize=8)
         axis.set_ylabel("")
         date_axis(axis, run)
     axes[0].set_ylim(min(low for low, _ in views), max(high for _, high in views))
     for axis in axes[len(shown) :]:
         axis.set_visible(False)
-    figure.supylabel(f"{which}  {fleet[shown[0].key].units[i]}".strip(), fontsize=10)
-    figure.supxlabel(time_label(fleet[shown[0].key]), fontsize=10)
+    first = shown[0][1]
+    figure.supylabel(f"{which}  {first.units[first.names.index(which)]}".strip(), fontsize=10)
+    figure.supxlabel(time_label(first), fontsize=10)
     return figure
 
 

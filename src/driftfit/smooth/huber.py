@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, whole
@@ -81,7 +81,7 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
         size = root * np.abs(walk.residual(path.theta))
         held = np.divide(delta, size, out=np.ones_like(size), where=size > delta)
         dynamic = path.cost - float(np.nansum((path.rho * path.c) ** 2))
-        costs.append(2.0 * float(np.sum(special.huber(delta, size))) + dynamic)
+        costs.append(2.0 * float(np.sum(scipy.special.huber(delta, size))) + dynamic)
         if costs[-2] - costs[-1] <= tol * costs[-1]:
             break
         weighted = walk._replace(weight=walk.weight * held)
@@ -95,7 +95,7 @@ def huber(run: Track, delta: float | None = None, tol: float = 1e-12, max_steps:
 def spread_of(smoothed: Smoothed) -> float:
     """Standard deviation of the noise from leave-one-out residuals, half of which may be arbitrary."""
     loo = smoothed.loo
-    return float(np.nanmedian(np.abs(loo - np.nanmedian(loo))) / special.ndtri(0.75))
+    return float(np.nanmedian(np.abs(loo - np.nanmedian(loo))) / scipy.special.ndtri(0.75))
 
 
 def certificate(walk: Walk, path: Path, delta: float) -> float:

@@ -13,8 +13,9 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps, output_type
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
+from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import NONE, Walk, free
 from driftfit.trackers.base import RandomWalk
 
@@ -58,7 +59,7 @@ def replay(run: Track) -> Array:
     program = run.program
     tile = program.tile()
     out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.noted)))
-    program.drivers(steps=attentive(program.steps)).run(tile, *lane_of(run.record), out)
+    program.drivers(steps=attentive(program.steps)).run(tile, *lanes_of(run.record), out)
     return out
 
 
@@ -78,7 +79,7 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     if own and tracker.noted:
         noted = {name: seen[name][..., 0] for name in tracker.noted}
         q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
-        each, weight, drift = np.sqrt(q), weight / r_of, np.ones(len(drift))
+        each, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE
     if prior.at_first_sample or prior.p0 is None:
         first = int(np.argmax(dt > 0.0)) + 1
@@ -86,4 +87,5 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
     phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
-    return Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
+    walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
+    return average_drift(walk, time) if own and tracker.noted else walk

@@ -17,8 +17,9 @@ out too (`driftfit.trackers.parts.frozen`).
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
 
-The start is exact diffuse least squares without drift, until there are enough residuals to estimate r. The filters then
-start from there, in the directions that the regressors span by then. Scaling inputs or outputs changes only the units.
+The start is exact diffuse least squares without drift, in which regressors out of proportion count less too, until
+there are enough residuals to estimate r. The filters then start from there, in the directions that the regressors span
+by then. Scaling inputs or outputs changes only the units.
 
 Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
 in a few hundred samples; ``groups`` tells it from the start.
@@ -107,8 +108,7 @@ def settle(s: State, l: int) -> None:
 
 @kernel
 def learn(s: State, l: int, odd: float) -> None:
-    """Update scales, excitation and the resolution of readings."""
-    learn_scales(s, l)
+    """Update excitation and the proportion of readings."""
     learn_information(s, l)
     learn_proportion(s, l, odd)
 
@@ -135,6 +135,7 @@ def follow(s: State, entering: int, l: int) -> None:
         update_filters(s, l)
         learn_weights(s, l)
         learn_noise(s, l)
+    learn_scales(s, l)
     learn(s, l, s.odd[l])
 
 
@@ -173,8 +174,13 @@ def begin(s: State, l: int) -> None:
         unseen_variance(s, l)
     else:
         resolve(s, l)
+        learn_scales(s, l)
+        bound_leverage(s, l)  # the drift is in units of scales that such a regressor did not move much either
         learn(s, l, 0.0)
+        noise = s.noise[l]
+        s.noise[l] = noise * s.leverage[l]
         take_in(s, l)
+        s.noise[l] = noise
         if s.s[l] < np.inf:
             learn_start(s, l)
             s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
@@ -238,6 +244,7 @@ class AdaptiveKalman(Tracker):
             "count": 0.0,
             "settled": 0,
             "weighed": 0,
+            "vague": 0.0,
             "gain": np.zeros((n, K)),
             "e_k": np.zeros(K),
             "step": np.zeros(K),
@@ -257,7 +264,7 @@ class AdaptiveKalman(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
-            predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights)
+            predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
         )
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:

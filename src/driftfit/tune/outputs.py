@@ -68,4 +68,4 @@ def tune_outputs(
     if isinstance(run, Shared):
         return one(Task(run.rows.model, run.rows.record))
     assert isinstance(run, Outputs)
-    return TunedOutputs({name: one(Task(each.model, each.record)) for name, each in run.items()})
+    return TunedOutputs({name: one(Task(run[name].model, run[name].record)) for name in run.outputs})

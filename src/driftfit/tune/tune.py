@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from driftfit.trackers.base import Tracker
 from driftfit.tune.intervals import intervals_of
 from driftfit.tune.lanes import Task, score
 from driftfit.tune.objective import Criterion, along
-from driftfit.tune.outputs import tune_outputs
+from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import Tuned
@@ -59,7 +59,7 @@ def tune(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
-) -> Tuned:
+) -> Tuned | TunedOutputs:
     """Estimate the missing settings of a tracker: ``FLS()``, ``Kalman()``, ``Kalman(r=0.1)``, ``RLS()`` ...
 
     Parameters
@@ -112,8 +112,7 @@ def tune(
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        found = tune_outputs(model, tracker, y, u, known, data, lambda task: _tuned(task, tracker, *options))
-        return cast("Tuned", found)
+        return tune_outputs(model, tracker, y, u, known, data, lambda task: _tuned(task, tracker, *options))
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
     return _tuned(_task(model, tracker, y, u, reading, data), tracker, method, groups, h, bounds, level, order_by)
 
@@ -161,6 +160,6 @@ def _warn(tuned: Tuned) -> None:
 
 
 def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any) -> Task:
-    records = records_of(y, u, reading, data)[0].for_model(model, reading)
+    records = records_of(model, y, u, reading, data)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
     return Task(bound, replace(records.told(bound, [tracker]).part(0), time=None))

@@ -30,13 +30,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import types
-from scipy import special
+import scipy
 
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
-from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
 from driftfit.run.program import state_of
@@ -184,9 +183,9 @@ def _covariances(run: Track) -> tuple[Array, Array]:
     """(covariance of theta at the end, its increase in a nominal sample without an observation), (n, n) each."""
     tile = run.program.resting(run.state)
     lane = state_of(tile)
-    update = run.program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
+    update = run.program.drivers().updater(tile, run.model.m)
     now = run.tracker.cov(lane).copy()
-    update(tile, np.nan, np.full(run.model.m, np.nan))
+    update(tile, np.nan, one_or_all(np.full(run.model.m, np.nan)))
     with np.errstate(invalid="ignore"):
         return now, run.tracker.cov(lane) - now
 
@@ -200,7 +199,7 @@ def _reflected(run: Track, lane: Mapping[str, Array], place: int, sign: float, l
     with np.errstate(divide="ignore", invalid="ignore"):
         B, ratio = c / np.sqrt(P + V), np.sqrt(V / P)
     B = np.where(P + V > 0.0, B, np.inf if c > 0.0 else -np.inf)
-    F = special.ndtr(-B) + 2.0 * special.owens_t(B, np.where(np.isnan(ratio), 0.0, ratio))
+    F = scipy.special.ndtr(-B) + 2.0 * scipy.special.owens_t(B, np.where(np.isnan(ratio), 0.0, ratio))
     return np.asarray(np.clip(F, 0.0, 1.0))
 
 

@@ -23,11 +23,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
 
 from driftfit.data.labels import inputs_for
 from driftfit.engine.arrays import as_numbers
-from driftfit.engine.drivers import INPUTS, tile_type
+from driftfit.engine.drivers import one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
@@ -92,15 +91,15 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     look, h, now = tile.copy(), len(inputs), tile["theta"][0, :, 0].copy()
     lane = state_of(tile)
     lagged = LagErrors.of(model, len(now)) if tracker.covariance else None
-    update = program.drivers().update.entry(tile_type(tile), types.float64, INPUTS)
+    update = program.drivers().updater(tile, model.m)
     noise = lane["r"] * lane["scale"] if "r" in lane else np.nan
     result = Forecast(np.empty((h, len(now))), np.empty((h, len(now))), np.empty(h), np.empty(h))
     for k in range(h):
         look[...] = tile
-        y_hat, _, s, _ = update(look, np.nan, inputs[k])
+        y_hat, _, s, _ = update(look, np.nan, one_or_all(inputs[k]))
         # the forecast takes the place of the output among the lags, and is not an observation
         tile["noise"] = np.inf
-        update(tile, y_hat, inputs[k])
+        update(tile, y_hat, one_or_all(inputs[k]))
         tile["noise"] = 1.0
         result.theta[k], result.std[k] = tile["theta"][0, :, 0], np.sqrt(tile["var"][0, :, 0])
         result.y_hat[k], result.y_std[k] = y_hat, s
@@ -161,7 +160,7 @@ class LagErrors:
     def of(cls, model: Model, n: int) -> LagErrors | None:
         """For a model whose regressors begin with past outputs; None for others."""
         na = model.output_lags
-        return None if na is None else cls(len(model.outputs), na, n)
+        return cls(len(model.outputs), na, n) if na else None
 
     def step(self, phi: Array, theta: Array, P: Array, s: Array) -> Array:
         """Variances (ny,) of the outputs of the next sample, for phi (n,), theta (ny, n), P (ny, n, n).

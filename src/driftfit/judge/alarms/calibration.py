@@ -127,23 +127,21 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
 
 
 def _begun(series: Sequence[Array]) -> tuple[Array, Array]:
-    """(limits, number of onsets over each), for every limit that makes a difference.
+    """(limits, largest number of onsets over each and those above it), for every limit that makes a difference.
 
     A step from a to b > a is an onset over the limits c with a <= c < b, so the number at c is that of the a up to c
-    minus that of the b up to c.
+    minus that of the b up to c. As the limit decreases, the number grows and falls again once normal values exceed it.
     """
     before = np.concatenate([np.concatenate([[-np.inf], values[:-1]]) for values in series])
     after = np.concatenate(list(series))
     rising = after > before
     low, high = np.sort(before[rising]), np.sort(after[rising])
     limits = np.unique(after)
-    return limits, np.searchsorted(low, limits, side="right") - np.searchsorted(high, limits, side="right")
+    begun = np.searchsorted(low, limits, side="right") - np.searchsorted(high, limits, side="right")
+    return limits, np.maximum.accumulate(begun[::-1])[::-1]
 
 
 def _least(limits: Array, begun: Array, allowed: float) -> float:
-    """The smallest limit from which upwards no limit has more than ``allowed`` onsets.
-
-    As the limit decreases, the number grows and falls again once normal values exceed it: the search is from above.
-    """
-    often = np.flatnonzero(begun > allowed)
-    return float(limits[min(often[-1] + 1, len(limits) - 1)] if len(often) else limits[0])
+    """The smallest limit from which upwards no limit has more than ``allowed`` onsets."""
+    often = int(np.searchsorted(-begun, -allowed))
+    return float(limits[min(often, len(limits) - 1)])

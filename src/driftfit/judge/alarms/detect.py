@@ -1,11 +1,16 @@
 """Detect: alarms from a run, at a set rate of false alarms.
 
+    "glr"           likelihood ratio of a change in the last 8 to 384 samples, against a frozen model of the reference
+    "cusum"         cumulated scores of that model: one sum up and one down for each parameter and for the noise
     "band"          a parameter has left its reference band:      max((theta - high) / std, (low - theta) / std) > z
     "innovation"    the last W innovations are too large, or too one-sided, for what the run expects
     "probability"   the probability of a change, from a tracker that carries hypotheses (`Bank`), is above a limit
 
 ``every`` is the number of samples in which one false alarm may begin (an alarm that stays on counts once).
 
+* glr, cusum: the model of the reference is estimated once and kept (`driftfit.judge.alarms.frozen`), so no tracker can
+  absorb a fault before it is noticed; the tracker gives the regressors only. Limits by a bootstrap of the reference
+  (`driftfit.judge.alarms.bootstrap`). They tell which parameter moved, by how much and since when: `Alarms.change`.
 * band: z such that a Gaussian sequence begins to exceed it once in ``every`` times c samples, for c parameters watched.
   Successive errors of an estimate have the correlation 1 / (1 + d), d = mean (theta_t - theta_(t-1))^2 / var_t, since
   a step of the filter has the variance that it removes. The rate holds for a parameter at the very edge of its band, if
@@ -45,10 +50,11 @@ from driftfit.engine.settings import numbers, one_of, whole
 from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
-from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of
+from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of, told_of
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
-from driftfit.run.live.rule import KINDS, AlarmRule, check_fits, value_text
+from driftfit.run.live.change import Change, change_of
+from driftfit.run.live.rule import FROZEN, KINDS, AlarmRule, check_fits, value_text
 from driftfit.run.result import Track
 from driftfit.show.parts.text import Printed, facts, table_of
 
@@ -89,6 +95,8 @@ class Alarms(Printed):
         First sample that is judged; the samples before it are the start of the run, or the reference.
     p : number
         Probability of an extreme like the largest here without a fault; NaN if nothing was judged.
+    told : (T, k)
+        For "glr" and "cusum": what `change` reads; otherwise without columns.
     """
 
     rule: AlarmRule
@@ -98,6 +106,7 @@ class Alarms(Printed):
     start: int
     p: float
     run: Track = field(repr=False, compare=False)
+    told: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False, compare=False)
 
     @property
     def kind(self) -> str:
@@ -116,12 +125,17 @@ class Alarms(Printed):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns: parameters, "power" and "mean" of the innovations, or "probability"."""
+        """Names of the columns, as in the rule."""
         return self.rule.names
 
     def cause(self, t: int) -> str:
-        """The column that is furthest beyond its limit at sample t."""
-        return self.names[self.rule.cause(self.statistic[t])]
+        """The column that is furthest beyond its limit at sample t; of "glr" the parameter that moved, or "noise"."""
+        change = self.change(t)
+        return self.names[self.rule.cause(self.statistic[t])] if change is None else change.name
+
+    def change(self, t: int) -> Change | None:
+        """For "glr" and "cusum": what changed, by how much and since when, as known at sample t; otherwise None."""
+        return change_of(self.rule, self.told[t], t) if self.kind in FROZEN else None
 
     def score(self, labels: Any) -> Score:
         """Compare with labels (T,), true where something is wrong; ValueError for another length."""
@@ -158,11 +172,15 @@ class Alarms(Printed):
             ("Alarms", f"{len(self.onsets)}"),
             *([] if np.isnan(self.p) else [("p-value", f"{p_text(self.p)} {chance}")]),
         )
-        table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", names=3)
-        for t in self.onsets[:20]:
-            j = self.names.index(self.cause(int(t)))
+        sizes = ("size", "+-", "since") if self.kind in FROZEN else ()
+        table = table_of("Alarms", "from", "to", "cause", "statistic", "limit", *sizes, names=3)
+        for t in map(int, self.onsets[:20]):
+            j, change = self.rule.cause(self.statistic[t]), self.change(t)
             numbers = (value_text(self.kind, self.statistic[t, j]), self.rule.limit_text(j))
-            table.add_row(*self.span(int(t)), Text(self.names[j]), *numbers)
+            if change is not None:
+                half = 0.5 * (change.high - change.low)
+                numbers = (*numbers, f"{change.size:.3g}", f"{half:.2g}", self.run.time_text(change.since))
+            table.add_row(*self.span(t), Text(self.cause(t)), *numbers)
         yield table
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
@@ -174,7 +192,7 @@ class Alarms(Printed):
 
 def detect(
     run: Track,
-    kind: str | AlarmRule = "band",
+    kind: str | AlarmRule = "glr",
     *,
     every: float = 10_000.0,
     reference: Reference = None,
@@ -190,11 +208,12 @@ def detect(
     Parameters
     ----------
         The run to be watched.
-    kind : "band", "innovation" or "probability", or an AlarmRule
+    kind : "glr", "cusum", "band", "innovation" or "probability", or an AlarmRule
         See the module. A rule, ``alarms.rule`` of another run, contains its limits and settings.
     every : number
         Samples in which one false alarm may begin.
     reference : mapping from names to (low, high), a number of samples, or (from, to)
+        For "glr" and "cusum": a segment that is normal; the first third of the record if there is none.
         For "band": the normal range of the parameters, or a segment of the record, whose range after the start of the
         run is the band. For "innovation": a segment that is normal. A segment is a number of first samples, or an
         interval of time without its end: dates if the record has them, otherwise numbers as in ``run.time`` (without
@@ -208,15 +227,15 @@ def detect(
     at : int
         The sample whose parameters are the true ones in that simulation.
     seed : int
-        Seed of that simulation.
+        Seed of that simulation, and of the bootstrap of "glr" and "cusum".
     start : int or None
-        With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
         With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
 
     Warns
     -----
     UserWarning
-        For "innovation" with a tracker that estimates its own drift (`AdaptiveKalman`) and therefore follows a fault.
+        For "innovation" with a tracker that estimates its own drift (`AdaptiveKalman`) and therefore follows a fault:
+        the record is judged by "glr" instead.
 
     Raises
     ------
@@ -229,16 +248,17 @@ def detect(
         return judged(run, kind, start)
     one_of("detect", "kind", kind, KINDS)
     every = numbers("detect", "every", every, ndim=0, low=1.0, strict=True)
-    asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
-    reference = in_samples(run, reference)
-    rule, first = rule_of(run, asked, reference)
     if kind == "innovation" and run.tracker.adapts:
         _warn_of_following(run)
-    if not calibrate and kind != "probability":
+        kind = "glr"
+    asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
+    reference = in_samples(run, reference)
+    rule, first = rule_of(run, asked, reference, seed)
+    if kind in FROZEN or (not calibrate and kind != "probability"):
         return judged(run, rule, first)
     made = []
     for null in null_records(run, every, at, seed):
-        own, begin = rule_of(null, asked, reference)
+        own, begin = rule_of(null, asked, reference, seed)
         made.append((statistic_of(null, own, begin), begin))
     limits = limit_of(made, every)
     said = judged(run, replace(rule, limits=tuple(limits.tolist()), simulated=True), first)
@@ -253,11 +273,12 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     check_fits(rule, run.tracker, run.names)
     if start is None:
         start = burn(run) if run.start is None else 0
-    statistic = statistic_of(run, rule, start)
+    told = told_of(run, rule, start) if rule.kind in FROZEN else np.zeros((0, 0))
+    statistic = told[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")
     active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
-    return Alarms(rule, active, onsets(active), statistic, start, p, run)
+    return Alarms(rule, active, onsets(active), statistic, start, p, run, told)
 
 
 def _highest(statistic: Array, start: int) -> Array:
@@ -270,9 +291,9 @@ def _warn_of_following(run: Track) -> None:
     """Warn that the innovations of a tracker that adapts are normal again soon after a fault."""
     warnings.warn(
         f"detect: {type(run.tracker).__name__} estimates its own drift and noise, so it follows a fault: its "
-        "innovations are soon normal again, and a slow fault is hardly visible in them. Watch the parameters with "
-        'detect("band", reference=...), or track with settings that are fitted to the reference and then kept, '
-        "tune(model, Kalman(), ...).tracker.",
+        "innovations are soon normal again, and a slow fault is hardly visible in them. The record is judged by "
+        'detect("glr") instead, against a model of the reference that does not adapt. For the innovations themselves, '
+        "track with settings that are fitted to the reference and then kept, tune(model, Kalman(), ...).tracker.",
         UserWarning,
         stacklevel=4,
     )

@@ -25,7 +25,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 
@@ -41,11 +41,11 @@ def power_rate(W: int) -> tuple[Rate, float, float]:
     """(P(begins), lower end, upper end of the limits) for the sum of W squares, W at least 4."""
     top = W + 20.0 * np.sqrt(2.0 * W) + 60.0
     grid = np.linspace(0.0, top, NODES)
-    weight = np.exp(special.xlogy(0.5 * (W - 1) - 1.0, grid / W) - 0.5 * (grid - W))
+    weight = np.exp(scipy.special.xlogy(0.5 * (W - 1) - 1.0, grid / W) - 0.5 * (grid - W))
     weight /= weight.sum()
 
     def begins(c: float) -> float:
-        above = np.where(grid >= c, 1.0, special.chdtrc(1, np.maximum(c - grid, 0.0)))
+        above = np.where(grid >= c, 1.0, scipy.special.chdtrc(1, np.maximum(c - grid, 0.0)))
         return float(np.sum(weight * above * (1.0 - above)))
 
     return begins, float(W), top
@@ -59,7 +59,7 @@ def mean_rate(W: int) -> tuple[Rate, float, float]:
     weight /= weight.sum()
 
     def begins(c: float) -> float:
-        inside = special.ndtr(c - grid) - special.ndtr(-c - grid)
+        inside = scipy.special.ndtr(c - grid) - scipy.special.ndtr(-c - grid)
         return float(np.sum(weight * inside * (1.0 - inside)))
 
     return begins, float(np.sqrt(W)), 12.0 * np.sqrt(W) + 12.0
@@ -73,7 +73,7 @@ def normal_rate(rho: float) -> tuple[Rate, float, float]:
     def begins(c: float) -> float:
         # most values that are about to exceed the limit are within a few standard deviations of it
         x = np.unique(np.concatenate([np.linspace(-9.0, c, NODES), c - spread * np.linspace(0.0, 9.0, NODES)]))
-        inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * special.ndtr((rho * x - c) / spread)
+        inside = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi) * scipy.special.ndtr((rho * x - c) / spread)
         return float(np.trapezoid(inside, x))
 
     return begins, 0.0, 12.0

@@ -53,6 +53,11 @@ def stretch(run: Track, reference: Any) -> tuple[int, int]:
     return first, end
 
 
+def first_third(run: Track) -> tuple[int, int]:
+    """(first, end) of the samples that are taken as normal where no reference was given."""
+    return stretch(run, len(run) // 3)
+
+
 def _place(run: Track, given: Any) -> int:
     """The first sample at or after a time, or a sample number."""
     time = run.time

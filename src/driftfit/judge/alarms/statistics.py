@@ -9,9 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
+from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
+from driftfit.engine.settings import plain
+from driftfit.judge.alarms.bootstrap import limits, simulated
+from driftfit.judge.alarms.frozen import frozen_model
 from driftfit.judge.alarms.onsets import (
     chance,
     mean_limit,
@@ -21,8 +25,11 @@ from driftfit.judge.alarms.onsets import (
     power_limit,
     power_rate,
 )
-from driftfit.judge.alarms.reference import burn, stretch
-from driftfit.run.live.rule import CHANGE, AlarmRule, check_fits, power_and_mean
+from driftfit.judge.alarms.reference import burn, first_third, stretch
+from driftfit.run.collected_samples import COLLECTED, collect
+from driftfit.run.live.likelihood_ratio import CUSUM, memory_of, scan
+from driftfit.run.live.rule import CHANGE, FROZEN, OFFSET, AlarmRule, check_fits, power_and_mean
+from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
 from driftfit.trackers.bank.results.results import Hypotheses
 
@@ -32,9 +39,52 @@ Chance = Callable[[Array, int], float]
 """Probability that a record without a fault reaches these highest values (c,) in a given number of samples."""
 
 
-def rule_of(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
+def rule_of(run: Track, rule: AlarmRule, reference: Reference, seed: int) -> tuple[AlarmRule, int]:
     """A rule with its names, reference and limits, and the first sample of the run that it judges."""
+    if rule.kind in FROZEN:
+        return _frozen(run, rule, reference, seed)
     return RULES[rule.kind](run, rule, reference)
+
+
+def samples_of(run: Track) -> tuple[Array, Array]:
+    """Regressors (T, n) of a run, and (T, 4): y, ok, noise, dt, as the tracker receives them."""
+    steps = run.program.steps._replace(store=collect)
+    tile = run.fresh()
+    out = np.empty(len(run), output_type(tile, COLLECTED))
+    run.program.drivers(steps=steps).run(tile, *lanes_of(run.record), out)
+    noise = np.broadcast_to(run.known.noise, len(run))
+    return out["phi"][..., 0], np.column_stack([out["y"], out["ok"], noise, out["dt"]])
+
+
+def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int) -> tuple[AlarmRule, int]:
+    """The model of the reference, and limits by its bootstrap."""
+    if isinstance(reference, Mapping):
+        raise ValueError(
+            f'detect: the reference of "{rule.kind}" must be a number of samples, such as reference=500, or (from, to).'
+        )
+    first, start = first_third(run) if reference is None else stretch(run, reference)
+    phi, rest = (part[first:start] for part in samples_of(run))
+    y, ok, noise = rest[:, 0], (rest[:, 1] > 0.0) & (rest[:, 3] > 0.0), rest[:, 2]
+    n, names, least = phi.shape[1], run.model.names, max(100, 10 * phi.shape[1])
+    if run.theta.shape[1] != n or ok.sum() < least:
+        raise ValueError(
+            f'detect: "{rule.kind}" estimates the {n} parameters of the regression from the reference, which needs at '
+            f"least {least} usable samples, and a tracker of these parameters; samples {first} to {start} contain "
+            f"{ok.sum()}, and {type(run.tracker).__name__} estimates {run.theta.shape[1]} parameters."
+        )
+    if not (np.ptp(phi[ok], axis=0) == 0.0).any():
+        phi, names = np.column_stack([phi, np.ones(len(phi))]), (*names, OFFSET)
+    root = np.sqrt(np.where(ok, noise, 1.0))
+    frozen, known = frozen_model(phi / root[:, None], y / root, ok)
+    rule = replace(
+        rule,
+        parameters=names,
+        names=("one parameter", "parameters", "noise") if rule.kind == "glr" else (*names, "noise"),
+        frozen=tuple(plain(one) for one in frozen),
+        simulated=True,
+    )
+    found, growth = limits(simulated(frozen, known, seed), rule.entries, rule.every)
+    return replace(rule, limits=plain(found), growth=plain(growth)), start
 
 
 def _band(run: Track, rule: AlarmRule, reference: Reference) -> tuple[AlarmRule, int]:
@@ -114,6 +164,15 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
+def told_of(run: Track, rule: AlarmRule, start: int) -> Array:
+    """What the compiled routine of "glr" and "cusum" writes for every sample, (T, k), NaN before ``start``."""
+    n, (phi, rest), model = len(rule.parameters), samples_of(run), rule.reference
+    told = np.full((len(run), CUSUM + n + 1), np.nan)
+    rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
+    scan(rows[start:], model, memory_of(n, len(model.ar)), told[start:])
+    return told
+
+
 def _carried(statistic: Array) -> Array:
     """Repeat the last statistic where there is no new sample."""
     place = np.maximum.accumulate(np.where(np.isfinite(statistic[:, 0]), np.arange(len(statistic)), -1))
@@ -121,14 +180,24 @@ def _carried(statistic: Array) -> Array:
 
 
 def chance_of(run: Track, rule: AlarmRule) -> Chance:
-    """The probability of an extreme by theory; NaN for probabilities and simulated limits, which have no theory."""
+    """The probability of an extreme by theory; NaN for probabilities and simulated limits, which have no theory.
+
+    For "glr" and "cusum" it is that of the limits that all columns have together at a smaller rate.
+    """
+    if rule.kind in FROZEN:
+
+        def of_deviates(highest: Array, J: int) -> float:
+            beyond = np.max((np.maximum(highest, 0.0) ** 2 - np.array(rule.limits) ** 2) / np.array(rule.growth))
+            return float(-np.expm1(-J / rule.every * np.exp(-beyond)))
+
+        return of_deviates
     if rule.simulated or rule.kind == "probability":
         return lambda highest, J: float("nan")
     if rule.kind == "band":
         rates = [normal_rate(rho) for rho in _alike(run, rule, slice(burn(run), None))]
 
         def of_band(highest: Array, J: int) -> float:
-            each = [chance(rate, z, special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
+            each = [chance(rate, z, scipy.special.ndtr(-z), J) for rate, z in zip(rates, highest, strict=True)]
             return min(1.0, len(each) * min(each))
 
         return of_band
@@ -137,8 +206,8 @@ def chance_of(run: Track, rule: AlarmRule) -> Chance:
         W, slack = rule.window, rule.slack
         loud, aside = W + (highest[0] - W) / slack, highest[1] / slack
         each = (
-            chance(power_rate(W), loud, special.chdtrc(W, max(loud, 0.0)), J),
-            chance(mean_rate(W), aside, 2.0 * special.ndtr(-aside / np.sqrt(W)), J),
+            chance(power_rate(W), loud, scipy.special.chdtrc(W, max(loud, 0.0)), J),
+            chance(mean_rate(W), aside, 2.0 * scipy.special.ndtr(-aside / np.sqrt(W)), J),
         )
         return min(1.0, 2.0 * min(each))
 

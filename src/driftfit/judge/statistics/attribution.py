@@ -18,7 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
@@ -103,7 +103,7 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
-    far = np.abs(after - before) > special.ndtri(1.0 - 0.5 * level) * std
+    far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
     return Attribution(p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)])
 

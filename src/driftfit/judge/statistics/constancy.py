@@ -17,8 +17,10 @@ or the excitation changes, that table is wrong, but the null distribution used h
 record. Zero drift lies on the boundary of "q >= 0", which invalidates likelihood-ratio tests, but not a score test.
 
 L averages over the record and is most powerful against slow drift. The suprema over one break and over an interval
-(`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. The Cauchy combination of
-Liu and Xie (2020) turns the three into one p-value, so that the error rate is that of all together.
+(`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. If the scores are white
+and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild`), which also finds a break
+in the last few samples. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, so that the error
+rate is that of all together.
 
 The noise is estimated under the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which
 are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
@@ -40,14 +42,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.bandwidth import plugged_in, rule_of_thumb
 from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
-from driftfit.judge.statistics.supremum import suprema, together
+from driftfit.judge.statistics.supremum import TIED, suprema, together
+from driftfit.judge.statistics.wild import wild_supremum
 
 POINTS = 48
 """Largest number of points of the path for the suprema and their null; the mean squares use every second point."""
@@ -74,8 +77,8 @@ class Constancy(NamedTuple):
     """Nyblom's statistic of all parameters together."""
     p_joint: float
     """p-value of all tests of all parameters together."""
-    p_each: tuple[float, float, float]
-    """p-values of all parameters: of the mean square, of one break, of an interval."""
+    p_each: tuple[float, float, float, float]
+    """p-values of all parameters: of the mean square, of one break, of an interval, of one break near an end."""
     at: Array
     """(n,): the sample (of the N) at which each parameter most likely changed."""
     path: Array
@@ -144,7 +147,9 @@ def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> 
     alone = ((path[ends - 1, i : i + 1], own[:, i : i + 1, :, i : i + 1]) for i in range(n))
     p_own = [together(p_path[i], *suprema(*one, ends, least, apart)) for i, one in enumerate(alone)]
     joint, p_mean = _joint(S[ends[mean] - 1], _thinned(null, mean), V[-1])
-    p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart))
+    white = len(found.ar) + rest == 0
+    late = wild_supremum(X, still.residual, found.level) if white else np.nan
+    p_each = (p_mean, *suprema(S[ends - 1], null, ends, least, apart), late)
     spread = np.sqrt(np.maximum(np.einsum("bibi->bi", own), 0.0))
     std = np.stack([np.interp(np.arange(1, N + 1), np.append(0, ends), np.append(0.0, spread[:, i])) for i in range(n)])
     at, z = _dates(path, std.T)
@@ -162,14 +167,14 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     """
     N, n = X.shape
     w = whitened(X[:, :0], np.clip(found.residual / found.level, -HELD, HELD), found.ar)[1]
-    basis = linalg.qr(rows, mode="economic")[0]
+    basis = scipy.linalg.qr(rows, mode="economic")[0]
     w = w - basis @ (basis.T @ w)
     for k in range(1, min(len(found.ar), MOST_LAGS) + 1):
         lagged = np.zeros((N, n))
         lagged[k:] = X[:-k]
         lagged[: len(found.ar)] = 0.0
         lagged -= basis @ (basis.T @ lagged)
-        Q, R, _ = linalg.qr(lagged, mode="economic", pivoting=True)
+        Q, R, _ = scipy.linalg.qr(lagged, mode="economic", pivoting=True)
         new = Q[:, np.abs(np.diag(R)) > 1e-6 * np.sqrt(N)]
         explained = new.T @ w
         gain = -N * np.log1p(-explained @ explained / (w @ w))
@@ -200,7 +205,7 @@ def _nothing(N: int, n: int) -> Constancy:
     unknown = np.full(n, np.nan)
     fit = Fit(unknown, np.full(N, np.nan), float("nan"), np.full(N, np.nan), np.zeros(N))
     path = np.full((N, n), np.nan)
-    return Constancy(unknown, unknown, unknown, np.nan, np.nan, (np.nan,) * 3, np.zeros(n, int), path, fit, None, 0)
+    return Constancy(unknown, unknown, unknown, np.nan, np.nan, (np.nan,) * 4, np.zeros(n, int), path, fit, None, 0)
 
 
 def _summed(scores: Array, lags: int) -> Array:
@@ -215,8 +220,8 @@ def _summed(scores: Array, lags: int) -> Array:
 def _profile(left: Array, right: Array, ends: Array) -> Array:
     """sum over s < end of left_s right_s', (m, n, n)."""
     starts = np.concatenate([[0], ends[:-1]])
-    blocks = [left[a:b].T @ right[a:b] for a, b in zip(starts, ends, strict=True)]
-    total: Array = np.cumsum(np.array(blocks), axis=0)
+    blocks = np.add.reduceat(left[:, :, None] * right[:, None, :], starts, axis=0)
+    total: Array = np.cumsum(blocks, axis=0)
     return total
 
 
@@ -239,22 +244,23 @@ def _thinned(cov: Array, points: Array) -> Array:
 
 def _turned(cov: Array, M: Array) -> Array:
     """Covariance (m, n, m, n) of a path whose rows are multiplied by M (n, n)."""
-    turned: Array = np.ascontiguousarray(np.swapaxes(M @ np.swapaxes(cov, 1, 2) @ M.T, 1, 2))
-    return turned
+    m, n = cov.shape[:2]
+    left = (M @ cov.reshape(m, n, m * n)).reshape(-1, n)
+    return (left @ M.T).reshape(m, len(M), m, len(M))
 
 
 def _weights(cov: Array) -> Array:
-    """Weights of the chi-squares of the mean square of a path with this covariance over its m points."""
-    weights: Array = np.maximum(np.linalg.eigvalsh(0.5 * (cov + cov.T)), 0.0)
+    """Weights (.., m) of the chi-squares of the mean square of a path with covariance (.., m, m) over its m points."""
+    weights: Array = np.maximum(np.linalg.eigvalsh(cov), 0.0)
     return weights
 
 
 def _each(S: Array, cov: Array, var: Array) -> tuple[Array, Array]:
     """Statistic and p-value of each parameter separately."""
-    m, n = S.shape
+    m = len(S)
     L = np.mean(S * S, axis=0) / var
-    p = [tail(_weights(cov[:, i, :, i]) / (m * var[i]), L[i]) for i in range(n)]
-    return L, np.array(p)
+    weights = _weights(np.moveaxis(np.diagonal(cov, axis1=1, axis2=3), -1, 0)) / (m * var[:, None])
+    return L, np.array([tail(*one) for one in zip(weights, L, strict=True)])
 
 
 def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
@@ -270,6 +276,6 @@ def _joint(S: Array, cov: Array, V: Array) -> tuple[float, float]:
 def _dates(path: Array, std: Array) -> tuple[Array, Array]:
     """The positions at which each standardised path is furthest from zero, without the edges."""
     N = len(path)
-    z = path / np.where(std > 0.0, std, np.inf)
+    z = path / np.where(std > np.sqrt(TIED) * std.max(axis=0), std, np.inf)
     low, high = int(EDGE * N), max(int((1.0 - EDGE) * N), int(EDGE * N) + 1)
     return low + np.argmax(np.abs(z[low:high]), axis=0) + 1, z

@@ -30,11 +30,12 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.partition import partition
 from driftfit.judge.statistics.robust import cholesky, huber
+from driftfit.judge.statistics.scale import deviation, median
 
 HELD = 3.0
 """y is limited to this many noise levels around the fit."""
@@ -96,11 +97,13 @@ def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, le
             r[w, k] = lagged(own, HELD * level[w], k)
 
 
-def _segments(
-    Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, residual: Array, near: Array, leverage: Array
-) -> None:
-    """Robust fits of segments on the white rows X, z, those that are mixed left out: residual (N,) of y on Q, near
-    (N,), that of the neighbouring segment where a break is near and it is smaller, and the leverage (N,) of X."""
+def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Array, out: Array) -> None:
+    """Robust fits of segments on the white rows X, z, those that are mixed left out.
+
+    ``out`` (3, N) are the residual of y on Q, that of the neighbouring segment where a break is near and it is smaller,
+    and the leverage of X.
+    """
+    residual, near, leverage = out[0], out[1], out[2]
     N, n = Q.shape
     K = bounds.shape[0] - 1
     theta, own = np.zeros((K, n)), np.empty(N)
@@ -212,12 +215,13 @@ class _Search(NamedTuple):
             X, z = whitened(Q / self.c[:, None], held / self.c, ar)
             size = self.size(near, ar)
             breaks = partition(X / size, z / size, self.grid, self.price(ar), self.least, len(ar))
-            residual, near, leverage = np.empty(N), np.empty(N), np.empty(N)
+            fits = np.empty((3, N))
             z = whitened(X[:, :0], y / self.c, ar)[1]
             bounds = np.concatenate([[0], breaks, [N]])
-            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), residual, near, leverage)
+            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), fits)
+            residual, near, leverage = fits
             ar = self.correlation(near, breaks)
-            c = self.c * (1.4826 * np.median(np.abs(near / self.c)))
+            c = self.c * deviation(near / self.c)
             held = y - near + np.clip(near, -HELD * c, HELD * c)
             if np.array_equal(before, breaks):
                 break
@@ -230,7 +234,7 @@ class _Search(NamedTuple):
             held,
             near,
             leverage,
-            self.size(near, ar) * float(np.median(self.c / c)),
+            self.size(near, ar) * median(self.c / c),
             self.price(ar),
         )
 
@@ -242,7 +246,7 @@ class _Search(NamedTuple):
     def correlation(self, v: Array, breaks: Array) -> Array:
         """The autoregression of v within segments."""
         N, r, v = len(v), np.zeros(self.P + 1), v / self.c
-        limit = HELD * 1.4826 * np.median(np.abs(v))
+        limit = HELD * deviation(v)
         _lags(v, np.concatenate([[0], breaks, [N]]), np.array([limit]), r)
         if not r[0] > 0.0:
             return r[:0]
@@ -256,7 +260,7 @@ class _Search(NamedTuple):
         if longest <= self.P:
             return ar
         w, r = whitened(np.zeros((N, 0)), v, ar)[1], np.zeros(longest + 1)
-        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * 1.4826 * np.median(np.abs(w))]), r)
+        _lags(w, np.concatenate([[0], breaks, [N]]), np.array([HELD * deviation(w)]), r)
         later = r[self.P + 1 :] / r[0] if r[0] > 0.0 else np.zeros(longest - self.P)
         best = int(np.argmax(np.abs(later)))
         b = float(np.clip(later[best], -LARGEST, LARGEST))
@@ -269,8 +273,9 @@ class _Search(NamedTuple):
     def size(self, v: Array, ar: Array) -> float:
         """Standard deviation of the white noise, with outliers limited."""
         w = whitened(np.zeros((len(v), 0)), v / self.c, ar)[1]
-        limit = HELD * 1.4826 * np.median(np.abs(w))
-        return float(np.sqrt(np.mean(np.clip(w, -limit, limit) ** 2))) if limit > 0.0 else 1.0
+        limit = HELD * deviation(w)
+        held = np.clip(w, -limit, limit)
+        return float(np.sqrt(held @ held / len(held))) if limit > 0.0 else 1.0
 
 
 def whitened(X: Array, y: Array, ar: Array) -> tuple[Array, Array]:
@@ -294,8 +299,8 @@ def penalty(N: int, n: int, least: int, quiet: float) -> float:
     follows from the supremum of a chi-square process with n degrees of freedom over its places (Siegmund, 1985).
     """
     span = np.log(max(N / least - 1.0, np.e))
-    one = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
-    pair = _exceeded(lambda c: special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
+    one = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * c * span - quiet)
+    pair = _exceeded(lambda c: scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(c * c / least, 1.0) * N - 0.5 * quiet)
     return max(one, 0.5 * pair)
 
 
@@ -319,7 +324,7 @@ def _level(spans: tuple[Array, Array], level: Array, N: int) -> Array:
 
     smooth = ndimage.median_filter(level, 5, mode="nearest") if len(level) > 2 else level
     positive = smooth[smooth > 0.0]
-    floor = 0.05 * float(np.median(positive)) if len(positive) else 1.0
+    floor = 0.05 * median(positive) if len(positive) else 1.0
     return np.interp(np.arange(N), 0.5 * (spans[0] + spans[1]), np.maximum(smooth, floor))
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.robust import cholesky
 
 
@@ -38,46 +38,65 @@ def _sum(phi: Array, y: Array, ends: Array, p: Array, G: Array) -> None:
         start = ends[b]
 
 
+@shared
+def _cost(G: Array, ends: Array, s: int, t: int, p: int, total: Array, seen: Array, M: Array) -> float:
+    """C(s, t), with one for each row after a break that belongs to two segments.
+
+    The blocks up to t that are new are added to total[s] (k, k); seen[s] (2,) is up to where they have been, and the
+    number of those rows.
+    """
+    k = M.shape[0]
+    start = ends[s - 1] if s > 0 else 0
+    for b in range(seen[s, 0], t):
+        begin = ends[b - 1] if b > 0 else 0
+        free = 0 if s == 0 else p - (begin - start)
+        if free <= 0 or begin == start:
+            block = G[1 if free > 0 else 0, b]
+            for i in range(k):
+                for j in range(i + 1):
+                    total[s, i, j] += block[i, j]
+            seen[s, 1] += max(0, min(free, ends[b] - begin))
+        else:
+            seen[s, 1] += ends[b] - begin
+    seen[s, 0] = t
+    M[:] = total[s]
+    return cholesky(M, k - 1) + seen[s, 1]  # type: ignore[no-any-return]
+
+
 def _partition(G: Array, ends: Array, penalty: Array, least: Array, p: Array, F: Array, last: Array) -> None:
-    """F (m + 1,), and the start of the last segment of the first t blocks, last (m + 1,)."""
+    """F (m + 1,), and the start of the last segment of the first t blocks, last (m + 1,).
+
+    The cost of a segment never falls as it grows, so what it was at an earlier end is a bound, and where that exceeds
+    the best total so far it is not computed again.
+    """
     m, k = G.shape[1], G.shape[2]
     total, M = np.zeros((m, k, k)), np.zeros((k, k))
-    alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, np.inf)
-    mixed = np.zeros(m)
-    count = 0
+    alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, -np.inf)
+    seen, count, chosen = np.zeros((m, 2), np.int64), 0, -1
+    seen[:, 0] = np.arange(m)
     F[0] = -penalty[0]
     for t in range(1, m + 1):
-        end, begin = ends[t - 1], ends[t - 2] if t > 1 else 0
+        end = ends[t - 1]
         if np.isfinite(F[t - 1]):
             alive[count] = t - 1
             count += 1
-        best, chosen = np.inf, -1
+        best, bound = np.inf, np.inf
+        if chosen >= 0:
+            bound = value[chosen] = F[chosen] + _cost(G, ends, chosen, t, p[0], total, seen, M)
         for a in range(count):
             s = alive[a]
             start = ends[s - 1] if s > 0 else 0
-            free = 0 if s == 0 else p[0] - (begin - start)
-            if free <= 0 or begin == start:
-                block = G[1 if free > 0 else 0, t - 1]
-                for i in range(k):
-                    for j in range(i + 1):
-                        total[s, i, j] += block[i, j]
-                mixed[s] += max(0, min(free, end - begin))
-            else:
-                mixed[s] += end - begin
-            value[s] = np.inf
-            if end - start >= least[0]:
-                for i in range(k):
-                    for j in range(i + 1):
-                        M[i, j] = total[s, i, j]
-                value[s] = F[s] + cholesky(M, k - 1) + mixed[s]
+            if end - start >= least[0] and value[s] <= bound:
+                if seen[s, 0] < t:
+                    value[s] = F[s] + _cost(G, ends, s, t, p[0], total, seen, M)
                 if value[s] < best:
-                    best, chosen = value[s], s
+                    best, bound, chosen = value[s], min(value[s], bound), s
         F[t] = best + penalty[0]
-        last[t] = chosen
+        last[t] = chosen if best < np.inf else -1
         kept = 0
         for a in range(count):
             s = alive[a]
-            if expired[s] < 0 and np.isfinite(value[s]) and value[s] - p[0] >= F[t]:
+            if expired[s] < 0 and value[s] - p[0] >= F[t]:
                 expired[s] = end
             if expired[s] < 0 or end - expired[s] < least[0]:
                 alive[kept] = s

@@ -17,23 +17,40 @@ of the record instead of those of a stationary one. Cost: O(m^2 n^3) for m posit
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.judge.statistics.robust import cholesky
 
+TIED = 1e-9
+"""A variance below this share of the largest of the path is rounding."""
+
 
 def _scan(S: Array, cov: Array, Q: Array, left: Array, right: Array) -> None:
-    """Q, and 1 - rho if a or b moves by one position; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n)."""
+    """Q, and 1 - rho if a or b moves by one position; S (m + 1, n) from 0 on, cov (m + 1, n, m + 1, n).
+
+    A component whose change has no variance (a regressor of the fit ties the path to zero there) does not count: the
+    quotient would be that of two rounding errors.
+    """
     m, n = S.shape[0] - 1, S.shape[1]
-    M, z = np.zeros((n + 1, n + 1)), np.zeros(n)
+    M, z, size = np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(n)
+    for i in range(n):
+        for b in range(m + 1):
+            size[i] = max(size[i], cov[b, i, b, i])
     for a in range(m):
         for b in range(a + 1, m + 1):
             for i in range(n):
                 for j in range(i + 1):
                     M[i, j] = cov[b, i, b, j] + cov[a, i, a, j] - cov[a, i, b, j] - cov[b, i, a, j]
                 M[n, i] = S[b, i] - S[a, i]
+            for i in range(n):
+                if not M[i, i] > TIED * size[i]:
+                    M[n, i] = 0.0
+                    for j in range(n):
+                        M[max(i, j), min(i, j)] = 0.0
             M[n, n] = 0.0
             cholesky(M, n)
             total = 0.0
@@ -107,14 +124,14 @@ def _tail(Q: Array, n: int, *moved: Array) -> float:
     places = np.ones(len(Q))
     for one in moved:
         places *= _kappa(c * np.minimum(one, 1.0))
-    return float(min(1.0, special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
+    return float(min(1.0, scipy.special.gammaincc(0.5 * n, 0.5 * c) * max(1.0, places.sum())))
 
 
 def _kappa(x: Array) -> Array:
     """x nu(sqrt(2 x))."""
     half = np.sqrt(np.maximum(x, 1e-12) / 2.0)
     density = np.exp(-0.5 * half * half) / np.sqrt(2.0 * np.pi)
-    above = special.ndtr(half)
+    above = scipy.special.ndtr(half)
     nu = (above - 0.5) / half / (half * above + density)
     kappa: Array = np.minimum(1.0, np.maximum(x, 0.0) * nu)
     return kappa
@@ -126,12 +143,11 @@ def together(mean: float, *suprema: float) -> float:
     The mean square has half of the weight, and the suprema share the rest. p-values above one half count as one half:
     those of suprema are bounds without meaning there.
     """
-    p = np.array([mean, *suprema])
-    weight = np.array([0.5, *[0.5 / len(suprema)] * len(suprema)])
-    known = np.isfinite(p)
-    if not known.any():
+    weights = (0.5, *[0.5 / len(suprema)] * len(suprema))
+    known = [(w, min(max(p, 1e-12), 0.5)) for w, p in zip(weights, (mean, *suprema), strict=True) if math.isfinite(p)]
+    if not known:
         return float("nan")
-    p, weight = np.clip(p[known], 1e-12, 0.5), weight[known] / weight[known].sum()
     # tan loses the small p-values
-    total = float(np.sum(weight * np.where(p < 1e-6, 1.0 / (p * np.pi), np.tan((0.5 - p) * np.pi))))
-    return 1.0 / (total * np.pi) if total > 1e6 else float(0.5 - np.arctan(total) / np.pi)
+    total = sum(w * (1.0 / (p * math.pi) if p < 1e-6 else math.tan((0.5 - p) * math.pi)) for w, p in known)
+    total /= sum(w for w, _ in known)
+    return 1.0 / (total * math.pi) if total > 1e6 else 0.5 - math.atan(total) / math.pi

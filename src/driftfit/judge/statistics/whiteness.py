@@ -11,9 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
+from driftfit.judge.statistics.scale import deviation
 
 
 class Whiteness(NamedTuple):
@@ -29,7 +30,7 @@ def clipped(z: Array) -> Array:
     """z limited to three robust standard deviations, with missing values as 0."""
     z = np.where(np.isfinite(z), z, 0.0)
     used = np.abs(z[z != 0.0])
-    limit = 3.0 * 1.4826 * float(np.median(used)) if used.size else 0.0
+    limit = 3.0 * deviation(used) if used.size else 0.0
     return np.clip(z, -limit, limit)
 
 
@@ -51,8 +52,9 @@ def _correlation(z: Array, u: Array, lags: range) -> Whiteness:
     if not total > 0.0 or not len(lags):
         unknown = np.full(len(lags), np.nan)
         return Whiteness(unknown, unknown, float("nan"), float("nan"))
-    pairs = [z[k:] * u[: len(u) - k] for k in lags]
-    r = np.array([np.sum(pair) for pair in pairs]) / total
-    std = np.sqrt([np.sum(pair * pair) for pair in pairs]) / total
+    past = np.concatenate([np.zeros(lags[-1]), u])
+    shifted = np.lib.stride_tricks.sliding_window_view(past, len(u))[lags[-1] - np.array(lags)]
+    r = shifted @ z / total
+    std = np.sqrt((shifted * shifted) @ (z * z)) / total
     Q = float(np.sum((r[std > 0.0] / std[std > 0.0]) ** 2))
-    return Whiteness(r, std, Q, float(special.chdtrc(len(lags), Q)))
+    return Whiteness(r, std, Q, float(scipy.special.chdtrc(len(lags), Q)))

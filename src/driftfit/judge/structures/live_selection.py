@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.storage import Kept
@@ -84,7 +84,7 @@ class LiveSelection(Kept):
     @property
     def weights(self) -> Array:
         """(K,) of the candidates for the next sample; they add up to 1."""
-        return np.asarray(special.softmax(self.forgetting * self._logs))
+        return np.asarray(scipy.special.softmax(self.forgetting * self._logs))
 
     @property
     def best(self) -> Live:

@@ -237,7 +237,9 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    records, _ = records_of(y, u, reading, data)
+    if any(len(model.outputs) > 1 for model in candidates):
+        raise ValueError("select: structures are compared for one output at a time.")
+    _, records, _ = records_of(candidates[0], y, u, reading, data)
     if data is None:
         factor("drift", drift, len(records.y))
     elif records.drifts is not None:
@@ -245,8 +247,6 @@ def select(
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
-    if any(len(model.outputs) > 1 for model in bound):
-        raise ValueError("select: structures are compared for one output at a time.")
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
     names = [repr(model) for model in candidates]

@@ -1,10 +1,12 @@
 """Alarms on a stream: the rule of a reference run, applied sample by sample, bit-equal to `Track.detect` on the record.
 
-It needs the memory of the window. Cost: some ten microseconds per sample in addition to the update.
+It needs the memory of the window, or of the sums of "glr". Cost: some ten microseconds per sample in addition to the
+update.
 """
 
 from __future__ import annotations
 
+from base64 import b64decode, b64encode
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -13,9 +15,13 @@ import numpy as np
 
 from driftfit.data.storage import describe, rebuild
 from driftfit.engine.kernel import Array
-from driftfit.run.live.rule import AlarmRule, change_probability, check_fits, last_power_and_mean
+from driftfit.run.live.change import Change, change_of
+from driftfit.run.live.likelihood_ratio import memory_of, scan
+from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
 from driftfit.trackers.base import Tracker
 
+ROW = ("y", "ok", "noise", "dt")
+"""Fields of the record that follow the regressors in a row of the frozen model."""
 KEPT = 256
 """Number of onsets that are kept until `onsets` is called."""
 
@@ -60,14 +66,27 @@ class LiveAlarm:
         self._wait, self._left = wait, 0
         self._scores: deque[float] = deque(maxlen=rule.window)
         self._onsets: deque[Onset] = deque(maxlen=KEPT)
+        if rule.kind in FROZEN:
+            self._frozen = rule.reference
+            self._memory = memory_of(len(rule.parameters), len(self._frozen.ar))
+            self._row = np.ones((1, len(rule.parameters) + len(ROW)))
+            self._told = self._memory.told[None].copy()
 
     def __repr__(self) -> str:
         return f"LiveAlarm({self.rule!r}, {'on' if self.active else 'off'} after {self.samples} samples)"
 
     @property
     def cause(self) -> str:
-        """The column that is now furthest beyond its limit."""
-        return self.rule.names[self.rule.cause(self.statistic)]
+        """The column that is now furthest beyond its limit; of "glr" the parameter that moved, or "noise"."""
+        change = self.change
+        return self.rule.names[self.rule.cause(self.statistic)] if change is None else change.name
+
+    @property
+    def change(self) -> Change | None:
+        """For "glr" and "cusum": what changed, by how much and since when; otherwise None."""
+        if self.rule.kind not in FROZEN:
+            return None
+        return change_of(self.rule, self._told[0], self.samples - 1)
 
     def onsets(self) -> list[Onset]:
         """The alarms that began since the last call; at most the last 256."""
@@ -87,14 +106,21 @@ class LiveAlarm:
         self.begun = self.active and not before
         if self.begun:
             j = self.rule.cause(self.statistic)
-            onset = (self.rule.names[j], float(self.statistic[j]), self.rule.limits[j])
+            onset = (self.cause, float(self.statistic[j]), self.rule.limits[j])
             self._onsets.append(Onset(self.samples, time, *onset))
         self.samples += 1
 
     def _compare(self, tile: Array, lane: int, e: float, s: float) -> None:
         """The statistic after a sample; without a new one the last is kept."""
         rule = self.rule
-        if rule.kind == "band":
+        if rule.kind in FROZEN:
+            row, phi = self._row[0], tile["phi"][0, :, lane]
+            row[: len(phi)] = phi
+            for place, name in enumerate(ROW, len(rule.parameters)):
+                row[place] = tile[name][0, lane]
+            scan(self._row, self._frozen, self._memory, self._told)
+            self.statistic = self._told[0, rule.entries]
+        elif rule.kind == "band":
             theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
             self.statistic = rule.outside(theta, np.sqrt(var))
         elif rule.kind == "probability":
@@ -113,6 +139,7 @@ class LiveAlarm:
             "rule": describe(self.rule), "active": self.active, "begun": self.begun, "samples": self.samples,
             "statistic": self.statistic.tolist(), "wait": self._wait, "left": self._left,
             "scores": list(self._scores), "onsets": [list(onset) for onset in self._onsets],
+            "memory": [b64encode(part).decode() for part in self._memory] if self.rule.kind in FROZEN else [],
         }  # fmt: skip
 
     @classmethod
@@ -123,6 +150,10 @@ class LiveAlarm:
         alarm.statistic, alarm._left = np.array(state["statistic"], float), state["left"]
         alarm._scores.extend(state["scores"])
         alarm._onsets.extend(Onset(*onset) for onset in state["onsets"])
+        for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=True):
+            part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
+        if state.get("memory"):
+            alarm._told[0] = alarm._memory.told
         return alarm
 
 

@@ -60,13 +60,9 @@ class Window:
 
     def _filter(self, count: int, rows: Array, values: Array) -> None:
         """Update the earlier information by the first ``count`` samples of the window."""
-        walk = self._first(count)
-        drift = np.sqrt(np.append(walk.drift, 0.0))
-        filters, _ = two_filters.compiled()
         scratch = np.zeros(1, two_filters.block_type(len(self.G)))
         self.before["S"][..., 1] = self.before["d"][..., 1] = 0.0
-        changes = two_filters.changes(walk)
-        filters(self.before, walk.phi, walk.y, np.sqrt(walk.weight), drift, *changes, rows, values, scratch)
+        two_filters.filter_both(self.before, self._first(count), rows, values, scratch)
 
     def _first(self, count: int) -> Walk:
         """The smoothing problem of the first ``count`` samples of the window."""

@@ -23,7 +23,7 @@ class Operated(ABC):
 
     tracker: Tracker
     _tile: Array
-    _window: Window | None
+    _windows: list[Window]
 
     @property
     @abstractmethod
@@ -68,7 +68,7 @@ class Operated(ABC):
         chosen = self._chosen(which)
         if p is None and theta is None:
             raise ValueError("Live.reset: give p= (the variance of their possible change), theta=, or both.")
-        if self._window is not None:
+        if self._windows:
             raise ValueError(
                 "Live.reset: smoothing with lag= does not support resets; keep a second stream without lag=."
             )

@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
 from driftfit.data import storage
-from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.labels import by_name, order_of
-from driftfit.data.limits import Gate
 from driftfit.data.signals import noise_of
 from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.kernel import Array
-from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.fixed_lag import FixedLag, Window
-from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
+from driftfit.run.live.late_input import LATER
 from driftfit.run.live.rule import AlarmRule
-from driftfit.run.output_lanes import programs_of
-from driftfit.run.program import Program, state_of, tile_of
-from driftfit.run.public_class import Plain
-from driftfit.run.result import burn_in
-from driftfit.run.shared_outputs import row_model
-from driftfit.run.warm_start import End, Run, carried
-from driftfit.trackers.base import Tracker
+from driftfit.run.live.stream import Stream
+from driftfit.run.program import Program, state_of
+from driftfit.run.warm_start import Run
+
+ROWS = "rows"
+"""The name of the alarm of outputs that share one theta."""
 
 Steps = tuple[Array, Array, Array, Array]
 """(y_hat, e, s, ok), each (ny,)."""
 
 
-class LiveOutputs(Plain, storage.Kept):
+class LiveOutputs(Stream):
     """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
 
     ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
@@ -48,34 +43,11 @@ class LiveOutputs(Plain, storage.Kept):
         self, model: Model, tracker: Any, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
         limits: Mapping[Any, Any] | None = None,
     ) -> None:  # fmt: skip
-        self.model = model if model.shared else model.bind(model.m)
-        given = programs_of(self.model, tracker)
-        self._clock = Clock.of(dt)
-        self.dt = self._clock.plain
-        self._pace = Pace(self._clock, model.reach)
-        self.lag = whole("Live", "lag", lag, 0)
-        if lag and warm_start is not None:
-            raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
-        before = None if warm_start is None else warm_start.end()
-        self._last: Any = None if before is None else before.last
-        self._awaits = NOTHING if before is None else before.awaits
-        self._cold = before is None
-        self._ignored = 0
-        self._alarms: dict[str, LiveAlarm] = {}
-        self._place: Any = None
-        self._rows = row_model(self.model, given[0].tracker) if self.model.shared else self.model
-        self.programs = tuple(replace(one, model=self._rows) for one in given)
-        self._gate = Gate(limits, model.outputs, self._rows.input_names, self._rows.m) if limits else None
-        self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+        self._begin(model, tracker, dt, lag, warm_start, limits)
         self._out = self.programs[0].written(self._tile, 1)
         self._run = self.programs[0].drivers().run
         rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
         self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
-
-    @property
-    def trackers(self) -> tuple[Tracker, ...]:
-        """The tracker of each output, or of the theta that they share."""
-        return tuple(one.tracker for one in self.programs)
 
     def update(self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0) -> Steps:
         """Process one sample: y (ny,), u (m,), or (ny, m) where the outputs share one theta.
@@ -83,32 +55,16 @@ class LiveOutputs(Plain, storage.Kept):
         u is None if it is not known; if it is left out, it comes with `apply`, as in `Live.update`. y may map the names
         of the outputs to numbers, and u those of the inputs if the model has names for them.
         """
-        ny = len(self.model.outputs)
-        check_applied(self._awaits)
-        later = u is LATER and self._rows.m > 0
-        if later:
-            self._placing()
-        if time is not None:
-            self._clock, time = self._clock.at(time), instant(time)
-        interval = 1.0 if time is None else self._clock.since(self._last, time)
-        if not interval >= 0.0:
-            self._ignored += 1
-            self._awaits = IGNORED if later else NOTHING
-            nothing = np.full(ny, np.nan)
-            return nothing, nothing, nothing, np.zeros(ny, bool)
-        known = self._known(interval, weight, drift)
-        output, inputs = self._outputs(y), self._inputs(None if u is LATER else u)
-        if self._gate is not None:
-            output, inputs = self._gate.sample(output, inputs)
-        step = self._step(self._tile, output, inputs, known, self._windows)
-        if time is not None:
-            self._last = time
-            self._pace.see(interval)
-        for name, alarm in self._alarms.items():
-            lane = self.model.outputs.index(name)
-            alarm.take(self._tile, lane, step[1][lane], step[2][lane], time)
-        self._awaits = INPUT if later else NOTHING
+        step: Steps = self._sample(y, u, time, weight, drift)
         return step
+
+    def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
+        outputs, inputs = self._outputs(y), self._inputs(u)
+        return (outputs, inputs) if self._gate is None else self._gate.sample(outputs, inputs)
+
+    def _nothing(self) -> Steps:
+        ny = len(self.model.outputs)
+        return np.full(ny, np.nan), np.full(ny, np.nan), np.full(ny, np.nan), np.zeros(ny, bool)
 
     def _outputs(self, y: Any) -> Array:
         """y as floats (ny,)."""
@@ -124,39 +80,14 @@ class LiveOutputs(Plain, storage.Kept):
     def _inputs(self, u: Any) -> Array:
         """u as floats (m,), or (ny, m) where the outputs share one theta."""
         shape = (len(self.model.outputs), self._rows.m) if self.model.shared else (self._rows.m,)
-        if u is None:
+        if u is None or u is LATER:
             return np.full(shape, np.nan)
         given = as_numbers("u", u if self.model.shared else by_name(self.model, u))
         if given.size != np.prod(shape):
             raise ValueError(f"Live.update: u must have shape {shape}; got shape {given.shape}.")
         return given.reshape(shape)
 
-    def apply(self, u: Any) -> None:
-        """Give the inputs (m,) of the last sample once they have been chosen; see `Live.apply`."""
-        check_expected(self._awaits)
-        inputs = self._inputs(u)
-        if self._gate is not None and self._awaits == INPUT:
-            _, inputs = self._gate.sample(np.full(len(self.model.outputs), np.nan), inputs)
-        self._apply(self._tile, inputs)
-        self._awaits = NOTHING
-
-    def _apply(self, tile: Array, inputs: Array) -> None:
-        """Write the inputs that were outstanding into a tile."""
-        if self._awaits == INPUT:
-            self._placing()(tile, inputs)
-
-    def _placing(self) -> Any:
-        """The routine that writes late inputs into the state; ValueError for a model that needs them at once."""
-        if self._place is None:
-            self._place = applier(self.model, self.trackers[0], self._tile)
-        return self._place
-
-    @property
-    def awaits(self) -> bool:
-        """Whether the inputs of the last sample are outstanding: they come with `apply`."""
-        return self._awaits != NOTHING
-
-    def _known(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
+    def _factors(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
         """What the driver knows of one sample, (k, ny)."""
         ny = len(self.model.outputs)
         each = np.ndim(drift) == 1
@@ -175,68 +106,80 @@ class LiveOutputs(Plain, storage.Kept):
         """
         missing, tile = np.full(len(self.model.outputs), np.nan), self._tile.copy()
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
-        if self.awaits:
-            self._apply(tile, inputs)
-        y_hat, _, s, _ = self._step(tile, missing, inputs, self._known(), [])
+        self._put(tile, inputs)
+        y_hat, _, s, _ = self._driven(tile, missing, inputs, self._factors())
         return y_hat, s
 
-    def detect(self, rules: Mapping[str, AlarmRule], wait: int | None = None) -> dict[str, LiveAlarm]:
+    def detect(self, rules: Mapping[str, AlarmRule] | AlarmRule, wait: int | None = None) -> dict[str, LiveAlarm]:
         """Watch outputs by the rules of reference runs, by name: ``{"flow": run["flow"].detect(...).rule}``.
 
-        One rule per output; ``wait`` and the alarms are those of `Live.detect`. ValueError where the outputs share one
-        theta, or for an unknown name.
+        One rule per output, a later one in the place of an earlier; ``wait`` and the alarms are those of `Live.detect`.
+        Outputs that share one theta have one rule, of ``run.detect(...)``, and ``wait`` counts their rows. ValueError
+        for an unknown name.
         """
-        start = burn_in(self._rows.n) if self._cold else 0
-        wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
-        absent = [name for name in rules if name not in self.model.outputs]
-        if self.model.shared or absent:
+        if isinstance(rules, AlarmRule):
+            rules = {ROWS: rules}
+        lanes = {ROWS: 0} if self.model.shared else {name: lane for lane, name in enumerate(self.model.outputs)}
+        if any(name not in lanes for name in rules):
             raise ValueError(
-                f"Live.detect: rules are for outputs with separate theta; got {list(rules)}, and the outputs are "
+                f"Live.detect: give rules by the name of their output; got {list(rules)!r}, and the outputs are "
                 f"{', '.join(self.model.outputs)}."
             )
+        self._watching = [
+            (lane, alarm) for lane, alarm in self._watching if lane not in {lanes[name] for name in rules}
+        ]
         for name, rule in rules.items():
-            lane = self.model.outputs.index(name)
-            self._alarms[name] = LiveAlarm(check_rule(rule), self.trackers[lane], self.names[lane], wait)
+            self._watch(lanes[name], rule, wait)
         return self.alarms
 
     @property
     def alarms(self) -> dict[str, LiveAlarm]:
-        """The alarms that watch outputs, by name."""
-        return dict(self._alarms)
+        """The alarms that watch outputs, by name; of outputs that share one theta the one of their "rows"."""
+        return {ROWS if self.model.shared else self.model.outputs[lane]: alarm for lane, alarm in self._watching}
 
     def pass_by(self, y: Array, u: Any) -> None:
         """Let one nominal sample pass whose outputs go to the lags and are not used."""
-        self._step(self._tile, y, self._inputs(u), self._known(weight=0.0), [])
+        self._driven(self._tile, y, self._inputs(u), self._factors(weight=0.0))
 
-    def _step(self, tile: Array, y: Array, u: Array, known: Array, windows: list[Window]) -> Steps:
-        """One call of the driver, or one for each row of the instant."""
+    def _step(self, y: Array, u: Array, known: Array, time: Any) -> Steps:
+        return self._driven(self._tile, y, u, known, lambda known: self._keep(known, time))
+
+    def _driven(
+        self, tile: Array, y: Array, u: Array, known: Array, after: Callable[[Array], None] | None = None
+    ) -> Steps:
+        """One call of the driver, or one for each row of the instant; ``after`` follows each of them."""
         ny, m = len(self.model.outputs), self._rows.m
-        said = []
+        results = []
         if self.model.shared:
             for j, row in enumerate(u):
                 same = known[None, :, j : j + 1].copy()
                 same[0, 0] *= j == 0
                 self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
-                said.append(self._said())
-                self._push(tile, same[0], windows)
+                results.append(self._result())
+                if after is not None:
+                    after(same[0])
         else:
             self._run(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
-            said.append(self._said())
-            self._push(tile, known, windows)
+            results.append(self._result())
+            if after is not None:
+                after(known)
         self._rest(tile)
-        y_hat, e, s, ok = (np.concatenate(values) for values in zip(*said, strict=True))
+        y_hat, e, s, ok = (np.concatenate(values) for values in zip(*results, strict=True))
         return y_hat, e, s, ok
 
-    def _push(self, tile: Array, known: Array, windows: list[Window]) -> None:
-        for lane, window in enumerate(windows):
-            window.push(tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
+    def _keep(self, known: Array, time: Any) -> None:
+        """Give what the driver has just processed to alarms and windows."""
+        for lane, alarm in self._watching:
+            alarm.take(self._tile, lane, self._out[0]["e"][lane], self._out[0]["s"][lane], time)
+        for lane, window in enumerate(self._windows):
+            window.push(self._tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
 
     def _rest(self, tile: Array) -> None:
         """Reset what was known of one sample, because it does not hold for the next."""
         if "each" in storage.fields(tile):
             tile["each"] = 1.0
 
-    def _said(self) -> Steps:
+    def _result(self) -> Steps:
         """What the driver wrote, one number per lane."""
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
@@ -255,9 +198,7 @@ class LiveOutputs(Plain, storage.Kept):
 
         Each is (lag + 1, ny, n), or (lag + 1, n) where the outputs share one theta.
         """
-        if not self._windows:
-            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
-        found = [window.smooth(self._tile, lane) for lane, window in enumerate(self._windows)]
+        found = [window.smooth(self._tile, lane) for lane, window in self._windowed()]
         if self.model.shared:
             ny = len(self.model.outputs)
             return FixedLag(found[0].theta[ny - 1 :: ny], found[0].std[ny - 1 :: ny])
@@ -293,60 +234,5 @@ class LiveOutputs(Plain, storage.Kept):
         """Names of the parameters, of each output where they have one theta each."""
         return self._rows.names if self.model.shared else tuple(one.names for one in self.programs)
 
-    @property
-    def ignored(self) -> int:
-        """Number of samples whose time was not after the last."""
-        return self._ignored
-
-    @property
-    def outside(self) -> dict[str, int]:
-        """How many numbers of each signal were outside its limits."""
-        return {} if self._gate is None else self._gate.counts
-
-    def end(self) -> End:
-        """The present state of the stream, from which another run can continue (`warm_start`)."""
-        lanes = range(len(self.programs))
-        states = tuple({n: value.copy() for n, value in state_of(self._tile, lane).items()} for lane in lanes)
-        return End(self.programs, states, self._last, self._awaits)
-
-    def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        extra = {
-            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
-            "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
-            "cold": self._cold, "windows": [window.plain() for window in self._windows],
-            "alarms": {name: alarm.plain() for name, alarm in self._alarms.items()},
-        }  # fmt: skip
-        described = {"model": storage.describe(self.model), "trackers": [storage.describe(t) for t in self.trackers]}
-        states = {f"state_{name}": self._tile[name][0] for name in storage.fields(self._tile)}
-        return {"kind": self._kind, **described, "extra": extra}, states
-
-    @classmethod
-    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        trackers = tuple(storage.rebuild(one, Tracker) for one in header["trackers"])
-        return cls._again(source, storage.rebuild(header["model"], Model), trackers, header["extra"], arrays)
-
-    def __reduce__(self) -> Any:
-        header, arrays = self._written()
-        return type(self)._again, ("the copy", self.model, self.trackers, header["extra"], arrays)
-
-    @classmethod
-    def _again(
-        cls, source: str, model: Model, trackers: tuple[Tracker, ...], extra: Mapping[str, Any],
-        arrays: Mapping[str, Array],
-    ) -> Self:  # fmt: skip
-        """The stream from its state."""
-        tracker = trackers[0] if model.shared else dict(zip(model.outputs, trackers, strict=True))
-        limits, outside = extra["limits"] or ([], [])
-        live = cls(model, tracker, Clock.of(extra["dt"], extra["zone"]), extra["lag"], limits=dict(limits))
-        if live._gate is not None:
-            live._gate.restore(outside)
-        live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra.get("cold", True)
-        live._awaits = extra.get("awaits", NOTHING)
-        for window, state in zip(live._windows, extra["windows"], strict=True):
-            window.restore(state)
-        for name, state in extra.get("alarms", {}).items():
-            lane = model.outputs.index(name)
-            live._alarms[name] = LiveAlarm.of(state, trackers[lane], live.names[lane])
-        into = {name: live._tile[name][0] for name in storage.fields(live._tile)}
-        storage.restore(source, trackers[0], arrays, "state_", into)
-        return live
+    def _fields(self) -> Mapping[str, Array]:
+        return {name: self._tile[name][0] for name in storage.fields(self._tile)}

@@ -4,6 +4,8 @@
     innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
                   score among normal innovations
     probability   the probability of a change in the tracker's window
+    glr, cusum    likelihood ratios or cumulated scores on a frozen reference model, beside the tracker
+                  (`driftfit.run.live.likelihood_ratio`)
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.
 """
@@ -15,13 +17,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings, near
+from driftfit.run.live.likelihood_ratio import CUSUM, JOINT, NOISE, ONE, Frozen
 from driftfit.trackers.base import Tracker
 
-KINDS = ("band", "innovation", "probability")
+FROZEN = ("glr", "cusum")
+"""Kinds that judge by a frozen reference model."""
+OFFSET = "offset"
+"""The parameter of a constant regressor that the frozen model has even if the model of the run has none."""
+KINDS = (*FROZEN, "band", "innovation", "probability")
 
 CHANGE, REPORT = "window", "report"
 """Where the probability of a change is stored: in a field of the tracker, or in the report of a `Bank`."""
@@ -33,11 +40,12 @@ class AlarmRule(Settings):
 
     Attributes
     ----------
-    kind : "band", "innovation" or "probability"
+    kind : "glr", "cusum", "band", "innovation" or "probability"
     every : number
         Samples in which one false alarm may begin.
     names, limits : (c,)
-        Names of the statistics (parameters; "power" and "mean" of the innovations; "probability"), and their limits.
+        Names of the statistics and their limits: "one parameter", "parameters" and "noise" of "glr"; parameters;
+        "power" and "mean" of the innovations; "probability".
     hold : int
         Number of samples for which an alarm stays on after its cause.
     window : int
@@ -48,6 +56,13 @@ class AlarmRule(Settings):
         Normal absolute standardised innovations, ascending, for "innovation" with a reference; otherwise empty.
     simulated : bool
         Whether the limits were found by simulation.
+    parameters : (n,)
+        Names of the parameters of the frozen model, for "glr" and "cusum"; otherwise empty. The last is OFFSET if the
+        run has no constant regressor.
+    frozen : theta, unit, ar, cov, numbers
+        That model, as `driftfit.run.live.likelihood_ratio.Frozen`.
+    growth : (c,)
+        Growth of the squares of the limits with log(every).
     """
 
     kind: str
@@ -60,10 +75,24 @@ class AlarmRule(Settings):
     high: tuple[float, ...] = ()
     normal: tuple[float, ...] = ()
     simulated: bool = False
+    parameters: tuple[str, ...] = ()
+    frozen: tuple[Any, ...] = ()
+    growth: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         limits = ", ".join(f"{name} {limit:.4g}" for name, limit in zip(self.names, self.limits, strict=True))
         return f"AlarmRule({self.kind}, one false alarm in {self.every:g} samples, limits {limits})"
+
+    @property
+    def reference(self) -> Frozen:
+        """The frozen model of "glr" and "cusum", as arrays."""
+        shapes = Frozen(-1, -1, -1, (len(self.parameters),) * 2, -1)  # type: ignore[arg-type]
+        return Frozen(*(np.array(one, float).reshape(shape) for one, shape in zip(self.frozen, shapes, strict=True)))
+
+    @property
+    def entries(self) -> list[int]:
+        """Which entries of what the compiled routine writes are the statistics of "glr" or "cusum"."""
+        return [ONE, JOINT, NOISE] if self.kind == "glr" else [CUSUM + j for j in range(len(self.names))]
 
     @property
     def slack(self) -> float:
@@ -110,6 +139,12 @@ def value_text(kind: str, value: float) -> str:
 def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
     """Raise an error if a tracker does not support the alarm."""
     kind = type(tracker).__name__
+    own = [name for name in rule.parameters if name != OFFSET]
+    if rule.kind in FROZEN and len(names) != len(own):
+        raise ValueError(
+            f"detect: the reference model has {len(own)} parameters, {', '.join(own)}; this run has {len(names)}. "
+            "Make a rule from a run of the same model."
+        )
     absent = [name for name in rule.names if name not in names] if rule.kind == "band" else []
     if absent:
         raise ValueError(f"detect: there is no parameter {absent[0]!r}; {near(str(absent[0]), names)}")
@@ -129,7 +164,7 @@ def check_fits(rule: AlarmRule, tracker: Tracker, names: Sequence[str]) -> None:
 def normal_scores(g: Array, known: Array) -> Array:
     """g with the size that a normal variable of the same rank among ``known`` (N,) absolute values would have."""
     share = (1.0 + len(known) - np.searchsorted(known, np.abs(g), side="left")) / (len(known) + 1.0)
-    return np.where(np.isfinite(g), -special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
+    return np.where(np.isfinite(g), -scipy.special.ndtri(np.clip(share / 2.0, 1e-12, 0.5)) * np.sign(g), np.nan)
 
 
 def moving_sums(values: Array, window: int) -> Array:

@@ -23,11 +23,15 @@ Sources: Kalaba and Tesfatsion (1989); Wilkinson (1963) for refinement. Cost: O(
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
 from driftfit.smooth.parts.walk import Path, Walk
+
+Y, WEIGHT, DRIFT = 0, 1, 2
+"""Columns of the samples."""
 
 CORRECTION = 1e-10
 """Largest correction, relative to the largest value of the parameter."""
@@ -41,27 +45,38 @@ LEVERAGE = 1e-5
 
 def smooth(walk: Walk) -> Path | None:
     """Solve a problem with a diagonal q and a diffuse start of full rank; None if the result is not accurate enough."""
+    solved = smooth_and_weigh(walk)
+    return None if solved is None else solved[0]
+
+
+def smooth_and_weigh(walk: Walk) -> tuple[Path, float] | None:
+    """The same, and the log of the diffuse likelihood of y given q, drift and weights, up to a constant.
+
+    With U after the last sample, -2 log L = J + log |U| - sum log f, since each f is 1 / (1 + g U_ii).
+    """
     T, n = walk.phi.shape
     work = workspace(n).copy()
-    a, b = np.empty((T, n, n)), np.empty((T, n))
-    q, each = np.diag(walk.q).copy(), walk.each if len(walk.each) else np.ones((1, n))
-    moved = walk.drift, np.ascontiguousarray(each), q
-    least = forwards(work, walk.phi, walk.y, walk.weight, *moved, a, b)
+    work["q"] = np.diag(walk.q)
+    steps, samples = np.empty(T, step_type(n)), np.stack([walk.y, walk.weight, walk.drift], axis=1)
+    each = np.ascontiguousarray(walk.each if len(walk.each) else np.ones((1, n)))
+    least = forwards(work, walk.phi, samples, each, steps)
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
+    pivots = np.einsum("tii->ti", steps["a"])
+    volume = float(np.linalg.slogdet(work["U"][0])[1]) - float(np.sum(np.log(pivots)))
     work["C"], work["theta"] = C, C @ work["z"][0]
     theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
-    backwards(work, walk.phi, walk.weight, *moved, a, b, theta, var, left)
-    cost = residuals(work, walk.phi, walk.y, walk.weight, *moved, a, b, theta)
+    backwards(work, walk.phi, samples, each, steps, theta, var, left)
+    cost = residuals(work, walk.phi, samples, each, steps, theta)
     work["theta"] = C @ work["z"][0]
-    correct(work, a, b, theta)
+    correct(work, steps, theta)
     correction = work["correction"][0] / np.maximum(work["size"][0], 1e-300)
     if not (correction.max() <= CORRECTION and left.min() > LEVERAGE and var.min() > 0.0):
         return None
     c, empty = np.sqrt(left), np.zeros((0, n, n))
     rho = np.where(walk.weight > 0.0, np.sqrt(walk.weight) * walk.residual(theta) / c, np.nan)
-    return Path(theta, var, rho, c, cost, empty, empty, "fast")
+    return Path(theta, var, rho, c, cost, empty, empty, "fast"), -0.5 * (cost + volume)
 
 
 def inverse(U: Array) -> Array | None:
@@ -81,22 +96,26 @@ def inverse(U: Array) -> Array | None:
 def workspace(n: int) -> Array:
     """Scratch space, to be copied; it is a record so that the compiler knows n."""
     square, vector = (np.float64, (n, n)), (np.float64, (n,))
-    vectors = ("z", "theta", "v", "correction", "size")
+    vectors = ("z", "theta", "v", "correction", "size", "q")
     return np.zeros(1, np.dtype([("U", *square), ("C", *square), *((name, *vector) for name in vectors)]))
 
 
+def step_type(n: int) -> np.dtype[Any]:
+    """The elimination of the n increments before a sample: a and b of each."""
+    return np.dtype([("a", np.float64, (n, n)), ("b", np.float64, (n,))])
+
+
 @Driver
-def forwards(
-    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array
-) -> float:
+def forwards(work: Array, phi: Array, samples: Array, each: Array, steps: Array) -> float:
     """Eliminate every increment; leaves the last U and z in the scratch space and returns the smallest f."""
     s = work[0]
     n = s.z.shape[0]
     many = 1 if each.shape[0] > 1 else 0
     least = 1.0
     for t in range(phi.shape[0]):
+        a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = q[i] * drift[t] * each[t * many, i] ** 2
+            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
             f = 1.0 / (1.0 + g * s.U[i, i])
             least = min(least, f)
             for j in range(n):
@@ -104,9 +123,9 @@ def forwards(
             s.v[i] = f
             z = s.z[i]
             for j in range(n):
-                a[t, i, j] = s.v[j]
+                a[i, j] = s.v[j]
                 s.z[j] = (s.z[j] if j != i else 0.0) + s.v[j] * z
-            b[t, i] = g * f * z
+            b[i] = g * f * z
             for j in range(n):
                 if j != i:
                     for k in range(j + 1):
@@ -116,24 +135,24 @@ def forwards(
             for j in range(n):
                 s.U[i, j] *= f
                 s.U[j, i] = s.U[i, j]
-        w = weight[t]
+        w = samples[t, WEIGHT]
         for j in range(n):
             for k in range(n):
                 s.U[j, k] += w * phi[t, j] * phi[t, k]
-            s.z[j] += w * phi[t, j] * y[t]
+            s.z[j] += w * phi[t, j] * samples[t, Y]
     return least
 
 
 @Driver
 def backwards(
-    work: Array, phi: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
-    theta: Array, var: Array, left: Array,
-) -> None:  # fmt: skip
+    work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array, var: Array, left: Array
+) -> None:
     """theta, variances and 1 - leverage, from the last theta and C in the scratch space."""
     s = work[0]
     n = s.z.shape[0]
     many = 1 if each.shape[0] > 1 else 0
     for t in range(phi.shape[0] - 1, -1, -1):
+        a, b = steps[t].a, steps[t].b
         h = 0.0
         for j in range(n):
             total = 0.0
@@ -142,20 +161,20 @@ def backwards(
             h += phi[t, j] * total
             theta[t, j] = s.theta[j]
             var[t, j] = s.C[j, j]
-        left[t] = 1.0 - weight[t] * h
+        left[t] = 1.0 - samples[t, WEIGHT] * h
         for i in range(n - 1, -1, -1):
-            x = b[t, i]
+            x = b[i]
             for j in range(n):
-                x += a[t, i, j] * s.theta[j]
+                x += a[i, j] * s.theta[j]
             s.theta[i] = x
-            own = q[i] * drift[t] * each[t * many, i] ** 2 * a[t, i, i]
+            own = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2 * a[i, i]
             for j in range(n):
                 total = 0.0
                 for k in range(n):
-                    total += s.C[j, k] * a[t, i, k]
+                    total += s.C[j, k] * a[i, k]
                 s.v[j] = total
             for j in range(n):
-                own += a[t, i, j] * s.v[j]
+                own += a[i, j] * s.v[j]
             for j in range(n):
                 s.C[i, j] = s.v[j]
                 s.C[j, i] = s.v[j]
@@ -163,10 +182,7 @@ def backwards(
 
 
 @Driver
-def residuals(
-    work: Array, phi: Array, y: Array, weight: Array, drift: Array, each: Array, q: Array, a: Array, b: Array,
-    theta: Array,
-) -> float:  # fmt: skip
+def residuals(work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array) -> float:
     """The forward pass of the refinement: b of the residuals; returns the cost of the path."""
     s = work[0]
     n = s.z.shape[0]
@@ -175,38 +191,40 @@ def residuals(
     for i in range(n):
         s.z[i] = 0.0
     for t in range(phi.shape[0]):
+        a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = q[i] * drift[t] * each[t * many, i] ** 2
+            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
             x = theta[t, i] - theta[t - 1, i] if t > 0 else 0.0
             shift = x / g if g > 0.0 else 0.0
             cost += x * shift
             z = s.z[i] + shift
-            b[t, i] = g * a[t, i, i] * z
+            b[i] = g * a[i, i] * z
             for j in range(n):
-                s.z[j] = (s.z[j] if j != i else -shift) + a[t, i, j] * z
-        e = y[t]
+                s.z[j] = (s.z[j] if j != i else -shift) + a[i, j] * z
+        e = samples[t, Y]
         for j in range(n):
             e -= phi[t, j] * theta[t, j]
-        cost += weight[t] * e * e
+        cost += samples[t, WEIGHT] * e * e
         for j in range(n):
-            s.z[j] += weight[t] * phi[t, j] * e
+            s.z[j] += samples[t, WEIGHT] * phi[t, j] * e
     return cost
 
 
 @Driver
-def correct(work: Array, a: Array, b: Array, theta: Array) -> None:
+def correct(work: Array, steps: Array, theta: Array) -> None:
     """The backward pass of the refinement: adds the correction to theta and stores the sizes of both."""
     s = work[0]
     n = s.z.shape[0]
     for i in range(n):
         s.correction[i] = s.size[i] = 0.0
     for t in range(theta.shape[0] - 1, -1, -1):
+        a, b = steps[t].a, steps[t].b
         for i in range(n):
             theta[t, i] += s.theta[i]
             s.correction[i] = max(s.correction[i], abs(s.theta[i]))
             s.size[i] = max(s.size[i], abs(theta[t, i]))
         for i in range(n - 1, -1, -1):
-            x = b[t, i]
+            x = b[i]
             for j in range(n):
-                x += a[t, i, j] * s.theta[j]
+                x += a[i, j] * s.theta[j]
             s.theta[i] = x

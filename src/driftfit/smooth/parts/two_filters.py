@@ -62,20 +62,34 @@ def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") 
 def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
     """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return what they know."""
     T, n = walk.phi.shape
-    root, drift = np.sqrt(walk.weight), np.sqrt(np.append(walk.drift, 0.0))
     blocks = np.zeros(-(-T // WIDTH), block_type(n))
-    filters, meet = compiled()
     pair = workspace(n, 2).copy()
     pair["G"] = G[:, :, None]
-    cost = filters(pair, walk.phi, walk.y, root, drift, *changes(walk), rows, values, blocks)
+    cost = filter_both(pair, walk, rows, values, blocks)
     theta, var, rho, c = np.empty((T, n)), np.empty((T, n)), np.empty(T), np.empty(T)
     R = np.empty((T if keep == "cov" else 0, n, n))
-    meet(workspace(n, WIDTH).copy(), walk.phi, walk.y, root, blocks, theta, var, rho, c, R)
+    _meet()(workspace(n, WIDTH).copy(), _weighted(walk), blocks, theta, var, rho, c, R)
     cov = R @ R.swapaxes(1, 2)
     return Path(theta, var, rho, c, cost, cov, cov, "safe"), blocks
 
 
-def changes(walk: Walk) -> tuple[Array, Array]:
+def filter_both(pair: Array, walk: Walk, rows: Array, values: Array, blocks: Array) -> float:
+    """Run both filters in the scratch space ``pair`` from ``rows theta_1 = values``; fills ``blocks``.
+
+    Returns the sum of rho^2 of the filter that goes forwards.
+    """
+    drift = np.sqrt(np.append(walk.drift, 0.0))
+    start = np.column_stack([rows, values])
+    return float(_filters()(pair, _weighted(walk), drift, *_changes(walk), start, blocks))
+
+
+def _weighted(walk: Walk) -> Array:
+    """sqrt(w) phi and sqrt(w) y, (T, n + 1)."""
+    samples: Array = np.sqrt(walk.weight)[:, None] * np.column_stack([walk.phi, walk.y])
+    return samples
+
+
+def _changes(walk: Walk) -> tuple[Array, Array]:
     """``each`` and ``trend`` with an entry after the last sample, where nothing changes."""
     each, trend = walk.each, walk.trend.ravel()
     each = np.vstack([each, np.ones((1, each.shape[1]))]) if len(each) else each
@@ -165,24 +179,25 @@ def workspace(n: int, L: int) -> Array:
 
 
 @lru_cache
-def compiled() -> tuple[Any, Any]:
-    """The two loops; they are closures, so that the cache on disk detects changes of a kernel."""
-    absorb, spread, solve, invert = information.absorb, information.spread, information.solve, information.invert
-    shear, width = information.shear, WIDTH
+def _filters() -> Driver:
+    """The loop of both filters; it is a closure, so that the cache on disk detects changes of a kernel."""
+    absorb, spread, shear, width = information.absorb, information.spread, information.shear, WIDTH
 
     @Driver
     def filters(
-        work: Array, phi: Array, y: Array, root: Array, drift: Array, each: Array, trend: Array,
-        rows: Array, values: Array, blocks: Array,
-    ) -> float:  # fmt: skip
-        """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0."""
+        work: Array, samples: Array, drift: Array, each: Array, trend: Array, rows: Array, blocks: Array
+    ) -> float:
+        """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0.
+
+        ``samples`` (T, n + 1) are sqrt(w) phi and sqrt(w) y, ``rows`` (k, n + 1) the start: rows of theta and values.
+        """
         s = work[0]
-        T, n = phi.shape[0], s.d.shape[0]
+        T, n = samples.shape[0], s.d.shape[0]
         s.H[:] = s.G
         for k in range(rows.shape[0]):
             for i in range(n):
                 s.row[i, 0] = rows[k, i]
-            absorb(s.S, s.d, s.row, values[k], 0)
+            absorb(s.S, s.d, s.row, rows[k, n], 0)
         cost = 0.0
         for t in range(T):
             if each.shape[0] > 0:
@@ -206,20 +221,27 @@ def compiled() -> tuple[Any, Any]:
                         block.S[l, k, lane] = s.S[i, j, l]
                         k += 1
                 for i in range(n):
-                    s.row[i, l] = root[at] * phi[at, i]
-                s.y[l] = root[at] * y[at]
+                    s.row[i, l] = samples[at, i]
+                s.y[l] = samples[at, n]
             for l in range(2):
                 s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
             cost += s.rho[0] * s.rho[0]
         return cost
 
+    return filters
+
+
+@lru_cache
+def _meet() -> Driver:
+    """The loop that combines the two filters, `WIDTH` samples at a time."""
+    absorb, solve, invert, width = information.absorb, information.solve, information.invert, WIDTH
+
     @Driver
     def meet(
-        work: Array, phi: Array, y: Array, root: Array, blocks: Array,
-        theta: Array, var: Array, rho: Array, c: Array, inverse: Array,
-    ) -> None:  # fmt: skip
+        work: Array, samples: Array, blocks: Array, theta: Array, var: Array, rho: Array, c: Array, inverse: Array
+    ) -> None:
         s = work[0]
-        T, n = phi.shape[0], s.d.shape[0]
+        T, n = samples.shape[0], s.d.shape[0]
         for b in range(blocks.shape[0]):
             block, first = blocks[b], b * width
             count = min(width, T - first)
@@ -239,8 +261,8 @@ def compiled() -> tuple[Any, Any]:
                 k += n - i
             for l in range(count):
                 for i in range(n):
-                    s.row[i, l] = root[first + l] * phi[first + l, i]
-                s.y[l] = root[first + l] * y[first + l]
+                    s.row[i, l] = samples[first + l, i]
+                s.y[l] = samples[first + l, n]
             for l in range(width):
                 s.rho[l], s.c[l] = absorb(s.S, s.d, s.row, s.y[l], l)
             for l in range(width):
@@ -262,4 +284,4 @@ def compiled() -> tuple[Any, Any]:
                         for j in range(n):
                             inverse[first + l, i, j] = s.R[i, j, l]
 
-    return filters, meet
+    return meet

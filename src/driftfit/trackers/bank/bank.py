@@ -68,7 +68,7 @@ from driftfit.trackers.bank.memory import SINGLE, arrays_of, packed
 from driftfit.trackers.bank.prior import chains, events, per_sample
 from driftfit.trackers.bank.reduction import Beam, Decide, Hybrid, Reduction, Shape
 from driftfit.trackers.bank.sensor import Sensor
-from driftfit.trackers.bank.variants import made
+from driftfit.trackers.bank.variants import steps_of
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import ALMOST_ANY, WORST, knowing, knowing_nothing
 from driftfit.trackers.parts.excitation import window
@@ -222,7 +222,7 @@ class Bank(Tracker):
     @property
     def chained(self) -> bool:
         """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
-        merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor | reductions.Decide)
+        merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
         walks = not any(one.forgets for one in self.all_changes)
         return len(self.all_changes) > 1 and not self._apart and not merging and walks
 
@@ -425,9 +425,7 @@ class Bank(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         own = tuple(sensor.likelihood for sensor in self.all_sensors if sensor.kind == "own")
-        machine, steps = made(self.form == "sqrt", own)
-        machine.load()
-        return steps
+        return steps_of(self.form == "sqrt", own)
 
 
 def _tuples(value: Any) -> Any:

@@ -56,7 +56,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
-    parents, children = _room(most := max(shape.parents * twice, K // H), Hd, Hm)
+    parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
@@ -72,7 +72,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "bases": shape.bases, "stamps": np.zeros(shape.held),
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
-        "path": path_of(H, Hd, _whole_vectors(tri), most if bank.chained else 0),
+        "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
         "ring": np.zeros((RING, BESIDE + H)), "new_events": news_of(H, Hm, remembered), "lag_prob": np.zeros((W, H)),
         "newest": np.zeros((min(W, TOLD), H)), "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
@@ -145,11 +145,9 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
 
 
-def path_of(H: int, Hd: int, wide: int, room: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`, with room for so many leaves; empty for none."""
-    table = np.zeros((3 * H + Hd + 1 if room else 0, max(H, wide) + 1))
-    table[-1:, -1] = room
-    return table
+def path_of(H: int, Hd: int, wide: int) -> Array:
+    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty where there is none."""
+    return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
 
 
 def _closed(Hd: int, wide: int) -> Array:

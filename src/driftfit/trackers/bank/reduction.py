@@ -51,7 +51,7 @@ class Reduction(Settings, ABC):
 
 def knobs(kind: int, **values: float) -> Array:
     """The vector of settings."""
-    vector = np.zeros(7)
+    vector = np.zeros(8)
     vector[selection.KIND], vector[selection.TAU], vector[selection.WAIT] = kind, -1.0, -1.0
     for name, value in values.items():
         vector[getattr(selection, name.upper())] = value
@@ -74,7 +74,8 @@ class Decide(Reduction):
     The oldest event that is still open has the marginal p; R_k = sum_e L[e, k] p_e; the k of least risk (of those with
     p_k > 0, the lowest on ties) is kept. The latency is depth - 1 used samples. Later results are conditional on the
     decision. With depth="auto" the event is decided as soon as the risk is at most ``tau``; with ``wait_cost`` c also
-    if waiting for one more sample is not expected to pay: R* <= c + E R(next). Cost: H^depth leaf updates per sample.
+    if waiting for s more samples is not expected to pay, R* <= s c + E R(after s), for s from 1 to ``ahead``
+    (`driftfit.trackers.bank.reducing.lookahead`). Cost: H^depth leaf updates per sample.
 
     Parameters
     ----------
@@ -84,6 +85,9 @@ class Decide(Reduction):
         L[true, decided]; "map" is 1 for every error. Asymmetric losses change the estimates too.
     max_depth, tau, wait_cost
         For "auto": the bound of the depth, the risk that is small enough, and the cost of a sample of delay.
+    ahead : int
+        For ``wait_cost``: how many samples ahead the rule looks. 1 decides at once where one sample tells little,
+        also if some more would tell all.
     force : bool
         Allow depth 1 with outliers, which always prefers "outlier" and so never adapts.
     """
@@ -94,11 +98,13 @@ class Decide(Reduction):
     tau: float = 0.01
     wait_cost: float | None = None
     force: bool = False
+    ahead: int = 1
 
     def __post_init__(self) -> None:
         if self.depth != "auto":
             self._set("depth", whole("Decide", "depth", self.depth, 1))
-        self._set("max_depth", whole("Decide", "max_depth", self.max_depth, 1))
+        for name in ("max_depth", "ahead"):
+            self._set(name, whole("Decide", name, getattr(self, name), 1))
         self._set("tau", numbers("Decide", "tau", self.tau, ndim=0, low=0.0))
         if self.wait_cost is not None:
             self._set("wait_cost", numbers("Decide", "wait_cost", self.wait_cost, ndim=0, low=0.0, strict=True))
@@ -115,7 +121,7 @@ class Decide(Reduction):
     def shape(self, Hd: int, Hm: int) -> Shape:
         H, d = Hd * Hm, self.deepest
         children = tree("Decide", H, d, "use Beam(9) or Hybrid(9), whose cost is linear, or a smaller depth")
-        auto = {} if self.depth != "auto" else {"tau": self.tau, "wait": self.wait_cost or -1.0}
+        auto = {} if self.depth != "auto" else {"tau": self.tau, "wait": self.wait_cost or -1.0, "ahead": self.ahead}
         return Shape(
             children // H, children, d, d, knobs(selection.CUT, depth=d, **auto), np.array([children * 1.0, 1, 1])
         )

@@ -23,16 +23,15 @@ def _factored() -> Machine:
 
 
 @cache
-def made(factored: bool, own: tuple[Callable[..., Any], ...]) -> tuple[Machine, TrackerSteps]:
-    """The machine for leaves that keep factors or covariances, and steps that also know where the user's ``own``
-    likelihoods are.
+def steps_of(factored: bool, own: tuple[Callable[..., Any], ...]) -> TrackerSteps:
+    """The steps for leaves that keep factors or covariances, which also know where the user's ``own`` likelihoods are.
+
+    Both forms have the same steps; drivers call one machine or the other by the same symbol.
     """
-    others: dict[Any, Any] = {bank: _factored()} if factored else {}
-    machines = STEPS.machines
-    if own:
-        entry, others[own_address] = entry_of(own)
-        machines = (*machines, entry)
-    if not others:
-        return bank, STEPS
-    correct, begin = substituted([STEPS.correct, STEPS.begin], others)
-    return others.get(bank, bank), STEPS._replace(correct=correct, begin=begin, machines=machines)
+    machine = _factored() if factored else bank
+    steps = STEPS._replace(machines=(*STEPS.machines, machine), instead=((bank, machine),) if factored else ())
+    if not own:
+        return steps
+    entry, address = entry_of(own)
+    correct, begin = substituted([steps.correct, steps.begin], {own_address: address})
+    return steps._replace(correct=correct, begin=begin, machines=(*steps.machines, entry))

@@ -87,7 +87,7 @@ def bound_leverage(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         square = s.phi[i, l] * s.phi[i, l]
         most = max(most, square / (LEVERAGE * s.c[i, l])) if s.c[i, l] > 0.0 else most
-    s.leverage[l] = most
+    s.leverage[l] = most * (1.0 + s.vague[l] / s.r[l])
 
 
 def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:

@@ -13,7 +13,7 @@ from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.separation.least_squares import refine
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks, Groups, deviations, split
 from driftfit.models.hammerstein_wiener.separation.separate import METHODS
-from driftfit.run.program import lane_of
+from driftfit.run.program import lanes_of
 
 if TYPE_CHECKING:
     from driftfit.run.result import Track
@@ -132,5 +132,5 @@ def covariances(run: Track) -> Any:
     drive = run.program.drivers("cov").run
     for first in range(0, T, BLOCK):
         last = min(first + BLOCK, T)
-        drive(tile, *lane_of(run.record.part(slice(first, last))), out[: last - first])
+        drive(tile, *lanes_of(run.record.part(slice(first, last))), out[: last - first])
         yield first, np.ascontiguousarray(out["P"][: last - first, ..., 0])

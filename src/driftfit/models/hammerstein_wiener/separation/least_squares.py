@@ -208,6 +208,32 @@ def solve(N: Array, damping: float, right: Array, C: Array, step: Array) -> bool
     return True
 
 
+@shared
+def equations(zeta: Array, orders: tuple[int, int], sizes: Array, L: Array, scale: Array, J: Array, N: Array) -> None:
+    """The whitened Jacobian J (n_z, n) at zeta, and the lower triangle of N = J J' with the scales held."""
+    n_x, n = J.shape
+    jacobian(zeta, orders, sizes, J)
+    for x in range(n_x):
+        whiten(L, scale, J[x])
+    for x in range(n_x):
+        for z in range(x + 1):
+            total = 0.0
+            for i in range(n):
+                total += J[x, i] * J[z, i]
+            N[x, z] = total
+    hold_scales(zeta, orders[0], sizes, N)
+
+
+@shared
+def gradient(J: Array, rho: Array, right: Array) -> None:
+    """right = J rho."""
+    for x in range(J.shape[0]):
+        total = 0.0
+        for i in range(J.shape[1]):
+            total += J[x, i] * rho[i]
+        right[x] = total
+
+
 @Driver
 def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: Array, cov: Array, cost: Array) -> None:
     """Refine zeta (T, n_z) in place; fill cov (T, n_z, n_z) and cost (T,), NaN where P is no finite covariance.
@@ -232,20 +258,8 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             best += rho[i] * rho[i]
         damping = 0.0
         for _ in range(STEPS):
-            jacobian(now, orders, sizes, J)
-            for x in range(n_x):
-                whiten(L, scale, J[x])
-            for x in range(n_x):
-                total = 0.0
-                for i in range(n):
-                    total += J[x, i] * rho[i]
-                right[x] = total
-                for z in range(x + 1):
-                    total = 0.0
-                    for i in range(n):
-                        total += J[x, i] * J[z, i]
-                    N[x, z] = total
-            hold_scales(now, orders[0], sizes, N)
+            equations(now, orders, sizes, L, scale, J, N)
+            gradient(J, rho, right)
             better = False
             for _ in range(10):
                 if solve(N, damping, right, C, step):
@@ -271,16 +285,7 @@ def refine(theta: Array, P: Array, orders: tuple[int, int], sizes: Array, zeta: 
             if gain <= 1e-12 * best or gain == 0.0:
                 break
         cost[t] = best
-        jacobian(now, orders, sizes, J)
-        for x in range(n_x):
-            whiten(L, scale, J[x])
-        for x in range(n_x):
-            for z in range(x + 1):
-                total = 0.0
-                for i in range(n):
-                    total += J[x, i] * J[z, i]
-                N[x, z] = total
-        hold_scales(now, orders[0], sizes, N)
+        equations(now, orders, sizes, L, scale, J, N)
         for x in range(n_x):
             right[:] = 0.0
             right[x] = 1.0

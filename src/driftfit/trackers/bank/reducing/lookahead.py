@@ -1,13 +1,15 @@
-"""The risk that the next sample is expected to leave, for deciding whether to wait for it.
+"""The risk that the next s samples are expected to leave, for deciding whether to wait for them.
 
-    ER = int min_k sum_e L[e, k] f_e(y) dy,   f_e(y) = sum over leaves with oldest event e, and next events e',
-         w_l P[e_l, e'] N(y; z'm_l + b_e', r_e' + z'(C_l + Q_e') z)
+    ER_s = int min_k sum_e L[e, k] f_e(y) dy,   f_e(y) = sum over leaves with oldest event e, and next events e',
+           w_l P[e_l, e'] N(y; z'm_l + b_e', r_e' / s + z'(C_l + Q_e') z)
 
-A minimum of averages is at most the average of minima, so ER <= R*: waiting never costs information, only time. The
-integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union of
-them. The next regressor is not known; the last one before the events that are open stands for it. One that the leaves
-have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x nodes;
-used only while a decision is open.
+A minimum of averages is at most the average of minima, so ER_s <= R*: waiting never costs information, only time. Of
+several samples y is the mean, which knows less than all of them: the risk is at most ER_s where they have one
+regressor and nothing happens between them. One sample alone may decide nothing where ten decide all; a rule that
+looks one sample ahead then never begins to wait. The integral runs over nodes at mean +- 6 standard deviations of
+every component, by the trapezoidal rule on the union of them. The next regressors are not known; the last one before
+the events that are open stands for it. One that the leaves have already been fitted to, as the present one, promises
+too little: they agree about it. Cost: components x nodes; used only while a decision is open.
 """
 
 from __future__ import annotations
@@ -43,8 +45,10 @@ def width(B: Array, l: int, n: int, na: int, phi: Array, keep: float, q: Array) 
 
 
 @shared
-def density_parts(t: Any, L: int, top: float, mass: float, phi: Array) -> int:
-    """Components of the predictive density as columns: oldest event, weight, mean, standard deviation."""
+def density_parts(t: Any, L: int, top: float, mass: float, phi: Array, samples: int) -> int:
+    """Components of the density of the mean of so many samples as columns: oldest event, weight, mean, standard
+    deviation.
+    """
     B, Q, maps, theta0, sensors, out = t.leaves, t.Q, t.maps, t.places[MEAN], t.sensors, t.components
     n, na, Hm, count, last, r = t.n, t.output_lags, len(t.sensors), 0, t.sample[LAST], t.sample[R]
     P, same = t.chain, t.independent > 0 and t.counters[CHAINED] == 0
@@ -71,7 +75,7 @@ def density_parts(t: Any, L: int, top: float, mass: float, phi: Array) -> int:
                     out[3, count] = math.sqrt(stuck if stuck > 0.0 else -stuck * r * unit)
                 else:
                     out[2, count] = mean + sensors[j, VALUE]
-                    out[3, count] = math.sqrt((wide + sensors[j, FACTOR] * r) * unit)
+                    out[3, count] = math.sqrt((wide + sensors[j, FACTOR] * r / samples) * unit)
                 count += 1
     return count
 
@@ -123,8 +127,9 @@ def integrate(parts: Array, count: int, loss: Array, f: Array, nodes: Array) -> 
 
 
 @shared
-def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array) -> float:
-    """ER for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
+def expected_risk(t: Any, L: int, top: float, mass: float, phi: Array, samples: int) -> float:
+    """ER_s for the oldest event held, whose digit in the codes counts ``top``, of leaves of that mass in all."""
     components = t.components
     nodes = components[4:].reshape(NODES * components.shape[1])
-    return float(integrate(components, density_parts(t, L, top, mass, phi), t.loss, t.scratch[2], nodes))
+    count = density_parts(t, L, top, mass, phi, samples)
+    return float(integrate(components, count, t.loss, t.scratch[2], nodes))

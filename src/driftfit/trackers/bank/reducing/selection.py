@@ -18,7 +18,7 @@ from driftfit.trackers.bank.reducing.lookahead import expected_risk
 
 CUT, MERGE, INTERACT, BEAM, HYBRID, REFILTER = range(6)
 """Kinds of reduction."""
-KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR = range(7)
+KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD = range(8)
 """Entries of the vector of settings of a reduction."""
 
 
@@ -184,17 +184,21 @@ def least_risk(loss: Array, p: Array, mass: float, risk: Array) -> int:
 @shared
 def settled(t: Any, L: int, held: int, risk: float, top: float, mass: float, phi: Array) -> bool:
     """Whether the oldest event is decided now: at full depth, where its risk is small, or where waiting does not pay,
-    R* <= c + ER.
+    R* <= s c + ER_s for every number s of samples that may be waited for.
     """
-    reduction = t.reduction
+    reduction, wait = t.reduction, t.reduction[WAIT]
     if held >= reduction[DEPTH]:
         return True
     if reduction[TAU] < 0.0:
         return False
     if risk <= reduction[TAU]:
         return True
-    wait = reduction[WAIT]
-    return wait > 0.0 and (risk <= wait or risk <= wait + expected_risk(t, L, top, mass, phi))  # type: ignore[no-any-return]
+    if wait <= 0.0:
+        return False
+    for samples in range(1, int(min(reduction[AHEAD], reduction[DEPTH] - held)) + 1):
+        if risk > samples * wait and risk > samples * wait + expected_risk(t, L, top, mass, phi, samples):
+            return False
+    return True
 
 
 @shared

@@ -1,68 +1,59 @@
 """The path of a complete record given the detected events: Rauch, Tung and Striebel with Q of the decided event.
 
-    G = C(t|t) C(t+1|t)^-1,   m_s = m + G (m_s(t+1) - m(t+1|t)),   C_s = C + G (C_s(t+1) - C(t+1|t)) G'
     theta(t+1) - theta(t):  mean m_s(t+1) - m_s(t),  covariance C_s(t+1) + C_s(t) - G C_s(t+1) - C_s(t+1) G'
 
 Samples at which the sensor was at fault have the noise variance of their fault, or are not used (additive outliers, a
 frozen sensor; in ARX also later samples whose regressors contain them). Bands are conditional on the events. A diffuse
-start is a prior of 1e6 times the variance that a sample leaves. Cost: O(T n^3).
+start is a prior of 1e6 times the variance that a sample leaves.
 
-The drift of a bank that was given no changes is a guess, too small where parameters walk all the time: between events
-the path would be taken for certain. So it is scaled, by the factor f >= 1 of greatest likelihood given the events
-
-    max_f sum_t log N(y_t; phi_t' m_t, s_t),   Q_t = f Q_0 between events
+The drift of a bank that was given no changes is a guess, and is fitted (`driftfit.trackers.bank.results.fitted_drift`).
 
 Source: Rauch, Tung and Striebel (1965); the covariance of an increment from the lag-one covariance G C_s(t+1).
 """
 
 from __future__ import annotations
 
+from functools import cached_property
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.kernel import Array
 from driftfit.engine.settings import matrix
 from driftfit.run.result import Track
 from driftfit.smooth.problem import replay
 from driftfit.trackers.bank.bank import Bank
 from driftfit.trackers.bank.leaves.leaf_matrix import NU, WEIGHT, S
 from driftfit.trackers.bank.results.events import Event
+from driftfit.trackers.bank.results.fitted_drift import FittedDrift
+from driftfit.trackers.bank.results.given_steps import Problem, solve
 
-WIDER, CLOSE = 1e7, 0.05
-"""Largest factor of a drift that is fitted, and how closely, in its natural logarithm."""
 WIDE = 1e6
 """Variance of the start of a diffuse run, in units of the variance that one sample leaves."""
-
-
-class Problem(NamedTuple):
-    """A regression whose coefficients have a separate drift covariance before every sample."""
-
-    phi: Array
-    y: Array
-    r: Array
-    """(T,): noise variance; inf for samples that are not used."""
-    Q: Array
-    """(T, n, n): covariance of the step before each sample."""
-    m0: Array
-    C0: Array
-    widened: float = 1.0
-    """What the drift was multiplied by."""
 
 
 class EventSmoothed:
     """Parameters of a record given the events, each estimated from the whole record.
 
-    ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on; ``widened`` is the
-    factor of the drift between them, 1 where the changes of the bank were given.
+    ``theta``, ``std`` (T, n); ``covs`` (T, n, n); ``events`` are those that it is conditional on; ``widened`` (n,) are
+    the factors of the drift between them, 1 where the changes of the bank were given.
     """
 
     def __init__(self, run: Track, events: list[Event]) -> None:
         self.run, self.events, self.names, self.time = run, events, run.names, run.time
-        self.problem = problem_of(run, events)
-        self.widened = self.problem.widened
-        self.theta, self.covs, self.gains = solve(self.problem)
+        self.problem, self.widened = problem_of(run, events), np.ones(len(run.names))
+        self._fitted: FittedDrift | None = None
+        if run.tracker.changes is None:  # type: ignore[attr-defined]
+            self._fitted = fitted = fitted_drift(run, self.problem, events)
+            self.problem, self.widened = fitted.problem, fitted.widened
+            self.events = [event for event in events if event.kind != "change" or event.span.date in fitted.dates]
+        self.theta, self._given, self.gains = solve(self.problem)
+
+    @cached_property
+    def covs(self) -> Array:
+        """(T, n, n), with what is not known of a drift that was fitted."""
+        return self._given if self._fitted is None else self._given + self._fitted.spread()
 
     @property
     def std(self) -> Array:
@@ -76,8 +67,9 @@ class EventSmoothed:
 
     def increment(self, t: int) -> tuple[Array, Array]:
         """Mean (n,) and covariance (n, n) of theta_t - theta_{t-1}."""
-        lag = self.gains[t - 1] @ self.covs[t]
-        return self.theta[t] - self.theta[t - 1], self.covs[t] + self.covs[t - 1] - lag - lag.T
+        given = self._given
+        lag = self.gains[t - 1] @ given[t]
+        return self.theta[t] - self.theta[t - 1], given[t] + given[t - 1] - lag - lag.T
 
 
 def problem_of(run: Track, events: list[Event]) -> Problem:
@@ -98,25 +90,18 @@ def problem_of(run: Track, events: list[Event]) -> Problem:
     steps = np.array(steps_of(run, measured))[which] * drift[:, None, None]
     C0 = np.diag(WIDE * measured.unit) if bank.p0 is None else np.asarray(_full(bank, n)) * measured.relative
     m0 = np.broadcast_to(np.asarray(bank.theta0, float), n).copy()
-    problem = Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
-    return problem if bank.changes is not None else with_drift(problem, which == 0)
+    return Problem(measured.phi, measured.y, measured.r, steps, m0, C0)
 
 
-def with_drift(problem: Problem, quiet: Array) -> Problem:
-    """The same with the steps of ``quiet`` samples scaled by the factor of greatest likelihood."""
-    from scipy.optimize import minimize_scalar
-
-    def wider(log_factor: float) -> Problem:
-        factor = np.exp(log_factor)
-        return problem._replace(Q=problem.Q * np.where(quiet, factor, 1.0)[:, None, None], widened=float(factor))
-
-    def unlikely(log_factor: float) -> float:
-        tried, shape = wider(log_factor), problem.phi.shape
-        m, C = np.empty(shape), np.empty((*shape, shape[1]))
-        return -float(forward(tried.phi, tried.y, tried.r, tried.Q, tried.m0, tried.C0.copy(), m, C))
-
-    best = minimize_scalar(unlikely, bounds=(0.0, np.log(WIDER)), method="bounded", options={"xatol": CLOSE})
-    return wider(best.x) if best.fun < unlikely(0.0) else problem
+def fitted_drift(run: Track, problem: Problem, events: list[Event]) -> FittedDrift:
+    """The same with the drift that is likely, without the changes that such a drift explains."""
+    bank: Any = run.tracker
+    measured = measurements(run, [])
+    time = (measured.drift * measured.dt)[:, None, None]
+    prior = bank.event_probabilities[1].reshape(len(bank.all_changes), -1).sum(axis=1)
+    prob = dict(zip(bank.change_names, prior, strict=True))
+    changes = {event.span.date: float(prob[event.name]) for event in events if event.kind == "change"}
+    return FittedDrift(problem, steps_of(run, measured)[0] * time, changes, bank.all_sensors[0].r is None)
 
 
 class Measured(NamedTuple):
@@ -185,55 +170,3 @@ def faults(bank: Bank, run: Track, events: list[Event]) -> Array:
 
 def _full(bank: Bank, n: int) -> Array:
     return matrix("Bank", "p0", bank.p0, n)
-
-
-def solve(problem: Problem) -> tuple[Array, Array, Array]:
-    """(theta (T, n), covariances (T, n, n), gains (T, n, n))."""
-    T, n = problem.phi.shape
-    m, C = np.empty((T, n)), np.empty((T, n, n))
-    forward(problem.phi, problem.y, problem.r, problem.Q, problem.m0, problem.C0.copy(), m, C)
-    gains = np.zeros((T, n, n))
-    for t in range(T - 2, -1, -1):
-        ahead = C[t] + problem.Q[t + 1]
-        try:
-            G = np.linalg.solve(ahead, C[t]).T
-        except np.linalg.LinAlgError:
-            G = C[t] @ np.linalg.pinv(ahead, hermitian=True)
-        gains[t] = G
-        m[t] += G @ (m[t + 1] - m[t])
-        smoothed = C[t] + G @ (C[t + 1] - ahead) @ G.T
-        C[t] = 0.5 * (smoothed + smoothed.T)
-    return m, C, gains
-
-
-@Driver
-def forward(phi: Array, y: Array, r: Array, Q: Array, m0: Array, P: Array, m: Array, C: Array) -> float:
-    """The filter; m (T, n) and C (T, n, n) after each sample. Returns the log-likelihood, but for its constant."""
-    T, n = phi.shape
-    likely = 0.0
-    theta = m0.copy()
-    g = np.empty(n)
-    for t in range(T):
-        for i in range(n):
-            for j in range(n):
-                P[i, j] += Q[t, i, j]
-        if r[t] < np.inf:
-            s, e = r[t], y[t]
-            for i in range(n):
-                g[i] = 0.0
-                for j in range(n):
-                    g[i] += P[i, j] * phi[t, j]
-                s += phi[t, i] * g[i]
-                e -= phi[t, i] * theta[i]
-            likely -= 0.5 * (np.log(s) + e * e / s)
-            for i in range(n):
-                theta[i] += g[i] / s * e
-            for i in range(n):
-                for j in range(i + 1):
-                    P[i, j] -= g[i] * g[j] / s
-                    P[j, i] = P[i, j]
-        for i in range(n):
-            m[t, i] = theta[i]
-            for j in range(n):
-                C[t, i, j] = P[i, j]
-    return likely

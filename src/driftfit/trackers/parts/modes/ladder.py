@@ -11,9 +11,9 @@ unknown or wrong: T leads across to it, and back through the bottom and by a jum
 to the bottom: mixing the wide covariance of the top filter into the filter without drift costs more than anything else
 when nothing changes (measured: 1.8 times the error of least squares instead of 1.15).
 
-The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP
-standard deviations of the output (times patience, `driftfit.trackers.parts.outlying_readings`), explains the sample
-better by more than a factor 1 / RARE, its covariance grows by that move.
+The top filter may also *leap*: if a move as large as the innovation, in directions 1 / c_i and up to LEAP standard
+deviations of the output (times patience, `driftfit.trackers.parts.outlying_readings`), at this regressor and at one of
+mean square c_i, explains the sample better by more than a factor 1 / RARE, its covariance grows by that move.
 
 Source: Blom and Bar-Shalom (1988); the ladder and its transitions are ours. Cost per sample: O(K^2 n^2) for K modes,
 vectorised over the destination modes.
@@ -141,7 +141,8 @@ def leap(s: State, l: int, noise: float) -> None:
     for i in range(s.theta.shape[0]):
         own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         unit += own * s.phi[i, l] * s.phi[i, l]
-    wide = max(v, min(square, most * most * s.spread[l]))
+    # a regressor near 0 says nothing about a move: none that would exceed the reach where regressors are as usual
+    wide = max(v, min(square, most * most * s.spread[l] * min(1.0, unit)))
     better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
     s.rare[l], s.leapt[l], s.gained[l] = 1.0, 0.0, 0.0
     if better and unit > 0.0:

@@ -17,9 +17,14 @@ mode that lasted. That is exact in the probabilities of both courses and of what
 moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
 interval of dt nominal samples is a gap of dt - 1 and a floor.
 
-Only random walks, and not under `Decide`, `FirstFloor` and `IMM`, which widen by the mean; where there is no room for
-two, one leaf has the moments of both. Cost: O(H^3 + H n^2) for each sample that is not used, and twice the leaves for
-the one that ends the gap.
+Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
+numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
+whose twin is still there, one leaf goes on with the moments of both courses. Without that rule a `Decide` whose leaves
+came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
+
+Only random walks, and not under `IMM`, which has one leaf for every event and mixes it anew from all of them, nor
+under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H n^2) for each
+sample that is not used, and twice the leaves for the one that ends the gap.
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ from typing import Any
 
 from driftfit.engine.kernel import Array, kernel, shared
 from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
-from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, LOG, WEIGHT, variance_factor
+from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, variance_factor
 
 SURE = 1e-12
 """A course less likely than this is left out."""
@@ -45,9 +50,7 @@ def further(dt: float) -> int:
 
 @shared
 def open_gap(path: Array, H: int) -> None:
-    """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare, whose last entry
-    says how many leaves there is room for.
-    """
+    """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare."""
     for row in range(len(path) - 1):
         for k in range(path.shape[1]):
             path[row, k] = 1.0 if row < 2 * H and k == row % H else 0.0
@@ -217,56 +220,96 @@ def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, ka
 
 
 @shared
+def count_codes(t: Any, K: int) -> None:
+    """How many parents have each code, in `slots`, for a reduction that takes leaves of one code for one history."""
+    for k in range(K if t.bases[0] > 1.0 else 0):
+        t.slots[int(t.parents[CODE, k])] = 0
+    for k in range(K if t.bases[0] > 1.0 else 0):
+        t.slots[int(t.parents[CODE, k])] += 1
+
+
+@shared
+def may_part(t: Any, k: int) -> bool:
+    """Whether a leaf may go on as two: there is room for two of each code."""
+    return t.bases[0] == 1.0 or t.slots[int(t.parents[CODE, k])] == 1  # type: ignore[no-any-return]
+
+
+@shared
+def courses(t: Any, k: int) -> tuple[int, float]:
+    """The mode that most likely lasted for parent k, and kappa; reach and stay of this leaf in two rows of scratch."""
+    prior, path, reach, stay, H, Hm = t.prior, t.path, t.scratch[0], t.scratch[1], len(t.row), len(t.sensors)
+    for e in range(H):
+        reach[e], stay[e] = 0.0, 0.0
+        for s in range(H):
+            reach[e] += prior[s, k] * path[s, e]
+            stay[e] += prior[s, k] * path[H + s, e]
+    best, kappa = 0, -1.0
+    for c in range(len(t.walks)):
+        mass = 0.0
+        for e in range(c * Hm, (c + 1) * Hm):
+            mass += stay[e]
+        best, kappa = (c, mass) if mass > kappa else (best, kappa)
+    return best, kappa
+
+
+@shared
+def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
+    """Parent k in the course of one mode."""
+    path, stay, H, Hm = t.path, t.scratch[1], len(t.row), len(t.sensors)
+    for e in range(H):
+        stay[e] = stay[e] / kappa if e // Hm == best else 0.0
+    next_event(t, t.sample[IN_DT] == 0.0, stay, k)
+    widen_leaf(t, k, path[2 * H + best])
+
+
+@shared
+def follow_others(t: Any, k: int, to: int, best: int, kappa: float) -> None:
+    """Parent ``to``, a copy of k, in all courses but that of one mode, whose probability is kappa; of 0, in all."""
+    path, reach, stay, H, Hm = t.path, t.scratch[0], t.scratch[1], len(t.row), len(t.sensors)
+    held, means, q = 2 * H + best, 2 * H + len(t.walks), path[len(path) - 1]
+    for i in range(t.n * (t.n + 1) // 2):
+        mean = 0.0
+        for s in range(H):
+            mean += t.prior[s, k] * path[means + s, i]
+        q[i] = (mean - kappa * path[held, i]) / (1.0 - kappa)
+    for e in range(H):
+        own = stay[e] if e // Hm == best and kappa > 0.0 else 0.0
+        reach[e] = max(reach[e] - own, 0.0) / (1.0 - kappa)
+    next_event(t, t.sample[IN_DT] == 0.0, reach, to)
+    widen_leaf(t, to, q)
+
+
+@shared
+def duplicate(t: Any, T: Array, k: int, to: int) -> None:
+    """Parent k once more, with what it remembers."""
+    for i in range(len(t.parents)):
+        t.parents[i, to] = t.parents[i, k]
+    for i in range(T.shape[1]):
+        T[to, i] = T[k, i]
+
+
+@shared
 def split(t: Any, K: int) -> int:
     """The parents twice; returns how many there are now.
 
     `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
     """
-    A, T, path, prior = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history, t.path, t.prior
-    H, Hd, Hm, last, wide, count = len(t.row), len(t.walks), len(t.sensors), len(path) - 1, path.shape[1] - 1, K
-    room, floors, standing = int(path[last, wide]), t.counters[OPEN], t.sample[IN_DT] == 0.0
-    reach, stay, q = t.scratch[0], t.scratch[1], path[last]
+    A, T = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history
+    H, Hm, floors, count = len(t.row), len(t.sensors), t.counters[OPEN], K
+    count_codes(t, K)
     for k in range(K):
-        for e in range(H):
-            reach[e], stay[e] = 0.0, 0.0
-            for s in range(H):
-                reach[e] += prior[s, k] * path[s, e]
-                stay[e] += prior[s, k] * path[H + s, e]
-        best, kappa = 0, -1.0
-        for c in range(Hd):
-            mass = 0.0
-            for e in range(c * Hm, (c + 1) * Hm):
-                mass += stay[e]
-            best, kappa = (c, mass) if mass > kappa else (best, kappa)
-        rest = 1.0 - kappa
-        both = rest > SURE and kappa > SURE and count < room
-        kappa, rest = (kappa, rest) if both else (1.0, 0.0) if rest <= SURE else (0.0, 1.0)
-        for i in range(wide):
-            mean = 0.0
-            for s in range(H):
-                mean += prior[s, k] * path[2 * H + Hd + s, i]
-            q[i] = (mean - kappa * path[2 * H + best, i]) / rest if rest > 0.0 else path[2 * H + best, i]
-        for e in range(H):
-            own = stay[e] if e // Hm == best else 0.0
-            reach[e] = max(reach[e] - own, 0.0) / rest if both else reach[e]
-            stay[e] = own / kappa if kappa > 0.0 else 0.0
-        if both:
-            for i in range(len(A)):
-                A[i, count] = A[i, k]
-            for i in range(T.shape[1]):
-                T[count, i] = T[k, i]
-            A[LOG, count] += math.log(rest)
-            widen_leaf(t, count, q)
+        best, kappa = courses(t, k)
+        parts = SURE < kappa < 1.0 - SURE and may_part(t, k)
+        if parts:
+            duplicate(t, T, k, count)
+            A[LOG, count] += math.log(1.0 - kappa)
+            A[LOG, k] += math.log(kappa)
             remember_other(T, count, floors, H, Hm, best, kappa)
             remember_one(T, k, floors, H, Hm, best)
-            next_event(t, standing, reach, count)
-            next_event(t, standing, stay, k)
-            A[LOG, k] += math.log(kappa)
-            for i in range(wide):
-                q[i] = path[2 * H + best, i]
-            widen_leaf(t, k, q)
+            follow_others(t, k, count, best, kappa)
             count += 1
+        if parts or kappa >= 1.0 - SURE:
+            follow_mode(t, k, best, kappa)
         else:
-            next_event(t, standing, reach if rest > 0.0 else stay, k)
-            widen_leaf(t, k, q)
+            follow_others(t, k, k, 0, 0.0)
     return count

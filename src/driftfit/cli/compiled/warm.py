@@ -11,7 +11,7 @@ import typer
 from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
-from driftfit.run.fleet import FEWEST
+from driftfit.run.lanes import FEWEST
 from driftfit.show.parts.text import facts
 
 SAMPLES = 300

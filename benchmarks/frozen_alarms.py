@@ -1,0 +1,234 @@
+"""Alarms on a frozen reference model: real rates of false alarms, and delays beside other detectors.
+
+    y_t = 2 u_t + 1 + v_t,    u_t ~ N(0, 1), v_t of standard deviation 1
+
+The first table has records without a fault: the share of the set rate that "glr" and "cusum" have, one alarm in EVERY
+samples being set, with two standard errors. The second has faults that begin 200 samples after the reference of 1000:
+the median delay in samples, "-" if fewer than half are found within 1000, at one false alarm in 1000 samples for all.
+The rivals get what they need: the residuals of least squares on the reference, times the regressor that changes
+(squared for the noise), and limits that were fitted to records without a fault. "GLR, textbook" is the likelihood ratio
+of that regressor over the last 8, 16, .., 256 samples, which does not allow for the errors of the reference.
+
+river and ruptures are compared if they are installed (ruptures sees the whole record and has no delay: the share of
+faults that it dates within 50 samples). Run: python benchmarks/frozen_alarms.py [records, 30 by default] [--quick]
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy import signal
+
+from driftfit import ARX, Kalman, Regression, Track, track
+from driftfit.judge.alarms.onsets import onsets
+from driftfit.run.live.rule import AlarmRule
+
+Array = np.ndarray[Any, Any]
+HELD = Kalman(q=0.0, r=1.0)
+EVERY, LATER = 300.0, 5000
+NORMAL, START, FAULT = 1000, 200, 1000
+"""Samples of the reference, before the fault, and of the fault."""
+NOISES = ("normal", "t3", "GARCH(.1, .85)", "AR(.6)", "input regimes", "8 regressors", "ARX(2, 2)")
+FAULTS = ("jump .3", "jump .6", "jump 1.2", "ramp to 1", "noise x 1.5", "1 of 8, .6")
+
+
+def noise(kind: str, T: int, rng: np.random.Generator) -> Array:
+    """Noise (T,) of standard deviation 1."""
+    z = rng.standard_t(3, size=T) / np.sqrt(3.0) if kind == "t3" else rng.normal(size=T)
+    if kind == "AR(.6)":
+        return signal.lfilter([0.8], [1.0, -0.6], z)
+    if kind == "GARCH(.1, .85)":
+        h = 1.0
+        for t in range(T):
+            z[t] *= np.sqrt(h)
+            h = 0.05 + 0.1 * z[t] ** 2 + 0.85 * h
+    return z
+
+
+def constant(kind: str, T: int, rng: np.random.Generator) -> Track:
+    """A run over a record without a fault."""
+    v = noise(kind, T, rng)
+    if kind == "ARX(2, 2)":
+        u = rng.normal(size=T)
+        y = signal.lfilter([0.0, 1.0, 0.4], [1.0, -1.2, 0.5], u) + signal.lfilter([0.3], [1.0, -1.2, 0.5], v)
+        return track(ARX(2, 2), HELD, y, u)
+    u = rng.normal(size=(T, 7 if kind == "8 regressors" else 1))
+    if kind == "input regimes":
+        u *= np.where(np.arange(T) // 300 % 2, 3.0, 1.0)[:, None]
+    return track(Regression(u.shape[1], intercept=True), HELD, 2.0 * u.sum(axis=1) + 1.0 + v, u)
+
+
+def rate(alarm: str, kind: str, N: int, records: int) -> str:
+    """Measured over set rate, with two standard errors."""
+    begun = []
+    for seed in range(records):
+        run = constant(kind, N + LATER, np.random.default_rng([seed, N]))
+        begun.append(len(run.detect(alarm, every=EVERY, reference=N, seed=seed).onsets) * EVERY / LATER)
+    return f"{np.mean(begun):.2f} +- {2.0 * np.std(begun) / np.sqrt(records):.2f}"
+
+
+def rates(lengths: tuple[int, ...], records: int) -> Table:
+    title = f"Measured over set rate of false alarms, {records} records of {LATER} samples after the reference"
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
+    table.add_column("noise")
+    cells = [(alarm, N) for N in lengths for alarm in ("glr", "cusum")]
+    for alarm, N in cells:
+        table.add_column(f"{alarm}, {N}", justify="right")
+    for kind in NOISES:
+        table.add_row(kind, *(rate(alarm, kind, N, records) for alarm, N in cells))
+    return table
+
+
+def faulty(fault: str, seed: int) -> tuple[Array, Array]:
+    """y (T,) and regressors (T, n) with a fault; with "none" without one."""
+    rng = np.random.default_rng([seed, 99])
+    T, at = NORMAL + START + FAULT, NORMAL + START
+    phi = np.column_stack([rng.normal(size=(T, 7 if "1 of 8" in fault else 1)), np.ones(T)])
+    v, theta, after = rng.normal(size=T), np.ones(T), np.arange(T) - at
+    size = {"jump .3": 0.3, "jump .6": 0.6, "jump 1.2": 1.2, "1 of 8, .6": 0.6}.get(fault, 0.0)
+    theta += size * (after >= 0) if "ramp" not in fault else np.clip(after / 500.0, 0.0, 1.0)
+    v *= np.where((after >= 0) & ("noise" in fault), 1.5, 1.0)
+    return phi[:, 0] * theta + phi[:, 1:].sum(axis=1) + v, phi
+
+
+@lru_cache(maxsize=1000)
+def rule(alarm: str, seed: int, n: int) -> AlarmRule:
+    """The rule of the reference, which is the same for all faults of n regressors."""
+    y, phi = faulty("1 of 8, none" if n > 2 else "none", seed)
+    run = track(Regression(n), HELD, y, phi)
+    return run.detect(alarm, every=1000.0, reference=NORMAL, seed=seed).rule
+
+
+def ours(alarm: str, fault: str, seed: int) -> tuple[float, int]:
+    """(delay, onsets before the fault)."""
+    y, phi = faulty(fault, seed)
+    said = track(Regression(phi.shape[1]), HELD, y, phi).detect(rule(alarm, seed, phi.shape[1]), start=NORMAL)
+    return first_of(said.onsets[said.onsets >= NORMAL + START]), int(np.sum(said.onsets < NORMAL + START))
+
+
+def first_of(places: Array) -> float:
+    return float(places[0] - NORMAL - START) if len(places) else np.inf
+
+
+def stream(fault: str, seed: int) -> tuple[Array, Array]:
+    """(scores, their squared regressors) after the reference, as rivals get them, of unit variance in the reference."""
+    y, phi = faulty(fault, seed)
+    e = y - phi @ np.linalg.lstsq(phi[:NORMAL], y[:NORMAL], rcond=None)[0]
+    e /= e[:NORMAL].std()
+    x, power = (e * e, np.ones(len(e))) if "noise" in fault else (e * phi[:, 0], phi[:, 0] ** 2)
+    mean = x[:NORMAL].mean() if "noise" in fault else 0.0
+    return ((x - mean) / x[:NORMAL].std())[NORMAL:], power[NORMAL:]
+
+
+def textbook(x: Array, power: Array, limit: float) -> Iterator[int]:
+    """Onsets of the windowed likelihood ratio."""
+    S, G = (np.concatenate([[0.0], np.cumsum(part)]) for part in (x, power))
+    best = np.zeros(len(x))
+    for L in (8, 16, 32, 64, 128, 256):
+        best[L - 1 :] = np.maximum(best[L - 1 :], (S[L:] - S[:-L]) ** 2 / np.maximum(G[L:] - G[:-L], 1e-9))
+    return iter(onsets(best > limit))
+
+
+def of_river(make: Callable[[float], Any], x: Array, power: Array, limit: float) -> Iterator[int]:
+    """Drifts that a detector of river reports."""
+    detector = make(limit)
+    for t, value in enumerate(x):
+        detector.update(value)
+        if detector.drift_detected:
+            yield t
+
+
+Rival = Callable[[Array, Array, float], Iterator[int]]
+
+
+def rivals() -> dict[str, tuple[Rival, float, float, int]]:
+    """Onsets at a limit, the range of limits, and records for its calibration."""
+    found: dict[str, tuple[Rival, float, float, int]] = {"GLR, textbook": (textbook, 3.0, 60.0, 100)}
+    if find_spec("river"):
+        from river import drift
+
+        found["Page-Hinkley (river)"] = (
+            partial(of_river, lambda limit: drift.PageHinkley(delta=0.1, threshold=limit)), 2.0, 300.0, 40
+        )  # fmt: skip
+        found["ADWIN (river)"] = (partial(of_river, lambda limit: drift.ADWIN(delta=10.0**-limit)), 0.1, 8.0, 30)
+        found["KSWIN (river)"] = (partial(of_river, lambda limit: drift.KSWIN(alpha=10.0**-limit, seed=1)), 1.5, 8.0, 6)
+    return found
+
+
+def calibrated(rival: Rival, fault: str, low: float, high: float, records: int) -> float:
+    """The limit with one onset in 1000 samples, by bisection over records without a fault."""
+    kind = "noise, none" if "noise" in fault else "none, 1 of 8" if "1 of 8" in fault else "none"
+    made = [stream(kind, 10_000 + seed) for seed in range(records)]
+    allowed = sum(len(x) for x, _ in made) / 1000.0
+    for _ in range(9):
+        middle = np.sqrt(low * high)
+        begun = sum(len(list(rival(x, power, middle))) for x, power in made)
+        low, high = (middle, high) if begun > allowed else (low, middle)
+    return float(high)
+
+
+def dated(fault: str, records: int) -> str:
+    """Share of the faults that ruptures dates within 50 samples, with one false date in 1000 samples."""
+    import ruptures
+
+    def breaks(kind: str, seed: int, penalty: float) -> Array:
+        fitted = ruptures.Pelt(model="l2", min_size=8, jump=4).fit(stream(kind, seed)[0])
+        return np.array(fitted.predict(pen=penalty)[:-1])
+
+    kind, low, high = ("noise, none" if "noise" in fault else "none"), 3.0, 60.0
+    for _ in range(6):
+        middle = np.sqrt(low * high)
+        begun = sum(len(breaks(kind, 10_000 + seed, middle)) for seed in range(8))
+        low, high = (middle, high) if begun > 8 * (START + FAULT) / 1000.0 else (low, middle)
+    found = [bool((np.abs(breaks(fault, seed, high) - START) < 50).any()) for seed in range(records)]
+    return f"{100.0 * np.mean(found):.0f} %"
+
+
+def told(delays: list[float]) -> str:
+    middle, share = np.median(delays), np.mean(np.isfinite(delays))
+    return (f"{middle:.0f}" if np.isfinite(middle) else "-") + (f" ({100.0 * share:.0f} %)" if share < 1.0 else "")
+
+
+def delays(records: int, faults: tuple[str, ...]) -> Table:
+    title = f"Median delay in samples (share found), {records} records, one false alarm in 1000"
+    table = Table(box=SIMPLE_HEAD, show_edge=False, title=title)
+    table.add_column("alarm")
+    for fault in faults:
+        table.add_column(fault, justify="right")
+    false, count = {"glr": 0, "cusum": 0}, records * START * len(faults) / 1000.0
+    for alarm in false:
+        cells = []
+        for fault in faults:
+            found = [ours(alarm, fault, seed) for seed in range(records)]
+            false[alarm] += sum(before for _, before in found)
+            cells.append(told([delay for delay, _ in found]))
+        table.add_row(alarm, *cells)
+    for name, (rival, low, high, made) in rivals().items():
+        cells = []
+        for fault in faults:
+            limit = calibrated(rival, fault, low, high, made if records > 5 else 2)
+            found = [np.array(list(rival(*stream(fault, seed), limit)), int) for seed in range(records)]
+            cells.append(told([first_of(one[one >= START] + NORMAL) for one in found]))
+        table.add_row(name, *cells)
+    if find_spec("ruptures"):
+        table.add_row("ruptures, off line", *(dated(fault, min(records, 20)) for fault in faults))
+    table.caption = ", ".join(f"{name}: {n} false alarms, {count:.0f} expected" for name, n in false.items())
+    return table
+
+
+def main(records: int = 30, lengths: tuple[int, ...] = (300, 1000, 5000), faults: tuple[str, ...] = FAULTS) -> None:
+    Console(width=120).print(delays(records, faults))
+    Console(width=120).print(rates(lengths, records))
+
+
+if __name__ == "__main__":
+    if "--quick" in sys.argv:
+        main(2, (300,), FAULTS[1:2])
+    else:
+        main(*map(int, sys.argv[1:2]))

@@ -1,0 +1,256 @@
+"""Regressions with time-varying coefficients by formula, with results in the manner of statsmodels.
+
+    result = TimeVaryingRegression.from_formula("demand ~ income + rate", data).fit()
+    result.params, result.bse, result.tvalues, result.conf_int(), result.summary(), result.plot_cusum()
+
+Formulas are those of formulaic (R's and patsy's grammar: interactions, transforms, categories). Rows are in order of
+time. ``params`` are the coefficients after the last row and ``params_path`` those after every row; ``smoothed_path``
+uses the whole sample.
+
+Needs formulaic and pandas (``pip install "driftfit[formula]"``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import formulaic
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr, ndtri
+
+from driftfit.models.regression import Regression
+from driftfit.results import Track
+from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.trackers.adaptive_kalman import AdaptiveKalman
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.kalman import Kalman
+from driftfit.tracking import track
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_INTERCEPT = "Intercept"
+
+
+@dataclass(frozen=True)
+class TimeVaryingRegression:
+    """y_t = x_t' beta_t + noise, where beta drifts as the tracker assumes.
+
+    Parameters
+    ----------
+    endog : pandas Series (T,)
+        Outputs; NaN is missing.
+    exog : pandas DataFrame (T, k)
+        Regressors by name. A column "Intercept" is the constant.
+    tracker : Tracker or None
+        None is ``AdaptiveKalman()``, which needs no settings. ``RLS(1.0)`` gives recursive least squares.
+    """
+
+    endog: pd.Series
+    exog: pd.DataFrame
+    tracker: Tracker | None = None
+
+    @classmethod
+    def from_formula(cls, formula: str, data: Any, tracker: Tracker | None = None) -> Self:
+        """Read a formula such as ``"y ~ x1 + log(x2) + C(region)"``; rows with missing cells are kept.
+
+        ValueError for a formula without a left-hand side, or with more than one output.
+        """
+        matrices = formulaic.model_matrix(formula, data, na_action="ignore")
+        if not isinstance(matrices, formulaic.ModelMatrices):
+            raise ValueError(f"from_formula: {formula!r} has no output; write it as in 'y ~ x1 + x2'.")
+        left, right = pd.DataFrame(matrices.lhs), pd.DataFrame(matrices.rhs)
+        if left.shape[1] != 1:
+            raise ValueError(f"from_formula: {formula!r} has {left.shape[1]} outputs; a regression has one.")
+        return cls(left.iloc[:, 0], right, tracker)
+
+    def fit(self) -> TimeVaryingResults:
+        """Track the coefficients through all rows."""
+        names = [str(name) for name in self.exog.columns if name != _INTERCEPT]
+        model = Regression(tuple(names), intercept=_INTERCEPT in self.exog.columns)
+        tracker = AdaptiveKalman() if self.tracker is None else self.tracker
+        y, X = self.endog.to_numpy(dtype=float), self.exog.drop(columns=_INTERCEPT, errors="ignore")
+        run = track(model, tracker, y, X.to_numpy(dtype=float) if names else None)
+        columns = [*names, *([_INTERCEPT] if model.intercept else [])]
+        return TimeVaryingResults(run, self.endog, pd.Index(columns))
+
+
+@dataclass(frozen=True)
+class TimeVaryingResults:
+    """Estimates in the words of statsmodels; ``run`` is the `Track` with everything else."""
+
+    run: Track
+    endog: pd.Series
+    names: pd.Index
+
+    @property
+    def params(self) -> pd.Series:
+        """Coefficients after the last row, (k,)."""
+        return pd.Series(self.run.theta[-1], self.names, name="params")
+
+    @property
+    def bse(self) -> pd.Series:
+        """Their standard errors, (k,): inf where the rows do not determine a coefficient."""
+        return pd.Series(self.run.std[-1], self.names, name="bse")
+
+    @property
+    def tvalues(self) -> pd.Series:
+        """Coefficients over standard errors, (k,)."""
+        return (self.params / self.bse).rename("tvalues")
+
+    @property
+    def pvalues(self) -> pd.Series:
+        """Two-sided p-values of "this coefficient is zero now", from the normal distribution, (k,)."""
+        return (2 * (1 - pd.Series(ndtr(self.tvalues.abs()), self.names))).rename("pvalues")
+
+    def conf_int(self, alpha: float = 0.05) -> pd.DataFrame:
+        """Limits of the 1 - alpha confidence interval of every coefficient after the last row, columns 0 and 1."""
+        half = float(ndtri(1 - alpha / 2)) * self.bse
+        return pd.DataFrame({0: self.params - half, 1: self.params + half})
+
+    @property
+    def params_path(self) -> pd.DataFrame:
+        """Coefficients after every row, (T, k), from that row and those before it."""
+        return pd.DataFrame(self.run.theta, self.endog.index, self.names)
+
+    @property
+    def bse_path(self) -> pd.DataFrame:
+        """Their standard errors, (T, k)."""
+        return pd.DataFrame(self.run.std, self.endog.index, self.names)
+
+    @cached_property
+    def smoothed_path(self) -> pd.DataFrame:
+        """Coefficients at every row, (T, k), from all rows."""
+        return pd.DataFrame(self.run.smooth().theta, self.endog.index, self.names)
+
+    @property
+    def fittedvalues(self) -> pd.Series:
+        """One-step predictions, (T,): of each row from those before it."""
+        return pd.Series(self.run.prediction, self.endog.index, name="fittedvalues")
+
+    @property
+    def resid(self) -> pd.Series:
+        """One-step prediction errors, (T,)."""
+        return pd.Series(self.run.innovation, self.endog.index, name="resid")
+
+    @property
+    def llf(self) -> float:
+        """Log-likelihood; with a diffuse start its diffuse form, see "Likelihood" in the chapter on tuning."""
+        return self.run.loglik
+
+    @property
+    def nobs(self) -> int:
+        """Number of rows that were used."""
+        return int(np.sum(self.run.ok))
+
+    @cached_property
+    def recursive_residuals(self) -> pd.Series:
+        """One-step errors of constant coefficients, each over its standard deviation, (T,).
+
+        w_t = (y_t - x_t' beta_(t-1)) / sqrt(1 + x_t' (X'X)^-1 x_t) of Brown, Durbin and Evans (1975, eq. 2), whatever
+        the tracker; NaN until the coefficients are determined.
+        """
+        run = self.run
+        constant = track(run.model, Kalman(q=0.0, r=1.0), run.y, run.u)
+        fit = constant.ok.astype(bool) & np.isfinite(constant.innovation_std)
+        errors = constant.innovation / np.where(fit, constant.innovation_std, 1.0)
+        return pd.Series(np.where(fit, errors, np.nan), self.endog.index, name="recursive residuals")
+
+    @property
+    def cusum(self) -> pd.Series:
+        """Cumulative sum of the recursive residuals over their standard deviation, (T,), eq. 5 of the same paper."""
+        w = self.recursive_residuals
+        return (w.cumsum() / w.std(ddof=1)).rename("cusum")
+
+    def cusum_limits(self, alpha: float = 0.05) -> pd.DataFrame:
+        """Lower and upper limits of `cusum` if the coefficients are constant, (T, 2).
+
+        +- a (sqrt(N) + 2 i / sqrt(N)) at the i-th of N errors, a = 1.143, .948, .850 for alpha = .01, .05, .10 (Brown,
+        Durbin and Evans 1975, eq. 8). ValueError for another alpha.
+        """
+        factors = {0.01: 1.143, 0.05: 0.948, 0.10: 0.850}
+        if alpha not in factors:
+            raise ValueError(f"cusum_limits: alpha={alpha} has no tabulated factor; choose from {sorted(factors)}.")
+        there = self.recursive_residuals.notna()
+        count = max(int(there.sum()), 1)
+        limit = factors[alpha] * (np.sqrt(count) + 2 * np.cumsum(there) / np.sqrt(count))
+        return pd.DataFrame({"lower": -limit, "upper": limit}, self.endog.index)
+
+    def plot_cusum(self, alpha: float = 0.05) -> Figure:
+        """`cusum` with its limits; a matplotlib figure. A path that leaves them contradicts constant coefficients."""
+        figure = new_figure(8.0, 3.0)
+        axis = figure.subplots()
+        axis.plot(_places(self.endog), self.cusum, color=BLUE, label="cumulative sum of recursive residuals")
+        axis.plot(_places(self.endog), self.cusum_limits(alpha), color=RED, linestyle="--", linewidth=1)
+        axis.axhline(0.0, color="black", linewidth=0.6)
+        axis.set_title(f"CUSUM, limits at {alpha:.0%}")
+        return figure
+
+    def plot_coefficients(self, level: float = 0.95) -> Figure:
+        """Every coefficient over time with its band, the prediction and the errors; a matplotlib figure."""
+        return self.run.plot(level)
+
+    def summary(self, alpha: float = 0.05) -> CoefficientTable:
+        """The table of coefficients after the last row, as text, HTML or LaTeX."""
+        limits = self.conf_int(alpha)
+        table = pd.DataFrame({
+            "coef": self.params, "std err": self.bse, "z": self.tvalues, "P>|z|": self.pvalues,
+            f"[{alpha / 2:g}": limits[0], f"{1 - alpha / 2:g}]": limits[1],
+        })  # fmt: skip
+        facts = {
+            "Dep. Variable": str(self.endog.name), "Tracker": repr(self.run.tracker), "Model": repr(self.run.model),
+            "No. Observations": str(self.nobs), "Log-Likelihood": f"{self.llf:.3f}",
+        }  # fmt: skip
+        return CoefficientTable(facts, table)
+
+
+@dataclass(frozen=True)
+class CoefficientTable:
+    """What `summary` returns; ``print`` shows it as text, and a notebook as HTML."""
+
+    facts: dict[str, str]
+    table: pd.DataFrame
+
+    def as_text(self) -> str:
+        """Plain text."""
+        width = max(map(len, self.facts))
+        lines = [f"{name + ':':<{width + 2}}{value}" for name, value in self.facts.items()]
+        body = self.table.to_string(float_format="{:.4f}".format)
+        rule = "=" * max(map(len, [*lines, *body.splitlines()]))
+        return "\n".join([rule, *lines, rule, body, rule])
+
+    def as_html(self) -> str:
+        """Two HTML tables."""
+        facts = pd.Series(self.facts).to_frame().to_html(header=False)
+        table: str = self.table.to_html(float_format="{:.4f}".format)
+        return f"{facts}{table}"
+
+    def as_latex(self) -> str:
+        """A LaTeX tabular."""
+        rows = [" & ".join(["", *map(_escaped, self.table.columns)])]
+        rows += [" & ".join([_escaped(str(name)), *(f"{x:.4f}" for x in row)]) for name, row in self.table.iterrows()]
+        facts = [rf"\multicolumn{{1}}{{l}}{{{_escaped(k)}}} & \multicolumn{{6}}{{l}}{{{_escaped(v)}}}"
+                 for k, v in self.facts.items()]  # fmt: skip
+        body = " \\\\\n".join(facts) + " \\\\\n\\hline\n" + rows[0] + " \\\\\n\\hline\n" + " \\\\\n".join(rows[1:])
+        return "\\begin{tabular}{lrrrrrr}\n\\hline\n" + body + " \\\\\n\\hline\n\\end{tabular}"
+
+    def __str__(self) -> str:
+        return self.as_text()
+
+    def _repr_html_(self) -> str:
+        return self.as_html()
+
+
+def _escaped(text: str) -> str:
+    """Text in which LaTeX's special characters are escaped."""
+    special = {"&": r"\&", "%": r"\%", "#": r"\#", "_": r"\_", "|": r"\textbar{}", ">": r"\textgreater{}"}
+    return "".join(special.get(letter, letter) for letter in text)
+
+
+def _places(endog: pd.Series) -> Any:
+    """The index as matplotlib takes it."""
+    index = endog.index
+    return index.to_timestamp() if isinstance(index, pd.PeriodIndex) else index

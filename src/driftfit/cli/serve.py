@@ -1,0 +1,55 @@
+"""``driftfit serve``: a live service that follows the units of a plant."""
+
+from __future__ import annotations
+
+import getpass
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from driftfit.cli.parts.program import app, helpful, progress, say
+
+NEEDED = "driftfit serve needs more packages: pip install 'driftfit[serve]' ({})."
+
+
+@app.command()
+def serve(
+    file: Annotated[
+        Path | None, typer.Argument(help="Configuration, a TOML file; docs/service.md explains it.")
+    ] = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say whether the configuration is valid.")] = False,
+    demo: Annotated[bool, typer.Option("--demo", help="A simulated plant; no file, broker or network needed.")] = False,
+    port: Annotated[int | None, typer.Option(help="Port of the page.")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Where journal and results are stored.")] = None,
+    make_hash: Annotated[bool, typer.Option("--hash", help="Ask for a password and print its hash.")] = False,
+    make_token: Annotated[bool, typer.Option("--token", help="Print a new token and its hash.")] = False,
+) -> None:
+    """Follow the units of a plant: sensors in, parameters, bands and alarms out, and a page to watch."""
+    with helpful():
+        try:
+            from driftfit.service import start
+        except ImportError as error:
+            raise ValueError(NEEDED.format(error)) from None
+        if make_hash or make_token:
+            from driftfit.service.page.passwords import hashed, new_token
+
+            for line in [hashed(getpass.getpass("Password: "))] if make_hash else new_token():
+                say(line, soft_wrap=True)
+            return
+        if demo == (file is not None):
+            raise ValueError("name a configuration, as in driftfit serve plant.toml, or try driftfit serve --demo.")
+        try:
+            config, home = start.configured(start.DEMO if file is None else file, port, folder)
+        except start.ProblemsError as error:
+            for problem in error.messages:
+                typer.echo(f"driftfit: {problem}", err=True)
+            raise typer.Exit(2) from None
+        if check:
+            say(start.described(config), soft_wrap=True)
+            return
+        with tempfile.TemporaryDirectory(prefix="driftfit-demo-") as temporary:
+            home = Path(temporary) if demo and folder is None else home
+            progress.print(start.greeting(config, home), markup=False, highlight=False, soft_wrap=True)
+            start.run(config, home)

@@ -1,0 +1,227 @@
+"""Lanes: many series, or many settings for one series, in parallel in the lanes of tiles, on all cores.
+
+A tile holds up to thirty-two series of one model and one kind of tracker; the compiled step works on all its lanes at
+once. Tiles are distributed over a pool of threads, which run in parallel because compiled code releases the GIL. Every
+lane does the same arithmetic in the same order as its series would alone, so results agree bit for bit.
+
+Several outputs of a series are lanes of one tile, because they read each other's past. Of G series with ny outputs
+lane o G + g is output o of series g; lanes beyond ny G repeat others and are ignored.
+
+Series are sorted by length, so that those of one tile end at about the same time. A lane whose series has ended
+continues with dt = 0 and no output, which changes only the lags of its model; its state is copied when its series ends.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from driftfit.data.record import Records
+from driftfit.engine.drivers import repeat_tile
+from driftfit.engine.kernel import Array, Driver
+from driftfit.run.program import Program, State, tile_of
+from driftfit.run.result import Lane
+from driftfit.trackers.base import Tracker
+
+BLOCK = 256
+"""Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
+
+FEWEST = 10
+"""Fewer series than this are run one by one: a tile of 32 lanes costs as much as about ten single lanes."""
+
+LARGEST = 10
+"""With more parameters than this loops over lanes stay scalar and are slower than single lanes (docs/design.md)."""
+
+SHOWN = 1_000_000
+"""Samples above which a progress bar appears."""
+
+
+_thread = threading.local()
+
+
+def run_lanes(
+    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State]
+) -> list[Lane | None]:
+    """Run every series by its programs, one for each of its outputs; all have one bound model.
+
+    ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
+    """
+    lanes: list[Lane | None] = [None] * len(programs)
+    ny = records.ny
+    jobs = [job for group in _groups(programs[::ny]) for job in _jobs(programs, records, group, keep)]
+    for job in jobs:
+        for lane, k in enumerate(job.lanes.tolist()):
+            for name, value in starts.get(k, {}).items():
+                job.tile[name][0, ..., lane] = value
+    jobs.sort(key=lambda job: -len(job.out))
+    _run_jobs(jobs, records)
+    for job in jobs:
+        if job.done:
+            for lane in np.flatnonzero(job.live).tolist():
+                lanes[job.lanes[lane]] = Lane(job.out, job.tile, lane)
+    return lanes
+
+
+class Job:
+    """One tile with the number of the program in each lane; lanes that are not ``live`` repeat others."""
+
+    def __init__(self, run: Any, tile: Array, lanes: Array, live: Array, out: Array) -> None:
+        self.run = run
+        self.tile = tile
+        self.lanes = lanes
+        self.live = live
+        self.out = out
+        self.done = False
+
+
+def _groups(programs: Sequence[Program]) -> list[list[int]]:
+    """Series whose trackers have the same steps and fields, so that they can share tiles."""
+    groups: dict[Any, list[int]] = defaultdict(list)
+    kinds: dict[Tracker, Any] = {}
+    for k, program in enumerate(programs):
+        if program.tracker not in kinds:
+            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
+        groups[kinds[program.tracker]].append(k)
+    return list(groups.values())
+
+
+def width_of(program: Program, count: int, ny: int = 1) -> int:
+    """Lanes of the tiles for ``count`` series with ny outputs."""
+    wide = 1 if count * ny < FEWEST or program.model.n > LARGEST else program.tracker.width
+    return ny if wide < 2 * ny else wide
+
+
+def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str) -> Iterator[Job]:
+    """Tiles for the series of one group, longest first."""
+    ny, program = records.ny, programs[group[0] * records.ny]
+    L = width_of(program, len(group), ny)
+    G = L // ny
+    order = np.array(group)[np.argsort(-records.length[group], kind="stable")]
+    padded = np.concatenate([order, np.full(-len(order) % G, order[-1])]).reshape(-1, G)
+    place, output = np.arange(L) % G, np.minimum(np.arange(L) // G, ny - 1)
+    lanes = padded[:, place] * ny + output
+    tiles = _tiles(programs, lanes)
+    longest = records.length[padded[:, 0]]
+    ends = np.cumsum(longest)
+    # one allocation for all tiles, so that it is large enough for huge pages
+    out = program.written(tiles[:1], int(ends[-1]), keep)
+    run = program.drivers(keep).run
+    for k, some in enumerate(lanes):
+        live = (np.arange(L) < ny * G) & (place < len(order) - k * G)
+        yield Job(run, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
+
+
+def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
+    """Tiles at their start, one record per row of ``lanes``."""
+    count, L = lanes.shape
+    first = [programs[k] for k in lanes[0]]
+    tiles = repeat_tile(tile_of(first), count)
+    if any(programs[k] is not first[lane] for row in lanes for lane, k in enumerate(row.tolist())):
+        starts = {key: one.start for key, one in {id(one): one for one in programs}.items()}
+        for name in first[0].start:
+            values = np.array([starts[id(programs[k])][name] for k in lanes.ravel()])
+            tiles[name][...] = np.moveaxis(values.reshape(count, L, *values.shape[1:]), 1, -1)
+    return tiles
+
+
+def _run_jobs(jobs: Sequence[Job], records: Records) -> None:
+    """Run all jobs on a pool of threads and mark those that are done."""
+    for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
+        _drive(job, records, 0)  # compiles, so that threads do not wait for each other
+    total = sum(len(job.out) * int(job.live.sum()) for job in jobs)
+    with (
+        Progress(console=Console(stderr=True), transient=True, disable=total <= SHOWN) as progress,
+        ThreadPoolExecutor(cores()) as pool,
+    ):
+        task = progress.add_task("tracking", total=total)
+        waiting = {pool.submit(_drive, job, records, len(job.out)): job for job in jobs}
+        try:
+            for future in as_completed(waiting):
+                future.result()
+                waiting[future].done = True
+                progress.advance(task, len(waiting[future].out) * int(waiting[future].live.sum()))
+        except KeyboardInterrupt:
+            pool.shutdown(wait=True, cancel_futures=True)
+            for future, job in waiting.items():
+                job.done = not future.cancelled()
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _drive(job: Job, records: Records, stop: int) -> None:
+    """Run one tile over its first ``stop`` samples, block by block."""
+    L, N = len(job.lanes), len(records.y)
+    series, column = np.divmod(job.lanes, records.ny)
+    first, length = records.first[series], records.length[series]
+    columns = records.known.columns
+    given, factors = records.y.reshape(N, -1), columns.reshape(*columns.shape[:2], -1)
+    y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(columns)), columns.shape[1])
+    finals: dict[int, Array] = {}
+    bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
+    for a, b in pairwise(bounds) if stop else [(0, 0)]:
+        size = b - a
+        start = np.where(b <= length, first + a, -1)
+        _gather_signals(given, records.u, start, column, y[:size], u[:size])
+        _gather_factors(factors, start, column, known if len(known) == 1 else known[:size])
+        job.run(job.tile, y[:size], u[:size], known if len(known) == 1 else known[:size], job.out[a:b])
+        for lane in np.flatnonzero(length == b).tolist():
+            finals[lane] = _words(job.tile, L)[:, lane].copy()
+    for lane, words in finals.items():
+        _words(job.tile, L)[:, lane] = words
+
+
+def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
+    """This thread's memory for a block in lane order; fresh memory for every tile would cost as much as the filter."""
+    shapes = (BLOCK, L), (BLOCK, m, L), (factors, columns, L)
+    if getattr(_thread, "shapes", None) != shapes:
+        _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
+    block: tuple[Array, Array, Array] = _thread.block
+    return block
+
+
+def _words(tile: Array, L: int) -> Array:
+    """The fields of a tile as (words, L): one column is the whole state of one lane."""
+    flat = tile.view(np.int64).reshape(-1)
+    return flat[: len(flat) // L * L].reshape(-1, L)
+
+
+@Driver
+def _gather_signals(y: Array, u: Array, start: Array, column: Array, to_y: Array, to_u: Array) -> None:
+    """Copy samples of every lane's series from ``start`` on into lane order; NaN for a lane that has ended (-1).
+
+    The copy goes sample by sample and not lane by lane, so that the block is written row after row (4 ns per series and
+    step with four inputs; lane by lane it takes 12, because each store opens another cache line).
+    """
+    L, m = len(start), u.shape[1]
+    for t in range(len(to_y)):
+        for l in range(L):
+            to_y[t, l] = y[start[l] + t, column[l]] if start[l] >= 0 else np.nan
+        for j in range(m):
+            for l in range(L):
+                to_u[t, j, l] = u[start[l] + t, j] if start[l] >= 0 else np.nan
+
+
+@Driver
+def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) -> None:
+    """The same for what is known of the samples (one row if it is the same for all); dt = 0 for a lane that has ended.
+
+    ``known`` is (T, k, ny).
+    """
+    changing = known.shape[0] > 1
+    for t in range(len(to_known)):
+        for j in range(known.shape[1]):
+            for l in range(len(start)):
+                to_known[t, j, l] = known[(start[l] + t) * changing, j, column[l]] if start[l] >= 0 else 1.0 * (j > 0)

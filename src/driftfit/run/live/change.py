@@ -1,0 +1,46 @@
+"""What changed, by how much and since when: what an alarm with a frozen reference model can tell."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.run.live.likelihood_ratio import NOISE_WINDOW, RATIO, RAW, SCALE, SIZE, SPREAD, STD, WHICH, WINDOW
+from driftfit.run.live.rule import AlarmRule
+
+SURE = NormalDist().inv_cdf(0.975)
+
+
+class Change(NamedTuple):
+    """A change in the window with the largest likelihood ratio, with a band of 95 %.
+
+    Of a parameter, ``size`` is the difference from its value in the reference; of the noise, the factor of its standard
+    deviation. ``since`` is the first of the used samples in that window. At the onset of an alarm the size is somewhat
+    too large, because the noise of a window that is beyond its limit tends to be on its side.
+    """
+
+    name: str
+    size: float
+    low: float
+    high: float
+    since: int
+
+
+def change_of(rule: AlarmRule, told: Array, t: int) -> Change:
+    """The change that the statistics ``told`` of sample t show."""
+    model = rule.reference
+    cause = rule.names[rule.cause(told[rule.entries])]
+    if cause == "noise" and np.isfinite(told[RATIO]):
+        L = told[NOISE_WINDOW]
+        error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
+        size, half = told[RATIO], SURE * told[RATIO] * error
+    elif np.isfinite(told[WHICH]) and (rule.kind == "glr" or cause == rule.parameters[int(told[WHICH])]):
+        which, L = int(told[WHICH]), told[WINDOW]
+        unit = model.numbers[SCALE] / model.unit[which]
+        cause, size, half = rule.parameters[which], told[SIZE] * unit, SURE * told[STD] * unit
+    else:
+        return Change(cause, np.nan, np.nan, np.nan, t)
+    return Change(cause, float(size), float(size - half), float(size + half), max(t + 1 - int(L), 0))

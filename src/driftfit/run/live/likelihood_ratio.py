@@ -1,0 +1,366 @@
+"""Windowed likelihood ratios and score CUSUM on a frozen reference model, recursive and in constant memory.
+
+    e_t = y_t - phi_t' theta,                 theta of the reference, frozen
+    w_t = e_t - sum_k a_k e_(t-k)             the noise of the reference was an autoregression; phi in the same way
+    x_t = w_t / (scale sqrt(h_t))             h_(t+1) = 1 - alpha - beta + alpha h_t g_t^2 / v + beta h_t
+    g_t = x_t clipped at +-clip               score; E g^2 = v, var g^2 = kappa, E dg/dx = k in the reference
+
+For a window of L samples S = sum phi g, G = sum phi phi', Q = sum g^2. theta was estimated, with covariance C, so that
+without a fault S ~ N(0, V), V = v G + k^2 G C G. The statistics are
+
+    one            max_j (g_j' V^-1 S)^2 / g_j' V^-1 g_j,  g_j = G e_j      one parameter moved by d_j
+    parameters     S' V^-1 S                                                any of them did
+    noise          Q against L v, both tails                                the noise variance changed
+
+as normal deviates (Wilson and Hilferty 1931), each the largest over windows of 8, 12, 16, 24, .., 384 samples. Level j
+has sums over blocks of 2^j samples, of which it keeps twelve; a block is the sum of two of the level below, so nothing
+is ever subtracted, and windows of 8 and 12 blocks are compared whenever a block is complete. The size of the change is
+d_j = g_j' V^-1 U / g_j' V^-1 g_j with U = sum phi x, and that of the noise sqrt(mean x^2), x without the clipping.
+
+The score CUSUM of parameter j, both signs, is C <- max(0, C + log likelihood ratio of a shift by SHIFT standard
+deviations of the noise); that of the noise the same for its variance. They are given as sqrt(2 C), again a deviate.
+
+A sample that cannot be used is passed over; an autoregression then waits until its lags are complete. Source: Lai
+(1998) for windowed likelihood ratios, Huber (1964) for the score, Bollerslev (1986) for h. Departures: the covariance
+of the reference within the statistic; windows of 8 and 12 blocks, of which the longer ones are compared less often.
+Cost per sample: O(n^3 + p n) on average, some 2 microseconds with four parameters.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import SMALLEST
+from driftfit.engine.kernel import Array, Driver, exp, kernel, log, shared
+
+LEVELS, BLOCKS, SHORT = 6, 12, 8
+"""Levels of blocks of 1, 2, 4, .. samples; blocks that each keeps; blocks of the shorter window."""
+GAP = 1.5
+"""An interval longer than this breaks an autoregression."""
+SHIFT = 0.5
+"""What the score CUSUM waits for, in standard deviations of the noise per root mean square regressor."""
+FLAT = 1e-9
+WIDE = 30.0
+"""x is limited to this for the size of a change."""
+SCALE, CLIP, K, V, KAPPA, ALPHA, BETA, INSIDE, RAW, SPREAD, LONGEST, NORMAL = range(12)
+"""Entries of `Frozen.numbers`. INSIDE is the mean of x^2 where x is not clipped and 0 elsewhere, RAW and SPREAD are the
+mean and variance of x^2, LONGEST is the longest window that judges the noise, NORMAL the size of the reference.
+"""
+SINCE, LEVEL, COUNT = range(3)
+"""Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
+ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
+"""Entries of what is written for a sample; the CUSUM of n parameters and of the noise come last."""
+
+
+class Frozen(NamedTuple):
+    """The reference model as the compiled routines take it; regressors are in units of ``unit``."""
+
+    theta: Array
+    unit: Array
+    ar: Array
+    cov: Array
+    numbers: Array
+
+
+class Memory(NamedTuple):
+    """The state: lags, block sums, the statistics of every window, CUSUM, counts, and the sums and statistics of the
+    last sample; ``work`` is scratch.
+    """
+
+    past: Array
+    sums: Array
+    last: Array
+    cusum: Array
+    counts: Array
+    work: Array
+    sample: Array
+    told: Array
+
+
+def memory_of(n: int, p: int) -> Memory:
+    """The state before the first sample, for n parameters and an autoregression of order p."""
+    last = np.full((LEVELS, 2, CUSUM), np.nan)
+    sums = np.zeros((LEVELS, BLOCKS, size_of(n)))
+    work = np.zeros((2 * n + 4, size_of(n)))
+    counts, told = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
+    past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1, 2))
+    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), told)
+
+
+def size_of(n: int) -> int:
+    """Numbers in the sums of a block: S, U, Q, sum x^2 and the lower triangle of G."""
+    return 2 * n + 2 + n * (n + 1) // 2
+
+
+@shared
+def enter(sums: Array, sample: Array, count: int) -> None:
+    """Add a sample as a block of level 0, and every block that it completes; ``count`` samples with this one."""
+    levels, blocks, size = sums.shape
+    for i in range(size):
+        sums[0, count % blocks, i] = sample[i]
+    for j in range(1, levels):
+        if count % (1 << j) != 0:
+            break
+        b = count >> j
+        for i in range(size):
+            sums[j, b % blocks, i] = sums[j - 1, (2 * b - 1) % blocks, i] + sums[j - 1, (2 * b) % blocks, i]
+
+
+@kernel
+def cube_root(x: float) -> float:
+    return exp(log(x) / 3.0) if x > SMALLEST else 0.0
+
+
+@shared
+def cube_deviate(ratio: float, shape: float) -> float:
+    """A gamma variable of this shape over its mean as a normal deviate (Wilson and Hilferty 1931)."""
+    return (cube_root(ratio) - (1.0 - 1.0 / (9.0 * shape))) * 3.0 * np.sqrt(shape)
+
+
+@shared
+def variance(total: Array, frozen: Frozen, work: Array) -> None:
+    """V of the sums of a window in work[:n], G in work[n:2n], symmetric."""
+    n = frozen.theta.shape[0]
+    v, k, at = frozen.numbers[V], frozen.numbers[K], 2 * n + 2
+    for i in range(n):
+        for j in range(i + 1):
+            work[n + i, j] = work[n + j, i] = total[at]
+            at += 1
+    for i in range(n):
+        for j in range(n):
+            value = 0.0
+            for m in range(n):
+                value += work[n + i, m] * frozen.cov[m, j]
+            work[2 * n, j] = value
+        for j in range(i + 1):
+            value = 0.0
+            for m in range(n):
+                value += work[2 * n, m] * work[n + m, j]
+            work[i, j] = v * work[n + i, j] + k * k * value
+
+
+@shared
+def factor(work: Array, n: int) -> int:
+    """Cholesky factor of work[:n] in place, a column of zeros where there is no direction left; returns the rank."""
+    rank = 0
+    for j in range(n):
+        own = work[j, j]
+        pivot = own
+        for m in range(j):
+            pivot -= work[j, m] * work[j, m]
+        good = pivot > FLAT * own and own > 0.0
+        root = np.sqrt(pivot) if good else 0.0
+        rank += 1 if good else 0
+        work[j, j] = root
+        for i in range(j + 1, n):
+            value = work[i, j]
+            for m in range(j):
+                value -= work[i, m] * work[j, m]
+            work[i, j] = value / root if good else 0.0
+    return rank
+
+
+@shared
+def solve(work: Array, n: int, given: Array, into: Array) -> None:
+    """into = factor^-1 given."""
+    for i in range(n):
+        value = given[i]
+        for m in range(i):
+            value -= work[i, m] * into[m]
+        into[i] = value / work[i, i] if work[i, i] > 0.0 else 0.0
+
+
+@shared
+def compare(total: Array, L: int, frozen: Frozen, work: Array, told: Array) -> None:
+    """The statistics of one window into told."""
+    n = frozen.theta.shape[0]
+    numbers = frozen.numbers
+    variance(total, frozen, work)
+    rank = factor(work, n)
+    z, u, g = work[2 * n], work[2 * n + 1], work[2 * n + 2]
+    solve(work, n, total[:n], z)
+    solve(work, n, total[n : 2 * n], u)
+    square = 0.0
+    for i in range(n):
+        square += z[i] * z[i]
+    told[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
+    best, told[ONE] = -1.0, np.nan
+    for j in range(n):
+        solve(work, n, work[n + j, :n], g)
+        length, score, raw = 0.0, 0.0, 0.0
+        for i in range(n):
+            length += g[i] * g[i]
+            score += g[i] * z[i]
+            raw += g[i] * u[i]
+        if length > 0.0 and score * score > best * length:
+            best = score * score / length
+            told[WHICH], told[SIZE], told[STD] = j, raw / length, np.sqrt(numbers[RAW] / (numbers[V] * length))
+    if best >= 0.0:
+        told[ONE] = np.sqrt(best)
+    told[NOISE], told[WINDOW] = np.nan, L
+    if numbers[LONGEST] >= L:
+        ratio = total[2 * n] / (L * numbers[V])
+        z_noise = cube_deviate(ratio, L * numbers[V] * numbers[V] / numbers[KAPPA])
+        told[NOISE] = abs(z_noise) / np.sqrt(1.0 + L / numbers[NORMAL])
+        told[RATIO] = np.sqrt(total[2 * n + 1] / (L * numbers[RAW]))
+
+
+@shared
+def windows(memory: Memory, frozen: Frozen, count: int) -> None:
+    """Compare the windows that end with a block that the last sample completed."""
+    sums, work, size = memory.sums, memory.work, memory.sums.shape[2]
+    total = work[work.shape[0] - 1]
+    for j in range(sums.shape[0]):
+        b = count >> j
+        if count % (1 << j) != 0 or b < SHORT:
+            break
+        for i in range(size):
+            total[i] = 0.0
+        for kind in range(2):
+            blocks, begin = (SHORT, 0) if kind == 0 else (BLOCKS, SHORT)
+            if b < blocks:
+                break
+            for back in range(begin, blocks):
+                for i in range(size):
+                    total[i] += sums[j, (b - back) % BLOCKS, i]
+            compare(total, blocks << j, frozen, work, memory.last[j, kind])
+
+
+@shared
+def accumulate(sample: Array, frozen: Frozen, cusum: Array) -> None:
+    """One step of the CUSUM of every parameter, the last row that of the noise; columns are up and down."""
+    n = frozen.theta.shape[0]
+    k, v, kappa = frozen.numbers[K], frozen.numbers[V], frozen.numbers[KAPPA]
+    at = 2 * n + 2
+    for j in range(n + 1):
+        at += j
+        if j < n:
+            z, mean, var, power = sample[j], SHIFT * k, v, sample[at + j]
+        else:
+            z, mean, var, power = sample[2 * n] - v, SHIFT * v, kappa, 1.0
+        for side in range(2):
+            step = (mean * z if side == 0 else -mean * z) - 0.5 * mean * mean * power
+            cusum[j, side] = max(0.0, cusum[j, side] + step / var)
+
+
+@shared
+def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
+    """The sums of a single sample: phi g, phi x, g^2, x^2, phi phi'."""
+    n, at = phi.shape[0], 2 * phi.shape[0] + 2
+    for i in range(n):
+        sample[i], sample[n + i] = phi[i] * g, phi[i] * x
+        for j in range(i + 1):
+            sample[at] = phi[i] * phi[j]
+            at += 1
+    sample[2 * n], sample[2 * n + 1] = g * g, x * x
+
+
+@shared
+def judge(memory: Memory, frozen: Frozen, told: Array) -> None:
+    """Take in the sample whose sums are in memory.sample, and write its statistics."""
+    n = frozen.theta.shape[0]
+    sums, last = memory.sums, memory.last
+    memory.counts[COUNT] += 1.0
+    count = int(memory.counts[COUNT])
+    enter(sums, memory.sample, count)
+    windows(memory, frozen, count)
+    accumulate(memory.sample, frozen, memory.cusum)
+    for i in range(told.shape[0]):
+        told[i] = np.nan
+    for j in range(last.shape[0]):
+        for kind in range(2):
+            one = last[j, kind]
+            if one[JOINT] > told[JOINT] or np.isnan(told[JOINT]):
+                told[JOINT] = one[JOINT]
+            if one[ONE] > told[ONE] or np.isnan(told[ONE]):
+                for i in (ONE, WHICH, SIZE, STD, WINDOW):
+                    told[i] = one[i]
+            if one[NOISE] > told[NOISE] or np.isnan(told[NOISE]):
+                told[NOISE], told[RATIO], told[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
+    for j in range(n + 1):
+        told[CUSUM + j] = np.sqrt(2.0 * max(memory.cusum[j, 0], memory.cusum[j, 1]))
+
+
+@shared
+def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
+    """Scores of a row [phi, y, ok, noise, dt] into memory.sample; whether it can be used."""
+    n, p = frozen.theta.shape[0], frozen.ar.shape[0]
+    past, counts, numbers, phi = memory.past, memory.counts, frozen.numbers, memory.work[0]
+    if not row[n + 3] > 0.0:
+        return False
+    if not row[n + 1] > 0.0:
+        counts[SINCE] = 0.0
+        return False
+    if row[n + 3] > GAP:
+        counts[SINCE] = 0.0
+    root = 1.0 / np.sqrt(row[n + 2])
+    e = row[n]
+    for i in range(n):
+        e -= row[i] * frozen.theta[i]
+        past[p, i] = row[i] * root / frozen.unit[i]
+    past[p, n] = e * root
+    scale = numbers[SCALE] * np.sqrt(counts[LEVEL])
+    for i in range(n + 1):
+        value = past[p, i]
+        for lag in range(p):
+            value -= frozen.ar[lag] * past[p - 1 - lag, i]
+        phi[i] = value / np.sqrt(counts[LEVEL]) if i < n else value / scale
+    for lag in range(p):
+        for i in range(n + 1):
+            past[lag, i] = past[lag + 1, i]
+    counts[SINCE] += 1.0
+    if counts[SINCE] <= p:
+        return False
+    x, clip = min(WIDE, max(-WIDE, phi[n])), numbers[CLIP]
+    g = min(clip, max(-clip, x))
+    enter_scores(phi[:n], g, x, memory.sample)
+    fed = numbers[ALPHA] * g * g / numbers[V] + numbers[BETA]
+    counts[LEVEL] = 1.0 - numbers[ALPHA] - numbers[BETA] + fed * counts[LEVEL]
+    return True
+
+
+@Driver
+def scan(rows: Array, frozen: Frozen, memory: Memory, told: Array) -> None:
+    """Judge rows (T, n + 4) = [phi, y, ok, noise, dt]: told (T, CUSUM + n + 1), repeated where a row is not used."""
+    for t in range(rows.shape[0]):
+        if enter_row(rows[t], frozen, memory):
+            judge(memory, frozen, memory.told)
+        for i in range(told.shape[1]):
+            told[t, i] = memory.told[i]
+
+
+@Driver
+def scan_scores(phi: Array, g: Array, frozen: Frozen, memory: Memory, told: Array) -> None:
+    """The same for whitened regressors phi (T, n) and scores g (T,), all of them used."""
+    for t in range(phi.shape[0]):
+        enter_scores(phi[t], g[t], g[t], memory.sample)
+        judge(memory, frozen, told[t])
+
+
+@Driver
+def levels(x: Array, numbers: Array, h: Array) -> float:
+    """The variances h (T,) of residuals x (T,) in units of their scale; returns sum log h + g^2 / inside.
+
+    With this factor h = 1 is the best constant, whatever the tails.
+    """
+    alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
+    total, level = 0.0, 1.0
+    for t in range(x.shape[0]):
+        h[t] = level
+        g = min(clip, max(-clip, x[t] / np.sqrt(level)))
+        total += log(level) + g * g / numbers[INSIDE]
+        level = 1.0 - alpha - beta + (alpha * g * g / v + beta) * level
+    return total
+
+
+@Driver
+def played(x: Array, numbers: Array, w: Array) -> None:
+    """Residuals w (T,) in units of their scale whose standardised values are x (T,): the inverse of `levels`."""
+    alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
+    level = 1.0
+    for t in range(x.shape[0]):
+        w[t] = x[t] * np.sqrt(level)
+        g = min(clip, max(-clip, x[t]))
+        level = 1.0 - alpha - beta + (alpha * g * g / v + beta) * level

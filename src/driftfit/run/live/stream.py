@@ -1,0 +1,230 @@
+"""What streams of one and of several outputs have in common: time, limits, late inputs, windows, alarms, files."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from typing import Any, Self
+
+import numpy as np
+
+from driftfit.data import storage
+from driftfit.data.clock import Clock, Pace, instant
+from driftfit.data.limits import Gate
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import whole
+from driftfit.models.base import Model
+from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.fixed_lag import Window
+from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
+from driftfit.run.live.rule import AlarmRule
+from driftfit.run.program import programs_of, state_of, tile_of
+from driftfit.run.public_class import Plain
+from driftfit.run.result import burn_in
+from driftfit.run.warm_start import End, Run, carried
+from driftfit.trackers.base import Tracker
+
+
+class Stream(Plain, storage.Kept):
+    """A stream: a tile with a lane for each program, which every sample changes.
+
+    A class of streams says how a sample goes through the tile (`_step`), and what a sample that is ignored returns.
+    """
+
+    def _begin(
+        self, model: Model, tracker: Any, dt: Any, lag: int, warm_start: Run | None, limits: Mapping[Any, Any] | None
+    ) -> None:
+        """Set everything that does not depend on the number of outputs."""
+        self.programs = programs_of(model, tracker, model.m)
+        self.model = self.programs[0].whole
+        self._rows = self.programs[0].model
+        self._clock = Clock.of(dt)
+        self.dt = self._clock.plain
+        self._pace = Pace(self._clock, self.model.reach)
+        self._gate = Gate(limits, self.model.outputs, self._rows.input_names, self._rows.m) if limits else None
+        self.lag = whole("Live", "lag", lag, 0)
+        if lag and warm_start is not None:
+            raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
+        before = None if warm_start is None else warm_start.end()
+        self._last: Any = None if before is None else before.last
+        self._awaits = NOTHING if before is None else before.awaits
+        self._cold = before is None
+        self._ignored = 0
+        self._place: Any = None
+        self._windows: list[Window] = []
+        self._watching: list[tuple[int, LiveAlarm]] = []
+        self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+
+    @property
+    def trackers(self) -> tuple[Tracker, ...]:
+        """The tracker of each output, or of the theta that they share."""
+        return tuple(one.tracker for one in self.programs)
+
+    @abstractmethod
+    def _step(self, y: Any, u: Array, known: Any, time: Any) -> Any:
+        """Process a sample within its limits: y and u as `_checked` returns them, ``known`` as `_factors` does."""
+
+    @abstractmethod
+    def _factors(self, interval: float, weight: Any, drift: Any) -> Any:
+        """What is known of a sample."""
+
+    @abstractmethod
+    def _checked(self, y: Any, u: Any) -> tuple[Any, Array]:
+        """The signals of a sample as numbers, NaN where they are outside their limits."""
+
+    @abstractmethod
+    def _nothing(self) -> Any:
+        """What a sample returns that is ignored."""
+
+    @abstractmethod
+    def _fields(self) -> Mapping[str, Array]:
+        """The fields of the tile that files contain, as views."""
+
+    @abstractmethod
+    def _inputs(self, u: Any) -> Array:
+        """u as floats, NaN where it is not known."""
+
+    def _sample(self, y: Any, u: Any, time: Any, weight: Any, drift: Any) -> Any:
+        """Process a sample with a time, known factors, limits, or a late input."""
+        check_applied(self._awaits)
+        later = u is LATER and self._rows.m > 0
+        if later:
+            self._placing()
+        if time is not None:
+            self._clock, time = self._clock.at(time), instant(time)
+        interval = 1.0 if time is None else self._clock.since(self._last, time)
+        if not interval >= 0.0:
+            self._ignored += 1
+            self._expect(IGNORED if later else NOTHING)
+            return self._nothing()
+        known = self._factors(float(interval), weight, drift)
+        y, u = self._checked(y, u)
+        if time is not None:
+            self._last = time
+            self._pace.see(interval)
+        step = self._step(y, u, known, time)
+        self._expect(INPUT if later else NOTHING)
+        return step
+
+    def _placing(self) -> Any:
+        """The routine that stores an input; ValueError for a model that needs it at once."""
+        if self._place is None:
+            self._place = applier(self._rows, self.trackers[0], self._tile)
+        return self._place
+
+    def _expect(self, what: int) -> None:
+        """Note whether an input is outstanding."""
+        self._awaits = what
+
+    def apply(self, u: Any) -> None:
+        """Give the input of the last sample, once it has been chosen: ``update(y)`` without u, then ``apply(u)``.
+
+        Together they leave the state that ``update(y, u)`` leaves. In between, `predict` and `forecast` show the effect
+        of an input; saving and copying keep the outstanding input. For models whose inputs act after one sample or
+        more (nk of at least 1).
+
+        Parameters
+        ----------
+        u : number, sequence of m, or None
+            None: missing. After a sample that was ignored for its time the input is ignored too.
+
+        Raises
+        ------
+        ValueError
+            If no sample is waiting for its input, or u does not have m numbers.
+        """
+        check_expected(self._awaits)
+        self._put(self._tile, self._within(self._inputs(u)))
+        self._expect(NOTHING)
+
+    def _put(self, tile: Array, inputs: Array) -> None:
+        """Store the outstanding input in a tile."""
+        if self._awaits == INPUT:
+            self._placing()(tile, inputs)
+
+    def _within(self, inputs: Array) -> Array:
+        """Inputs with NaN outside their limits, which are counted."""
+        if self._gate is None or self._awaits != INPUT:
+            return inputs
+        return self._gate.sample(np.full(len(self.model.outputs), np.nan), inputs)[1]
+
+    @property
+    def awaits(self) -> bool:
+        """Whether the input of the last sample is outstanding; it comes with `apply`."""
+        return self._awaits != NOTHING
+
+    @property
+    def ignored(self) -> int:
+        """Number of samples whose time was not after the last."""
+        return self._ignored
+
+    @property
+    def outside(self) -> dict[str, int]:
+        """How many numbers of each signal were outside its limits."""
+        return {} if self._gate is None else self._gate.counts
+
+    def _watch(self, lane: int, rule: AlarmRule, wait: int | None) -> LiveAlarm:
+        """An alarm that watches a lane from the next sample on."""
+        start = burn_in(self._rows.n) if self._cold else 0
+        wait = start if wait is None else whole("Live.detect", "wait", wait, 0)
+        alarm = LiveAlarm(check_rule(rule), self.trackers[lane], self.programs[lane].names, wait)
+        self._watching.append((lane, alarm))
+        return alarm
+
+    def end(self) -> End:
+        """The present state of the stream, from which another run can continue (`warm_start`)."""
+        lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
+        states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
+        return End(self.programs, states, self._last, self._awaits)
+
+    def _windowed(self) -> Iterator[tuple[int, Window]]:
+        """The lanes and their windows; ValueError if no samples are kept."""
+        if not self._windows:
+            raise ValueError("Live.smooth: no samples are kept; give their number, as in Live(model, tracker, lag=20).")
+        yield from enumerate(self._windows)
+
+    def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        extra = {
+            "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
+            "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
+            "cold": self._cold, "windows": [window.plain() for window in self._windows],
+            "alarms": [[lane, alarm.plain()] for lane, alarm in self._watching],
+        }  # fmt: skip
+        described = [storage.describe(one) for one in self.trackers]
+        tracker = described[0] if len(described) == 1 else described
+        header = {"kind": self._kind, "model": storage.describe(self.model), "tracker": tracker, "extra": extra}
+        return header, {f"state_{name}": value for name, value in self._fields().items()}
+
+    @classmethod
+    def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
+        described = header["tracker"]
+        trackers = tuple(
+            storage.rebuild(one, Tracker) for one in (described if isinstance(described, list) else [described])
+        )
+        return cls._again(source, storage.rebuild(header["model"], Model), trackers, header["extra"], arrays)
+
+    def __reduce__(self) -> Any:
+        header, arrays = self._written()
+        return type(self)._again, ("the copy", self.model, self.trackers, header["extra"], arrays)
+
+    @classmethod
+    def _again(
+        cls, source: str, model: Model, trackers: tuple[Tracker, ...], extra: Mapping[str, Any],
+        arrays: Mapping[str, Array],
+    ) -> Self:  # fmt: skip
+        """The stream from its state."""
+        tracker = trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
+        limits, outside = extra["limits"] or ([], [])
+        make: Any = cls
+        live: Self = make(model, tracker, Clock.of(extra["dt"], extra["zone"]), extra["lag"], limits=dict(limits))
+        if live._gate is not None:
+            live._gate.restore(outside)
+        live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra["cold"]
+        for window, state in zip(live._windows, extra["windows"], strict=True):
+            window.restore(state)
+        live._watching = [
+            (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
+        ]
+        storage.restore(source, trackers[0], arrays, "state_", live._fields())
+        live._expect(extra["awaits"])
+        return live

@@ -1,0 +1,220 @@
+"""Many: results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
+
+What is common to `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
+copies, and their files.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Iterator, KeysView, Mapping, Sequence
+from dataclasses import asdict
+from os import PathLike
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from driftfit.data import storage
+from driftfit.data.known import Known
+from driftfit.data.record import Labels, Records
+from driftfit.engine.drivers import repeat_tile
+from driftfit.engine.kernel import Array
+from driftfit.models.base import Model
+from driftfit.run.program import Program, State, programs_of, state_of
+from driftfit.run.public_class import Plain
+from driftfit.run.result import Lane, Track, names_of
+from driftfit.trackers.base import Tracker
+
+
+class Many(Plain):
+    """Results of many lanes, from key to `Track` like a dict; ``by`` names the parts of a key.
+
+    ``programs``, ``lanes`` and ``starts`` have an entry for each output of each series of ``records``, in that order.
+    """
+
+    _kind: ClassVar[str]
+
+    failed: dict[Hashable, str]
+    """The reason why a series has no result."""
+
+    def __init__(
+        self,
+        programs: Sequence[Program],
+        records: Records,
+        lanes: Sequence[Lane | None],
+        failed: Mapping[Hashable, str],
+        starts: Mapping[int, State],
+    ) -> None:
+        self.records = records
+        self.failed = dict(failed)
+        self._programs = tuple(programs)
+        self._lanes = [
+            lane and lane._replace(out=lane.out[: records.length[j // records.ny]]) for j, lane in enumerate(lanes)
+        ]
+        self._starts = dict(starts)
+        self._index = {key: j for j, key in enumerate(self._named()) if lanes[j] is not None}
+
+    def __reduce__(self) -> Any:
+        """A copy does not contain other series of a tile."""
+        lanes = [lane and lane.alone(one) for lane, one in zip(self._lanes, self._programs, strict=True)]
+        return type(self), (self._programs, self.records, lanes, self.failed, self._starts)
+
+    def _named(self) -> Sequence[Hashable]:
+        """The key of every lane."""
+        raise NotImplementedError
+
+    def _run(self, j: int) -> Track:
+        """The result of lane j."""
+        raise NotImplementedError
+
+    @property
+    def by(self) -> tuple[str, ...]:
+        """Names of what identifies the results, one for each part of a key."""
+        raise NotImplementedError
+
+    @property
+    def model(self) -> Model:
+        """The model of all series, with all their outputs."""
+        return self._programs[0].whole
+
+    @property
+    def labels(self) -> Labels:
+        """Names and units of the signals."""
+        return self.records.labels
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Rows that never became samples, by reason."""
+        return dict(sum((Counter(counts) for counts in self.records.dropped.values()), Counter()))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of what was written for all series."""
+        return sum(lane.out.nbytes // lane.tile["theta"].shape[-1] for lane in self._lanes if lane)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __iter__(self) -> Iterator[Hashable]:
+        return iter(self._index)
+
+    def keys(self) -> KeysView[Hashable]:
+        """Keys of the results."""
+        return self._index.keys()
+
+    def values(self) -> Iterator[Track]:
+        """The results."""
+        return map(self._run, self._index.values())
+
+    def items(self) -> Iterator[tuple[Hashable, Track]]:
+        """Keys and results."""
+        return ((key, self._run(j)) for key, j in self._index.items())
+
+    def ends(self) -> Iterator[tuple[Program, dict[str, Array]]]:
+        """The program of each lane, and its state after the last sample."""
+        for j in self._index.values():
+            lane = self._lanes[j]
+            assert lane is not None
+            yield self._programs[j], state_of(lane.tile, lane.lane)
+
+    def stack(self, name: str) -> Array:
+        """One result of every lane in natural order, (lanes, T, ...), NaN after the end of a series.
+
+        ``name`` is that of an attribute of `Track`: "theta", "std", "prediction", "innovation", "innovation_std".
+        """
+        parts = [np.asarray(getattr(run, name), dtype=float) for run in self.values()]
+        longest = max(len(part) for part in parts)
+        stacked = np.full((len(parts), longest, *parts[0].shape[1:]), np.nan)
+        for row, part in zip(stacked, parts, strict=True):
+            row[: len(part)] = part
+        return stacked
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write all results to one file without pickle, completely or not at all.
+
+        Keys must be text, numbers, times, or tuples of them.
+        """
+        records, programs = self.records, self._programs
+        trackers = list(dict.fromkeys(one.tracker for one in programs))
+        place = {one: k for k, one in enumerate(trackers)}
+        header: dict[str, Any] = {"kind": self._kind, "model": storage.describe(programs[0].whole)}
+        header |= {"trackers": [storage.describe(one) for one in trackers], "labels": asdict(records.labels)}
+        header |= {"tracker": [place[one.tracker] for one in programs], "inputs": programs[0].model.m}
+        header |= {"keys": list(records.keys), "outputs": list(records.outputs)}
+        counts = {"failed": self.failed, "dropped": records.dropped, "missing": records.missing}
+        header |= {name: list(found.items()) for name, found in counts.items()}
+        arrays = {"y": records.y, "u": records.u, "known": records.known.columns}
+        arrays |= {"first": records.first, "length": records.length}
+        arrays |= {} if records.time is None else {"time": records.time}
+        for j, start in self._starts.items():
+            arrays |= {f"start{j}_{name}": value for name, value in start.items()}
+        groups = self._groups()
+        for g, some in enumerate(groups):
+            lanes = [lane for j in some if (lane := self._lanes[j])]
+            states = [state_of(lane.tile, lane.lane) for lane in lanes]
+            arrays[f"lanes{g}"] = np.array(some)
+            for name in names_of(lanes[0].out):
+                arrays[f"out{g}_{name}"] = np.concatenate([lane.written(name) for lane in lanes])
+            for name in states[0]:
+                arrays[f"state{g}_{name}"] = np.stack([state[name] for state in states])
+        storage.write(path, {**header, "groups": len(groups)}, arrays)
+
+    def _groups(self) -> list[list[int]]:
+        """Lanes with a result, those with equal fields together."""
+        groups: dict[Any, list[int]] = {}
+        for j in self._index.values():
+            lane = self._lanes[j]
+            assert lane is not None
+            shapes = tuple((name, value.shape) for name, value in state_of(lane.tile, lane.lane).items())
+            groups.setdefault((shapes, names_of(lane.out)), []).append(j)
+        return list(groups.values())
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read a file that `save` wrote."""
+        header, arrays = storage.read(path, cls._kind)
+        model = storage.rebuild(header["model"], Model)
+        trackers = [storage.rebuild(one, Tracker) for one in header["trackers"]]
+        made = [programs_of(model, tracker, header["inputs"]) for tracker in trackers]
+        outputs = tuple(header["outputs"])
+        programs = [made[k][j % max(len(outputs), 1)] for j, k in enumerate(header["tracker"])]
+        keys = tuple(map(_key, header["keys"]))
+        failed, dropped, missing = (
+            {_key(key): value for key, value in header[name]} for name in ("failed", "dropped", "missing")
+        )
+        records = Records(
+            keys, arrays["first"], arrays["length"], arrays["y"], arrays["u"], Known(arrays["known"]),
+            arrays.get("time"), Labels(**header["labels"]), dropped, None, missing, outputs,
+        )  # fmt: skip
+        lanes: list[Lane | None] = [None] * len(programs)
+        for g in range(header["groups"]):
+            for j, lane in _restored(path, arrays, g, programs, records):
+                lanes[j] = lane
+        starts: dict[int, dict[str, Array]] = {}
+        for name in arrays:
+            if name.startswith("start"):
+                lane_number, _, field = name.removeprefix("start").partition("_")
+                starts.setdefault(int(lane_number), {})[field] = arrays[name]
+        return cls(programs, records, lanes, failed, starts)
+
+
+def _key(value: Any) -> Any:
+    """A key as JSON gives it: a tuple comes back as a list."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _restored(
+    path: str | PathLike[str], arrays: Mapping[str, Array], g: int, programs: Sequence[Program], records: Records
+) -> Iterator[tuple[int, Lane]]:
+    """The lanes of group g of a file, each with its number."""
+    some = arrays[f"lanes{g}"].tolist()
+    program = programs[some[0]]
+    length = [int(records.length[j // records.ny]) for j in some]
+    tiles = repeat_tile(program.tile(), len(some))
+    into = {name: tiles[name][..., 0] for name in storage.fields(tiles)}
+    storage.restore(path, program.tracker, arrays, f"state{g}_", into)
+    out = program.written(tiles[:1], sum(length), "cov" if f"out{g}_P" in arrays else "std")
+    storage.restore(path, program.tracker, arrays, f"out{g}_", {name: out[name][..., 0] for name in names_of(out)})
+    ends = np.cumsum(length).tolist()
+    for k, j in enumerate(some):
+        yield j, Lane(out[ends[k] - length[k] : ends[k]], tiles[k : k + 1])

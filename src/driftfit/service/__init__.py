@@ -1,0 +1,7 @@
+"""A live service: sources, a journal, the engine, sinks and a page; docs/service.md. What own sources and sinks need."""
+
+from driftfit.service.sinks.contract import Event, Outcome, Result, Sink, Writer
+from driftfit.service.sources.contract import Reader, Source
+from driftfit.service.sources.samples import Batch, Samples
+
+__all__ = ["Batch", "Event", "Outcome", "Reader", "Result", "Samples", "Sink", "Source", "Writer"]

@@ -1,0 +1,106 @@
+"""The local socket by which the page asks the engine: status, units, operator's actions, samples over HTTP.
+
+A message is a length, a header in JSON, a length and a body. The socket belongs to the user who runs the service, in a
+folder that nobody else can enter. Each connection has a thread; at most MOST are open.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+from pathlib import Path
+from typing import Any
+
+from driftfit.service.core.engine import Engine
+from driftfit.service.sources.incoming import INCOMING, WAIT
+
+MOST = 64
+LONGEST = 16 << 20
+
+
+class Control(threading.Thread):
+    """Answers on the socket."""
+
+    def __init__(self, engine: Engine, path: Path, status: Any) -> None:
+        super().__init__(name="driftfit-control", daemon=True)
+        self.engine, self.path, self.status = engine, path, status
+        self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        path.unlink(missing_ok=True)
+        self.listener.bind(str(path))
+        path.chmod(0o600)
+        self.listener.listen(MOST)
+        self._slots = threading.Semaphore(MOST)
+
+    def run(self) -> None:
+        while True:
+            try:
+                connection, _ = self.listener.accept()
+            except OSError:  # closed
+                return
+            self._slots.acquire()
+            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.listener.close()
+        self.path.unlink(missing_ok=True)
+
+    def _serve(self, connection: socket.socket) -> None:
+        try:
+            with connection, connection.makefile("rwb") as file:
+                while (message := receive(file)) is not None:
+                    try:
+                        answer = self._answer(*message)
+                    except Exception as error:
+                        answer = {"error": f"{type(error).__name__}: {error}", "status": 400}
+                    file.write(packed(answer))
+                    file.flush()
+        except (OSError, ValueError):
+            pass
+        finally:
+            self._slots.release()
+
+    def _answer(self, header: dict[str, Any], body: bytes) -> dict[str, Any]:
+        do = header.get("do")
+        if do == "status":
+            return dict(self.status())
+        if do == "samples":
+            if not any(type(one).__name__ == "Http" for one in self.engine.config.sources):
+                return {
+                    "error": 'no source takes samples over HTTP; add [source.web] with kind = "http".',
+                    "status": 404,
+                }
+            return INCOMING.offer(str(header.get("topic", "")), body)
+        name = str(header.get("unit"))
+        number = self.engine.units.names.get(name)
+        if number is None:
+            return {"error": f"there is no unit {name!r}", "status": 404}
+        if do == "unit":
+            return self.engine.units.get(number).plain()
+        if do == "act":
+            done = threading.Event()
+            self.engine.act(name, header["action"], done.set)
+            return {"done": True} if done.wait(WAIT) else {"error": "the journal does not answer", "status": 503}
+        return {"error": f"unknown request {do!r}", "status": 400}
+
+
+def receive(file: Any) -> tuple[dict[str, Any], bytes] | None:
+    """The next message; None at the end."""
+    parts = []
+    for _ in range(2):
+        length = file.read(4)
+        if len(length) < 4:
+            return None
+        (count,) = struct.unpack(">I", length)
+        if count > LONGEST:
+            raise ValueError("too long")
+        parts.append(file.read(count))
+    return json.loads(parts[0]), parts[1]
+
+
+def packed(header: dict[str, Any], body: bytes = b"") -> bytes:
+    """A message."""
+    text = json.dumps(header).encode()
+    return struct.pack(">I", len(text)) + text + struct.pack(">I", len(body)) + body

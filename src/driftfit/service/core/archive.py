@@ -1,0 +1,103 @@
+"""Old journals: exported to Parquet, then deleted, a piece at a time; results that nobody waits for are deleted.
+
+A piece is written under a temporary name and moved into place before its rows leave the database, so a crash at any
+moment leaves every sample in at least one of the two, and a piece that is written again replaces itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from driftfit.service.core.journal import Journal, Pending
+from driftfit.service.settings.options import ServiceOptions
+
+log = logging.getLogger("driftfit.service")
+EVERY = 60.0
+"""Seconds between two looks."""
+PIECE = 2_000
+"""Groups of one piece."""
+DAY = 86_400.0
+
+
+class Archive:
+    """Keeps the database small."""
+
+    def __init__(self, options: ServiceOptions, folder: Path, pool: Executor) -> None:
+        self.options, self.folder, self._pool = options, folder, pool
+        self._looked = time.monotonic()
+        self._writing: Future[int] | None = None
+
+    def forget(self, pending: Pending, journal: Journal, sinks_at: int) -> None:
+        """Add what may be deleted to the next transaction; start to export what may be deleted later."""
+        if self._writing is not None and self._writing.done():
+            if self._writing.exception() is not None:
+                log.error("archive", extra={"detail": str(self._writing.exception())})
+            elif upto := self._writing.result():
+                pending.forget.append(("delete from log where first < ?", (upto,)))
+            self._writing = None
+        if time.monotonic() - self._looked < EVERY or self._writing is not None:
+            return
+        self._looked = time.monotonic()
+        self.begin(pending, journal.floor(), sinks_at)
+
+    def begin(self, pending: Pending, floor: int, sinks_at: int) -> None:
+        """Look for what is old."""
+        now = time.time()
+        pending.forget += [
+            ("delete from result where at < ? and first < ?", (now - 60.0, min(floor, sinks_at))),
+            ("delete from result where at < ?", (now - DAY * self.options.results,)),
+            ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),
+        ]
+        self._writing = self._pool.submit(export, self.folder, floor, now - DAY * self.options.keep)
+
+
+def export(folder: Path, floor: int, before: float) -> int:
+    """Write the oldest piece of the log, if all of it is older than ``before`` seconds and stored in states.
+
+    Returns the number up to which the log may be deleted; 0 if nothing was written.
+    """
+    journal = Journal(folder, read_only=True)
+    try:
+        query = "select first, count from log where at < ? and first + count <= ? order by first limit ?"
+        found = journal.db.execute(query, (before, floor, PIECE)).fetchall()
+        if not found:
+            return 0
+        first, upto = found[0][0], found[-1][0] + found[-1][1]
+        names = {number: name for number, name, *_ in journal.units()}
+        rows: dict[str, list[Any]] = {"number": [], "unit": [], "time": [], "values": [], "action": []}
+        for start, items in journal.groups(first):
+            if start >= upto:
+                break
+            number = start
+            for item in items:
+                count = item.count
+                rows["number"] += range(number, number + count)
+                rows["unit"] += [names[item.unit]] * count
+                rows["time"] += item.times if item.times is not None else [None] * count
+                rows["values"] += item.rows if item.action is None else [[]]
+                rows["action"] += [None if item.action is None else str(item.action)] * count
+                number += count
+    finally:
+        journal.close()
+    target = folder / "journal" / f"{first:016d}-{upto - 1:016d}.parquet"
+    target.parent.mkdir(exist_ok=True)
+    types = {
+        "number": pl.Int64,
+        "unit": pl.String,
+        "time": pl.Float64,
+        "values": pl.List(pl.Float64),
+        "action": pl.String,
+    }
+    partial = target.with_suffix(".part")
+    pl.DataFrame(rows, schema=types).write_parquet(partial)
+    with open(partial, "rb") as handle:
+        os.fsync(handle.fileno())
+    partial.replace(target)
+    return int(upto)

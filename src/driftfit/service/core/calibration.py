@@ -1,0 +1,31 @@
+"""The limits of a unit's alarms: its first samples are tracked as a record and judged by `Track.detect`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from driftfit.data.storage import describe
+from driftfit.engine.kernel import Array
+from driftfit.service.settings.config import UnitSettings
+from driftfit.tracking import track
+
+
+def rules_of(settings: UnitSettings, rows: Array) -> dict[str, Any]:
+    """The action that gives a unit its rules; ``rows`` (N, 2 + m) are time, y, u of the reference."""
+    alarm = settings.alarm
+    assert alarm is not None
+    rules, refused = [], []
+    try:
+        time = None if settings.time is None else rows[:, 0]
+        run = track(settings.model, settings.tracker, rows[:, 1], rows[:, 2:], time=time, dt=settings.dt)
+    except Exception as error:
+        return {"do": "calibrated", "rules": [], "refused": [str(error)]}
+    for kind in alarm.on:
+        every = alarm.every * len(alarm.on)  # together they begin one false alarm in ``every`` samples
+        reference = None if kind == "probability" else len(rows)
+        try:
+            said = run.detect(kind, every=every, reference=reference, window=alarm.window, hold=alarm.hold)
+            rules.append(describe(said.rule))
+        except Exception as error:
+            refused.append(f"{kind}: {error}")
+    return {"do": "calibrated", "rules": rules, "on": list(alarm.on), "refused": refused, "samples": len(rows)}

@@ -1,0 +1,253 @@
+"""The engine: one thread that journals what arrives, and then lets the trackers see it.
+
+    gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
+
+A transaction contains whatever has arrived while the one before was written, so groups grow with the load and nothing
+waits for a timer. Cost: one transaction of 1 to 10 ms per group, and some ten microseconds per sample.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from driftfit.service.core.archive import Archive
+from driftfit.service.core.calibration import rules_of
+from driftfit.service.core.intake import Action, Arrived, Intake
+from driftfit.service.core.journal import Item, Journal, Pending
+from driftfit.service.core.unit import Out, Unit
+from driftfit.service.core.units import Units
+from driftfit.service.settings.config import Config
+
+log = logging.getLogger("driftfit.service")
+BUDGET = 0.02
+"""Seconds of one transaction that may go into storing states."""
+IDLE = 0.25
+"""Seconds that the engine waits for samples before it looks after other things."""
+
+
+class Engine:
+    """A service without sources and sinks."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self.config = config
+        self.journal = Journal(folder)
+        self.intake = Intake(config.service.queue)
+        self.units = Units(config.units, self.journal, config.service.units)
+        self.positions = self.journal.positions()
+        self.progress: dict[str, int] = {}
+        """The last group that each sink has written."""
+        self.news = threading.Condition()
+        """Notified when results have been stored."""
+        self.problem = ""
+        self.samples = 0
+        self.told = 0
+        """The last group whose results were stored by this process."""
+        self.next = self.journal.next_number()
+        self.latencies: deque[float] = deque(maxlen=2000)
+        """Seconds from the arrival of a batch to the results of its samples."""
+        self._dirty: OrderedDict[int, tuple[int, float]] = OrderedDict()
+        self._pending = Pending()
+        self._pool = ThreadPoolExecutor(1, "driftfit-calibrate")
+        self._archive = Archive(config.service, folder, self._pool)
+        self._stop = threading.Event()
+        self.recovered = self._recover()
+
+    def _recover(self) -> int:
+        """Bring all states to the end of the log; the number of samples that were processed again."""
+        told, again = self.journal.told(), 0
+        for first, items in self.journal.groups(self.journal.floor()):
+            out, number = Out(), first
+            for item in items:
+                if self._apply(number, item, out, replay=True):
+                    again += item.count
+                number += item.count
+            if first >= told:
+                self._pending.add_results(first, out.results, out.events, time.time())
+            self._flush_blocks(items)
+        for unit in self.units.resident:
+            self._ask_for_limits(unit)
+        return again
+
+    def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> bool:
+        """Let a unit see an entry of the log, unless its stored state already contains it."""
+        unit = self.units.get(item.unit)
+        if replay and number < self.units.since[item.unit]:
+            return False
+        self._dirty.setdefault(item.unit, (number, time.monotonic()))
+        if item.action is not None:
+            unit.act(number, item.action, out)
+        else:
+            unit.take(number, item.times, item.rows, out)
+        return True
+
+    def run(self) -> None:
+        """Work until `stop`."""
+        while not self._stop.is_set():
+            self.step(IDLE)
+        if not self.problem:  # otherwise nothing more may be written: what was not acknowledged comes again
+            self.step(0.0)
+            self._store_states(everything=True)
+            self._commit()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def stop(self) -> None:
+        """Let `run` return after what has arrived is stored."""
+        self._stop.set()
+        self.intake.close()
+
+    def close(self) -> None:
+        """Store how far the sinks have come, and close the journal."""
+        if not self.problem:
+            self._commit()
+        self.journal.close()
+
+    def step(self, wait: float) -> int:
+        """Take, journal and process what has arrived; the number of samples."""
+        arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
+        first, items = self.next, self._admit(arrived)
+        now = time.time()
+        if items:
+            self._pending.add_group(first, items, now)
+            self.next += sum(item.count for item in items)
+        self._store_states()
+        self._archive.forget(self._pending, self.journal, self._sinks_at())
+        if not self._commit():
+            return 0
+        for _, batch in arrived.batches:
+            batch.acknowledge()
+        for action in arrived.actions:
+            action.done()
+        count = self._process(first, items, now) if items else 0
+        done = time.monotonic()
+        self.latencies.extend(done - batch.arrived for _, batch in arrived.batches if batch.arrived)
+        return count
+
+    def _admit(self, arrived: Arrived) -> list[Item]:
+        """The entries of the next group."""
+        items = []
+        refused = self.units.refused
+        for source, batch in arrived.batches:
+            refused["unreadable"] += batch.refused
+            for samples in batch.samples:
+                found = self.units.of_topic(samples.topic, self._pending, self.next)
+                if not found:
+                    refused["no unit for the topic"] += samples.count
+                for number in found:
+                    times, rows = self.units.admitted(self.units.get(number), samples)
+                    if rows:
+                        items.append(Item(number, times, rows))
+            if batch.position is not None:
+                self._pending.positions[f"source:{source}"] = batch.position
+        for action in arrived.actions:
+            unit = self.units.names.get(action.unit)
+            if unit is not None:
+                items.append(Item(unit, None, [], action.what))
+        return items
+
+    def _process(self, first: int, items: list[Item], now: float) -> int:
+        """Update the units of a group; its results become part of the next transaction."""
+        out, number = Out(), first
+        for item in items:
+            self._apply(number, item, out)
+            number += item.count
+        self._pending.add_results(first, out.results, out.events, now)
+        self._flush_blocks(items)
+        for unit in out.to_calibrate:
+            self._ask_for_limits(self.units.get(unit))
+        self.samples += len(out.results)
+        for _, unit, _, kind, detail in out.events:
+            log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
+        return number - first
+
+    def _flush_blocks(self, items: list[Item]) -> None:
+        for unit in {item.unit for item in items}:
+            self._pending.blocks += self.units.get(unit).blocks.flush()
+
+    def _ask_for_limits(self, unit: Unit) -> None:
+        """Find the limits of a unit's alarms in another thread; they come back as an action in the journal."""
+        alarm = unit.settings.alarm
+        width = 2 + len(unit.settings.u)
+        if alarm is None or unit.calibrated or len(unit.reference) < alarm.reference * width:
+            return
+        rows = np.array(unit.reference).reshape(-1, width)
+
+        def find() -> None:
+            self.act(unit.name, rules_of(unit.settings, rows))
+
+        self._pool.submit(find)
+
+    def act(self, unit: str, what: dict[str, Any], done: Callable[[], None] = lambda: None) -> None:
+        """Put an action on a unit into the journal."""
+        self.intake.act(Action(unit, what, done))
+
+    def _store_states(self, everything: bool = False) -> None:
+        """Add the states that have been waiting longest to the next transaction."""
+        begin, now = time.perf_counter(), time.monotonic()
+        while self._dirty and (everything or time.perf_counter() - begin < BUDGET):
+            number, (_, since) = next(iter(self._dirty.items()))
+            if not everything and now - since < self.config.service.snapshot:
+                break
+            del self._dirty[number]
+            unit = self.units.get(number)
+            # the state contains every sample that was processed, which is all before the present group
+            upto = self._pending.log[0] if self._pending.log is not None else self.next
+            self._pending.snapshots.append((number, upto, unit.state()))
+            self._pending.blocks += unit.blocks.flush(all_of_it=True)
+        upto = self._pending.log[0] if self._pending.log is not None else self.next
+        floor = next(iter(self._dirty.values()))[0] if self._dirty else upto
+        if self._pending:
+            self._pending.meta["floor"] = str(floor)
+
+    def _commit(self) -> bool:
+        """Write the next transaction; wait while that is impossible. False if the service was stopped meanwhile."""
+        for name, upto in self.progress.copy().items():
+            if self.positions.get(f"sink:{name}") != upto:
+                self._pending.positions[f"sink:{name}"] = upto
+        if not self._pending:
+            return True
+        while True:
+            try:
+                self._pending.commit(self.journal.db)
+            except sqlite3.Error as error:
+                if not self.problem:
+                    log.error("journal", extra={"detail": str(error)})
+                self.problem = f"the journal cannot be written: {error}; sources are held back."
+                if self._stop.wait(1.0):
+                    return False
+                continue
+            break
+        self.problem = ""
+        self.positions |= self._pending.positions
+        results = bool(self._pending.results)
+        self.told = max([self.told, *(first for first, *_ in self._pending.results)])
+        self._pending = Pending()
+        if results:
+            with self.news:
+                self.news.notify_all()
+        return True
+
+    def _sinks_at(self) -> int:
+        """The group up to which all sinks have come."""
+        found = [self.positions.get(f"sink:{sink.name}", 0) for sink in self.config.sinks]
+        return min(found, default=self.next)
+
+    def status(self) -> dict[str, Any]:
+        """Numbers for the page and for Prometheus."""
+        recent = sorted(self.latencies)
+        return {
+            "samples": self.samples, "next": self.next, "units": len(self.units), "waiting": self.intake.waiting,
+            "held_back": self.intake.held_back, "refused": dict(self.units.refused), "problem": self.problem,
+            "p50": recent[len(recent) // 2] if recent else None,
+            "p99": recent[int(len(recent) * 0.99)] if recent else None,
+            "dirty": len(self._dirty), "recovered": self.recovered, "positions": dict(self.positions),
+        }  # fmt: skip

@@ -1,0 +1,94 @@
+"""What waits for the journal: batches of sources, and actions, bounded in number.
+
+A source that delivers faster than the journal takes is held back in `put`. Nothing is dropped here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from driftfit.service.sources.samples import Batch
+
+
+class Action(NamedTuple):
+    """What an operator, or the service itself, wants to do to a unit."""
+
+    unit: str
+    what: dict[str, Any]
+    done: Callable[[], None] = lambda: None
+    """Called once it is in the journal."""
+
+
+class Arrived(NamedTuple):
+    """What is to be journaled together."""
+
+    batches: list[tuple[str, Batch]]
+    actions: list[Action]
+
+
+class Intake:
+    """A bounded queue of samples, and an unbounded one of the few actions."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.waiting = 0
+        """Samples that wait."""
+        self.held_back = 0
+        """How often a source had to wait."""
+        self._batches: deque[tuple[str, Batch]] = deque()
+        self._actions: deque[Action] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, source: str, batch: Batch) -> bool:
+        """Add a batch once there is room; False if the service stops first."""
+        count = _size(batch)
+        with self._changed:
+            if self.waiting and self.waiting + count > self.most:
+                self.held_back += 1
+            while self.waiting and self.waiting + count > self.most and not self._closed:
+                self._changed.wait()
+            if self._closed:
+                return False
+            self._batches.append((source, batch))
+            self.waiting += count
+            self._changed.notify_all()
+        return True
+
+    def act(self, action: Action) -> None:
+        """Add an action."""
+        with self._changed:
+            self._actions.append(action)
+            self._changed.notify_all()
+
+    def take(self, most: int, wait: float) -> Arrived:
+        """What has arrived, up to about ``most`` samples; empty after ``wait`` seconds."""
+        until = time.monotonic() + wait
+        with self._changed:
+            while not (self._batches or self._actions or self._closed):
+                left = until - time.monotonic()
+                if left <= 0.0 or not self._changed.wait(left):
+                    break
+            batches, count = [], 0
+            while self._batches and count < most:
+                batches.append(self._batches.popleft())
+                count += _size(batches[-1][1])
+            self.waiting -= count
+            actions = list(self._actions)
+            self._actions.clear()
+            self._changed.notify_all()
+        return Arrived(batches, actions)
+
+    def close(self) -> None:
+        """Let nobody wait any more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+def _size(batch: Batch) -> int:
+    return max(1, sum(one.count for one in batch.samples))

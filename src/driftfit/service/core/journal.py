@@ -1,0 +1,228 @@
+"""The journal: one SQLite database in which samples, states, results and positions of sources change together.
+
+    log        what came in, in groups: numbered samples and operator's actions, in MessagePack
+    unit       number, name, section and topic of every unit
+    snapshot   the last stored state of a unit, and the number up to which it knows the samples
+    result     what the trackers said, in the order in which they said it; sinks and the page read from here
+    block      the results of one unit in pieces, with least, largest and mean of every column, for the page
+    event      alarms, failures, operator's actions
+    position   where sources continue, and how far sinks have come
+
+Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker sees it, and acknowledged
+after that. The next transaction contains the results of the group. After a crash the results that are missing are
+computed again from snapshots and log, bit for bit.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from driftfit.service.sinks.contract import Event, Outcome, Result
+
+SCHEMA = """
+create table if not exists meta (key text primary key, value text);
+create table if not exists unit (id integer primary key, name text unique, section integer, topic text, born integer,
+    about text);
+create table if not exists log (first integer primary key, count integer, at real, items blob);
+create table if not exists result (first integer primary key, count integer, at real, rows blob);
+create table if not exists snapshot (unit integer primary key, number integer, state blob);
+create table if not exists block (unit integer, first integer, last integer, start real, stop real, count integer,
+    rows blob, extremes blob, primary key (unit, first)) without rowid;
+create table if not exists event (id integer primary key, number integer, unit integer, at real, kind text,
+    detail text);
+create index if not exists event_of_unit on event (unit, id);
+create table if not exists position (name text primary key, value text);
+"""
+FORMAT = "1"
+NAME = "driftfit.db"
+
+
+class Item(NamedTuple):
+    """One entry of a group: samples of a unit, or an action."""
+
+    unit: int
+    times: list[float] | None
+    rows: list[list[float]]
+    """y, u_1 .. u_m of each sample, NaN where missing."""
+    action: dict[str, Any] | None = None
+    """What an operator, or the service itself, did; then there are no rows."""
+
+    @property
+    def count(self) -> int:
+        """How many numbers of the journal the entry takes."""
+        return 1 if self.action is not None else len(self.rows)
+
+
+_ITEMS = msgspec.msgpack.Decoder(list[tuple[int, list[float] | None, list[list[float]], dict[str, Any] | None]])
+_encode = msgspec.msgpack.Encoder().encode
+_RESULTS = msgspec.msgpack.Decoder(tuple[list[list[Any]], list[list[Any]]])
+
+
+class Journal:
+    """The database, opened by the one process that writes it."""
+
+    def __init__(self, folder: Path, read_only: bool = False) -> None:
+        self.path = folder / NAME
+        if read_only:
+            uri = f"{self.path.resolve().as_uri()}?mode=ro"
+            self.db = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=10.0)
+            return
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self.db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=10.0)
+        self.path.chmod(0o600)
+        for line in ("journal_mode=wal", "synchronous=full", "wal_autocheckpoint=4000", "temp_store=memory"):
+            self.db.execute(f"pragma {line}")
+        self.db.executescript(SCHEMA)
+        self.db.execute("insert or ignore into meta values ('format', ?)", (FORMAT,))
+        found = self.meta("format")
+        if found != FORMAT:
+            raise ValueError(f"{self.path} has the format {found}; this version reads {FORMAT}. Use another folder.")
+
+    def close(self) -> None:
+        self.db.close()
+
+    def meta(self, key: str) -> str | None:
+        row = self.db.execute("select value from meta where key = ?", (key,)).fetchone()
+        return None if row is None else str(row[0])
+
+    def next_number(self) -> int:
+        """The number of the next sample."""
+        row = self.db.execute("select first + count from log order by first desc limit 1").fetchone()
+        return max(int(row[0]) if row else 1, int(self.meta("next") or 1))
+
+    def told(self) -> int:
+        """The first group whose results are not yet stored."""
+        return int(self.meta("told") or 1)
+
+    def floor(self) -> int:
+        """The number from which the log is needed, because some state is not stored after it."""
+        return int(self.meta("floor") or 1)
+
+    def positions(self) -> dict[str, Any]:
+        """Where sources and sinks have come to."""
+        return {name: msgspec.json.decode(value) for name, value in self.db.execute("select * from position")}
+
+    def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
+        """(number of the first sample, entries) of the groups from a number on, a few at a time."""
+        first = self.db.execute("select coalesce(max(first), 0) from log where first <= ?", (first,)).fetchone()[0]
+        while rows := self.db.execute(
+            "select first, items from log where first >= ? order by first limit 64", (first,)
+        ).fetchall():
+            for start, items in rows:
+                yield start, [Item(*one) for one in _ITEMS.decode(items)]
+            first = rows[-1][0] + 1
+
+    def outcomes(self, after: int, most: int = 64) -> list[tuple[int, list[list[Any]], list[list[Any]]]]:
+        """(number of the group, rows of results, rows of events) of groups after one, the units as numbers."""
+        found = self.db.execute("select first, rows from result where first > ? order by first limit ?", (after, most))
+        return [(first, *_RESULTS.decode(rows)) for first, rows in found.fetchall()]
+
+    def units(self, after: int = 0) -> list[tuple[int, str, int, str, int, str]]:
+        """(number, name, section, topic, born, about) of the units with larger numbers."""
+        return self.db.execute("select * from unit where id > ? order by id", (after,)).fetchall()
+
+    def state(self, unit: int) -> tuple[int, bytes] | None:
+        """(number up to which samples are in it, the stored state)."""
+        row = self.db.execute("select number, state from snapshot where unit = ?", (unit,)).fetchone()
+        return None if row is None else (int(row[0]), bytes(row[1]))
+
+    def rows_of(self, unit: int) -> tuple[list[float], list[list[float]]]:
+        """All samples of a unit that the log has, in the order of their arrival."""
+        times: list[float] = []
+        rows: list[list[float]] = []
+        for _, items in self.groups(1):
+            for item in items:
+                if item.unit == unit and item.action is None:
+                    times += item.times or []
+                    rows += item.rows
+        return times, rows
+
+
+class Pending:
+    """What the next transaction will contain."""
+
+    def __init__(self) -> None:
+        self.units: list[tuple[int, str, int, str, int, str]] = []
+        self.log: tuple[int, int, float, bytes] | None = None
+        self.results: list[tuple[int, int, float, bytes]] = []
+        self.events: list[tuple[int, int, float, str, str]] = []
+        self.blocks: list[tuple[Any, ...]] = []
+        self.snapshots: list[tuple[int, int, bytes]] = []
+        self.positions: dict[str, Any] = {}
+        self.meta: dict[str, str] = {}
+        self.forget: list[tuple[str, tuple[Any, ...]]] = []
+
+    def __bool__(self) -> bool:
+        return any(map(bool, self.__dict__.values()))
+
+    def add_group(self, first: int, items: list[Item], at: float) -> None:
+        """The group that is to be journaled."""
+        count = sum(item.count for item in items)
+        self.log = (first, count, at, _encode(items))
+        self.meta["next"] = str(first + count)
+
+    def add_results(self, first: int, rows: list[list[Any]], events: list[list[Any]], at: float) -> None:
+        """The results of a group."""
+        if rows or events:
+            self.results.append((first, len(rows), at, _encode((rows, events))))
+            self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
+        self.meta["told"] = str(first + 1)
+
+    def commit(self, db: sqlite3.Connection) -> None:
+        """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
+        db.execute("begin immediate")
+        try:
+            put = db.executemany
+            put("insert into unit values (?, ?, ?, ?, ?, ?)", self.units)
+            if self.log is not None:
+                db.execute("insert into log values (?, ?, ?, ?)", self.log)
+            put("insert or ignore into result values (?, ?, ?, ?)", self.results)
+            put("insert into event (number, unit, at, kind, detail) values (?, ?, ?, ?, ?)", self.events)
+            put("insert or ignore into block values (?, ?, ?, ?, ?, ?, ?, ?)", self.blocks)
+            put("insert or replace into snapshot values (?, ?, ?)", self.snapshots)
+            put("insert or replace into position values (?, ?)", [(k, _json(v)) for k, v in self.positions.items()])
+            put("insert or replace into meta values (?, ?)", self.meta.items())
+            for statement, values in self.forget:
+                db.execute(statement, values)
+            db.execute("commit")
+        except BaseException:
+            if db.in_transaction:
+                db.execute("rollback")
+            raise
+
+
+def _json(value: Any) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+class Names:
+    """Units by number, as the database knows them; new ones are read when they are asked for."""
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self.names: dict[int, str] = {}
+        self.about: dict[str, dict[str, Any]] = {}
+
+    def read(self) -> None:
+        """Add the units that are new."""
+        for number, name, section, topic, _, about in self._journal.units(max(self.names, default=0)):
+            self.names[number] = name
+            self.about[name] = msgspec.json.decode(about) | {"topic": topic, "section": section, "number": number}
+
+    def outcome(self, group: int, rows: Iterable[list[Any]], events: Iterable[list[Any]]) -> Outcome:
+        """Stored rows as a batch for a sink."""
+        rows, events = list(rows), list(events)
+        if any(row[1] not in self.names for row in (*rows, *events)):
+            self.read()
+        names = self.names
+        return Outcome(
+            group,
+            [Result(row[0], names[row[1]], *row[2:]) for row in rows],
+            [Event(row[0], names[row[1]], *row[2:]) for row in events],
+            self.about,
+        )

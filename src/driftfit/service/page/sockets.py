@@ -1,0 +1,88 @@
+"""What open pages are sent: two and a half times a second the overview, or what is new of one unit.
+
+A page says what it looks at: {"view": "fleet"} or {"view": "unit", "unit": "pump 7"}. Each viewer has a task of
+its own, which waits for that viewer alone; one that is slow is sent less often.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+import msgspec
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from driftfit.service.core.blocks import columns_of
+from driftfit.service.page.feed import Feed
+from driftfit.service.page.history import latest
+
+EVERY = 0.4
+"""Seconds between two messages."""
+LONGEST = 2000
+"""Bytes of a message from a page."""
+
+
+class Sockets:
+    """The open pages."""
+
+    def __init__(self, feed: Feed, most: int) -> None:
+        self.feed, self.most = feed, most
+        self.count = 0
+
+    async def endpoint(self, socket: WebSocket) -> None:
+        """Serve one page until it closes."""
+        await socket.accept()
+        if self.count >= self.most:
+            await socket.close(4429, "too many open pages")
+            return
+        self.count += 1
+        view: dict[str, Any] = {"view": "fleet", "unit": "", "at": 0}
+        sender = asyncio.create_task(self._send(socket, view))
+        try:
+            while True:
+                text = await socket.receive_text()
+                if len(text) > LONGEST:
+                    break
+                given = msgspec.json.decode(text, type=dict[str, str])
+                view |= {"view": given.get("view", "fleet"), "unit": given.get("unit", ""), "at": 0}
+        except (WebSocketDisconnect, msgspec.DecodeError, KeyError, RuntimeError):
+            pass
+        finally:
+            self.count -= 1
+            sender.cancel()
+            with contextlib.suppress(RuntimeError):  # it may be closed
+                await socket.close(4400)
+
+    async def _send(self, socket: WebSocket, view: dict[str, Any]) -> None:
+        """Messages until the page is gone."""
+        try:
+            while True:
+                message = await self._message(view)
+                await socket.send_text(msgspec.json.encode(message).decode())
+                await asyncio.sleep(EVERY)
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+
+    async def _message(self, view: dict[str, Any]) -> dict[str, Any]:
+        feed = self.feed
+        status = feed.status
+        said = {
+            "samples": status.get("samples"), "units": status.get("units"), "problem": status.get("problem"),
+            "alive": feed.healthy, "p99": status.get("p99"),
+        }  # fmt: skip
+        if view["view"] != "unit":
+            return {"view": "fleet", "status": said, "units": feed.fleet}
+        number = feed.find(view["unit"])
+        if number is None:
+            return {"view": "unit", "unit": view["unit"], "status": said, "missing": True}
+        unit, after = view["unit"], view["at"]
+        recent = await feed.recent(number)
+        rows = [row for row in recent if row[0] > after]
+        columns = columns_of(rows).T.tolist() if rows else []
+        if after == 0:
+            columns = (await asyncio.to_thread(latest, feed.journal, number, recent)).T.tolist()
+        if unit == view["unit"] and rows:
+            view["at"] = max(row[0] for row in rows)
+        on = rows[-1][10] if rows else None
+        return {"view": "unit", "unit": unit, "status": said, "columns": columns, "alarm": on}

@@ -1,0 +1,143 @@
+"""Threads that run sources and sinks: each is opened, used, and opened again after a pause when it fails."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any
+
+from driftfit.service.core.engine import Engine
+from driftfit.service.core.journal import Journal, Names
+from driftfit.service.sinks.contract import Outcome, Sink, Writer
+from driftfit.service.sources.contract import END, Reader, Source
+
+log = logging.getLogger("driftfit.service")
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
+READ = 0.5
+"""Seconds for which a source may block."""
+
+
+class Runner(threading.Thread):
+    """A thread that works until it is stopped, and begins again after a pause when something fails."""
+
+    what = ""
+
+    def __init__(self, engine: Engine, name: str) -> None:
+        super().__init__(name=f"driftfit-{self.what}-{name}", daemon=True)
+        self.engine, self.label = engine, name
+        self.state, self.count, self.failures = "starting", 0, 0
+        self.stopping = threading.Event()
+
+    def run(self) -> None:
+        pause = FIRST_PAUSE
+        while not self.stopping.is_set():
+            begun = time.monotonic()
+            try:
+                self.work()
+                self.state = "ended"
+                return
+            except Exception as error:  # whatever a broker or a driver raises
+                self.failures += 1
+                self.state = f"away: {type(error).__name__}: {error}"[:300]
+                log.warning(f"{self.what} away", extra={"name_of": self.label, "detail": self.state})
+            pause = FIRST_PAUSE if time.monotonic() - begun > LONGEST_PAUSE else min(2.0 * pause, LONGEST_PAUSE)
+            self.stopping.wait(pause)
+
+    def work(self) -> None:
+        """Open and use it until it ends or `stopping` is set."""
+        raise NotImplementedError
+
+    def status(self) -> dict[str, Any]:
+        """Numbers for the page."""
+        return {"state": self.state, "count": self.count, "failures": self.failures}
+
+    def stop(self) -> None:
+        """Let the thread end."""
+        self.stopping.set()
+
+
+class SourceRunner(Runner):
+    """Reads one source into the intake."""
+
+    what = "source"
+
+    def __init__(self, engine: Engine, source: Source) -> None:
+        super().__init__(engine, source.name)
+        self.source = source
+        self.position = engine.positions.get(f"source:{source.name}")
+
+    def work(self) -> None:
+        """Read until the source ends; after a failure go on from what was handed over."""
+        reader: Reader = self.source.open(self.position)
+        self.state = "running"
+        try:
+            while not self.stopping.is_set():
+                batch = reader.read(READ)
+                if batch is END:
+                    return
+                if batch is not None:
+                    if not self.engine.intake.put(self.source.name, batch):
+                        return
+                    if batch.position is not None:
+                        self.position = batch.position
+                    self.count += sum(one.count for one in batch.samples)
+        finally:
+            reader.close()
+
+
+class SinkRunner(Runner):
+    """Hands stored results to one sink."""
+
+    what = "sink"
+
+    def __init__(self, engine: Engine, sink: Sink) -> None:
+        super().__init__(engine, sink.name)
+        self.sink = sink
+        self.at = int(engine.positions.get(f"sink:{sink.name}", 0))
+        self.missed = 0
+
+    def work(self) -> None:
+        """Write until the thread is stopped."""
+        journal = Journal(self.engine.journal.path.parent, read_only=True)
+        writer: Writer | None = None
+        try:
+            names = Names(journal)
+            writer = self.sink.open()
+            self.state = "running"
+            while (batch := self._next(journal, names)) is not None:
+                outcome, upto = batch
+                if outcome.results or outcome.events:
+                    writer.write(outcome)
+                self.at = self.engine.progress[self.sink.name] = upto
+                self.count += len(outcome.results)
+        finally:
+            if writer is not None:
+                writer.close()
+            journal.close()
+
+    def _next(self, journal: Journal, names: Names) -> tuple[Outcome, int] | None:
+        """What the sink is to write next, and the last group in it; None when the thread is to end."""
+        begun = time.monotonic()
+        results: list[Any] = []
+        events: list[Any] = []
+        first, upto = 0, self.at
+        while True:
+            groups = journal.outcomes(upto)
+            for group, rows, happened in groups:
+                first = first or group
+                results += rows
+                events += happened
+                upto = group
+            late = time.monotonic() - begun >= self.sink.gather or len(results) >= self.sink.most
+            if (results or events) and (late or self.stopping.is_set()):
+                return names.outcome(first, results, events), upto
+            if self.stopping.is_set():
+                return None
+            if not groups:
+                with self.engine.news:
+                    self.engine.news.wait(0.2)
+
+    def status(self) -> dict[str, Any]:
+        """Numbers for the page."""
+        return super().status() | {"at": self.at}

@@ -1,0 +1,179 @@
+"""Options of the service, its page, sources and sinks: frozen dataclasses that are built from tables of a TOML file.
+
+A source or sink is one file in ``sources/`` or ``sinks/``; existing in the folder is being registered.
+"""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+import types
+import typing
+from dataclasses import MISSING, dataclass, field, fields
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TypeVar
+
+from driftfit.engine.settings import near
+from driftfit.service.sinks.contract import Sink
+from driftfit.service.sources.contract import Source
+
+Made = TypeVar("Made")
+
+
+class Secret:
+    """A password or token, which is never printed: { env = "NAME" } or { file = "path" } in the configuration."""
+
+    def __init__(self, value: str) -> None:
+        self._value = value
+
+    def __repr__(self) -> str:
+        return "Secret(...)"
+
+    @property
+    def value(self) -> str:
+        """The text itself."""
+        return self._value
+
+    @classmethod
+    def of(cls, given: Any) -> Secret:
+        """From the environment or a file; ValueError for a password in the configuration itself."""
+        if isinstance(given, dict) and given.keys() == {"env"}:
+            if given["env"] not in os.environ:
+                raise ValueError(f"the environment has no variable {given['env']}; set it before the service starts.")
+            return cls(os.environ[given["env"]])
+        if isinstance(given, dict) and given.keys() == {"file"}:
+            return cls(Path(given["file"]).read_text(encoding="utf-8").strip())
+        raise ValueError('passwords do not stand in the file: write { env = "NAME" } or { file = "PATH" }.')
+
+
+@dataclass(frozen=True)
+class ServiceOptions:
+    """The section [service]."""
+
+    folder: str = "driftfit-service"
+    """Where journal, states and results are stored."""
+    group: int = 5000
+    """Most samples of one transaction."""
+    queue: int = 50_000
+    """Most samples that wait for the journal; sources hold back beyond that."""
+    snapshot: float = 30.0
+    """Seconds after which a changed state is stored."""
+    keep: float = 7.0
+    """Days for which the journal stays in the database before it is exported to Parquet."""
+    results: float = 1.0
+    """Days for which results wait for sinks that are away."""
+    history: float = 365.0
+    """Days for which the page's history is kept."""
+    units: int = 100_000
+    """Most units; topics beyond that are refused and counted."""
+    log: str = "info"
+
+
+@dataclass(frozen=True)
+class UserOptions:
+    """A section [[page.user]]."""
+
+    name: str
+    role: str = "viewer"
+    """viewer or operator"""
+    password: str = ""
+    """scrypt hash, as `driftfit serve --hash` prints it."""
+    token: str = ""
+    """SHA-256 hash of a token, as `driftfit serve --token` prints it."""
+
+    def __post_init__(self) -> None:
+        if self.role not in ("viewer", "operator"):
+            raise ValueError(f"user {self.name}: role must be viewer or operator; got {self.role!r}.")
+        if not self.password.startswith("scrypt$") and not self.token.startswith("sha256$"):
+            raise ValueError(f"user {self.name}: give password or token as printed by `driftfit serve --hash`.")
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """The section [page]."""
+
+    host: str = "127.0.0.1"
+    port: int = 8765
+    enabled: bool = True
+    names: list[str] = field(default_factory=list)
+    """Host names under which browsers may reach the page, besides the host itself."""
+    certificate: str = ""
+    key: str = ""
+    behind_proxy: bool = False
+    """Whether a proxy on this machine ends TLS."""
+    requests: float = 50.0
+    """Requests a second of one client, on average."""
+    body: int = 4 << 20
+    """Most bytes of a request."""
+    viewers: int = 100
+    """Most pages that are open at the same time."""
+    user: list[UserOptions] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if bool(self.certificate) != bool(self.key):
+            raise ValueError("page: certificate and key belong together.")
+        if not self.local and not self.user:
+            raise ValueError(
+                f"page: host {self.host!r} can be reached from other machines, which needs [[page.user]] with a "
+                "password or token; `driftfit serve --hash` prints one. Or leave host at 127.0.0.1."
+            )
+        if not self.local and not self.certificate and not self.behind_proxy:
+            raise ValueError(
+                f"page: host {self.host!r} needs certificate and key for TLS, or behind_proxy = true if a proxy "
+                "on this machine ends TLS."
+            )
+        if not 0 <= self.port < 65536:
+            raise ValueError(f"page: port must be 0 to 65535; got {self.port}.")
+
+    @property
+    def local(self) -> bool:
+        """Whether only this machine can reach the page."""
+        return self.host in ("127.0.0.1", "::1", "localhost")
+
+
+def kinds(what: str) -> dict[str, Any]:
+    """The classes of the folder ``sources`` or ``sinks``, by kind, which is the name of the file."""
+    package = import_module(f"driftfit.service.{what}s")
+    names = [one.name for one in pkgutil.iter_modules(package.__path__)]
+    found = {name: import_module(f"{package.__name__}.{name}") for name in names}
+    classes = {name: getattr(module, name.capitalize(), None) for name, module in found.items()}
+    return {name: kind for name, kind in classes.items() if isinstance(kind, type) and issubclass(kind, Source | Sink)}
+
+
+def build(kind: type[Made], given: dict[str, Any]) -> Made:
+    """A dataclass from a table; ValueError for an unknown, missing or wrong option."""
+    known = {one.name: one for one in fields(kind) if one.init}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(kind)
+    for key in given:
+        if key not in known:
+            raise ValueError(f"there is no option {key!r}; {near(key, known)}")
+    for key, one in known.items():
+        if key not in given and one.default is MISSING and one.default_factory is MISSING:
+            raise ValueError(f"the option {key} is missing.")
+    return kind(**{key: _converted(key, value, hints[key]) for key, value in given.items()})
+
+
+def _converted(key: str, value: Any, hint: Any) -> Any:
+    """A value of a table in the type of an option."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        inner = next(one for one in args if one is not type(None))
+        return _converted(key, value, inner)
+    if hint is Secret:
+        return Secret.of(value)
+    if origin is list:
+        if not isinstance(value, list):
+            raise ValueError(f"{key} must be a list; got {value!r}.")
+        return [_converted(key, one, args[0]) for one in value]
+    if origin is dict:
+        if not isinstance(value, dict):
+            raise ValueError(f"{key} must be a table; got {value!r}.")
+        return {name: _converted(f"{key}.{name}", one, args[1]) for name, one in value.items()}
+    if isinstance(value, dict):
+        return build(hint, value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not hint:
+        raise ValueError(f"{key} must be of type {hint.__name__}; got {value!r}.")
+    return value

@@ -1,0 +1,64 @@
+"""Kafka, by confluent-kafka: a JSON object for every result, keyed by its unit; the producer is idempotent.
+
+After a crash of the service the last results come again, with the same ``number``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from driftfit.service.sinks.contract import Outcome, Sink, Writer
+from driftfit.service.sinks.mqtt import messages
+from driftfit.service.sources.kafka import library
+
+TIMEOUT = 30.0
+
+
+@dataclass(frozen=True)
+class Kafka(Sink):
+    """A topic of a cluster."""
+
+    brokers: str
+    topic: str = "driftfit"
+    each: bool = True
+    """Whether every result is sent, or of each batch only the last of a unit."""
+    settings: dict[str, str] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """The client library."""
+        library()
+
+    def open(self) -> Writer:
+        """Connect."""
+        return _Kafka(self)
+
+
+class _Kafka(Writer):
+    def __init__(self, options: Kafka) -> None:
+        self.options = options
+        given = {"bootstrap.servers": options.brokers, "enable.idempotence": True, "linger.ms": 5} | options.settings
+        self.producer = library().Producer(given)
+        self.failed: list[str] = []
+
+    def write(self, batch: Outcome) -> None:
+        """Send, and wait until the cluster has it."""
+        units = [one.unit for one in (batch.results if self.options.each else _last(batch))]
+        keys = [*units, *(one.unit for one in batch.events)]
+        for key, (topic, body) in zip(keys, messages(self.options, batch), strict=True):
+            event = topic.endswith("/event")
+            self.producer.produce(f"{self.options.topic}-events" if event else self.options.topic, body, key.encode(),
+                                  on_delivery=self._delivered)  # fmt: skip
+            self.producer.poll(0)
+        left = self.producer.flush(TIMEOUT)
+        failed, self.failed = self.failed, []
+        if left or failed:
+            raise ConnectionError(failed[0] if failed else f"{left} messages are not acknowledged")
+
+    def _delivered(self, error: Any, message: Any) -> None:
+        if error is not None:
+            self.failed.append(str(error))
+
+
+def _last(batch: Outcome) -> list[Any]:
+    return list({one.unit: one for one in batch.results}.values())

@@ -1,0 +1,57 @@
+"""Parquet: a folder of files, each with the results of a minute or of 100,000 samples, for pandas, polars, DuckDB.
+
+A file is named by its first group and moved into place when it is complete; one that is written again after a crash
+replaces itself.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import polars as pl
+
+from driftfit.service.sinks.contract import Outcome, Sink, Writer
+
+TYPES = {
+    "number": pl.Int64, "unit": pl.String, "time": pl.Float64, "y": pl.Float64, "y_hat": pl.Float64, "e": pl.Float64,
+    "s": pl.Float64, "ok": pl.Boolean, "theta": pl.List(pl.Float64), "std": pl.List(pl.Float64), "alarm": pl.Boolean,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Parquet(Sink):
+    """A folder of files."""
+
+    path: str
+    seconds: float = 60.0
+    """Time that one file covers."""
+    most: ClassVar[int] = 100_000
+
+    @property
+    def gather(self) -> float:
+        """The time of one file."""
+        return self.seconds
+
+    def open(self) -> Writer:
+        """Make the folder."""
+        Path(self.path).mkdir(parents=True, exist_ok=True)
+        return _Parquet(Path(self.path))
+
+
+class _Parquet(Writer):
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def write(self, batch: Outcome) -> None:
+        """One file, complete or not at all."""
+        if not batch.results:
+            return
+        target = self.folder / f"results-{batch.group:016d}.parquet"
+        partial = target.with_suffix(".part")
+        pl.DataFrame(batch.results, schema=TYPES, orient="row").write_parquet(partial)
+        with open(partial, "rb") as handle:
+            os.fsync(handle.fileno())
+        partial.replace(target)

@@ -1,0 +1,59 @@
+"""Samples on their way from the page's process to the source of kind http."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from typing import Any
+
+import msgspec
+
+from driftfit.service.sources.samples import Batch, Samples, decode
+
+WAIT = 30.0
+"""Seconds after which a request that is not yet journaled is answered with an error."""
+_BODY = msgspec.json.Decoder(dict[str, msgspec.Raw])
+
+
+class Incoming:
+    """Samples that came over HTTP and wait for the source of kind http; bounded, so senders wait."""
+
+    def __init__(self, most: int = 256) -> None:
+        self.queue: queue.Queue[Batch] = queue.Queue(most)
+
+    def offer(self, topic: str, body: bytes) -> dict[str, Any]:
+        """Decode a request, wait until it is in the journal, and say what was received."""
+        samples, refused = decoded(topic, body)
+        done = threading.Event()
+        try:
+            self.queue.put(Batch(samples, done.set, refused=len(refused), arrived=time.monotonic()), timeout=WAIT)
+        except queue.Full:
+            return {"error": "busy: samples are held back; try again later", "status": 503}
+        if not done.wait(WAIT):
+            return {"error": "the journal does not take samples now; try again later", "status": 503}
+        return {"received": sum(one.count for one in samples), "refused": refused[:20]}
+
+
+INCOMING = Incoming()
+"""The one queue of this process."""
+
+
+def decoded(topic: str, body: bytes) -> tuple[list[Samples], list[str]]:
+    """Samples of one topic, or of a mapping from topics to payloads; and what could not be read."""
+    if topic:
+        try:
+            return [decode(topic, body)], []
+        except ValueError as error:
+            return [], [str(error)]
+    try:
+        parts = _BODY.decode(body)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return [], ["the body is not an object with a payload for each topic, in JSON."]
+    samples, refused = [], []
+    for name, payload in parts.items():
+        try:
+            samples.append(decode(name, bytes(payload)))
+        except ValueError as error:
+            refused.append(f"{name[:100]}: {error}")
+    return samples, refused

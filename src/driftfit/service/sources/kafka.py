@@ -1,0 +1,93 @@
+"""Kafka, by confluent-kafka: positions are kept in the journal, so every message is taken exactly once.
+
+The topic of the samples is the topic of Kafka, with the key of the message after a slash if it has one.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from driftfit.service.sources.contract import Reader, Source
+from driftfit.service.sources.samples import Batch, Samples, decode
+
+MOST = 2_000
+START = 20.0
+"""Seconds in which the brokers must answer."""
+
+
+@dataclass(frozen=True)
+class Kafka(Source):
+    """Topics of a cluster."""
+
+    brokers: str
+    topics: list[str]
+    begin: str = "latest"
+    """Where to begin without a position: latest or earliest."""
+    settings: dict[str, str] = field(default_factory=dict)
+    """Further settings of librdkafka, such as "security.protocol"."""
+
+    def check(self) -> None:
+        """The options and the client library."""
+        if self.begin not in ("latest", "earliest"):
+            raise ValueError(f"kafka: begin must be latest or earliest; got {self.begin!r}.")
+        library()
+
+    def open(self, position: Any) -> Reader:
+        """Continue after the messages that were read."""
+        return _Kafka(self, dict(position or {}))
+
+
+class _Kafka(Reader):
+    def __init__(self, options: Kafka, position: dict[str, int]) -> None:
+        kafka = library()
+        self.position = position
+        given = {"bootstrap.servers": options.brokers, "group.id": f"driftfit-{options.name}",
+                 "enable.auto.commit": False, "auto.offset.reset": options.begin} | options.settings  # fmt: skip
+        self.consumer = kafka.Consumer(given)
+        places = []
+        for topic in options.topics:
+            known = self.consumer.list_topics(topic, START).topics[topic]
+            if known.error is not None:
+                raise ConnectionError(str(known.error))
+            for part in known.partitions:
+                at = position.get(f"{topic}/{part}")
+                if at is None:  # noted now, so that nothing is skipped if the service stops before the first message
+                    ends = self.consumer.get_watermark_offsets(kafka.TopicPartition(topic, part), START)
+                    at = position[f"{topic}/{part}"] = ends[options.begin == "latest"]
+                places.append(kafka.TopicPartition(topic, part, at))
+        self.consumer.assign(places)
+
+    def read(self, wait: float) -> Batch | None:
+        """The messages that have arrived."""
+        found = self.consumer.consume(MOST, wait)
+        if not found:
+            return None
+        arrived = time.monotonic()
+        samples: list[Samples] = []
+        refused = 0
+        for message in found:
+            if message.error() is not None:
+                raise ConnectionError(str(message.error()))
+            self.position[f"{message.topic()}/{message.partition()}"] = message.offset() + 1
+            key = message.key()
+            topic = f"{message.topic()}/{key.decode('utf-8', 'replace')}" if key else message.topic()
+            try:
+                samples.append(decode(topic, message.value() or b""))
+            except ValueError:
+                refused += 1
+        return Batch(samples, position=dict(self.position), refused=refused, arrived=arrived)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self.consumer.close()
+
+
+def library() -> Any:
+    """The client library; ImportError says how to install it."""
+    try:
+        import confluent_kafka
+    except ImportError:
+        raise ImportError("kafka needs confluent-kafka: pip install 'driftfit[kafka]'.") from None
+    return confluent_kafka

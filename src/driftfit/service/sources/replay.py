@@ -1,0 +1,96 @@
+"""Replay: a recorded file at a chosen speed, for trials and demonstrations.
+
+``speed`` is in rows per second for a file without times, and a multiple of real time with ``time``; 0 is as fast as
+possible. The position is the number of rows that were read.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from driftfit.service.sources.contract import END, Reader, Source
+from driftfit.service.sources.samples import Batch, Samples, seconds
+
+PIECE = 1000
+"""Rows of one batch at most."""
+
+
+@dataclass(frozen=True)
+class Replay(Source):
+    """A recorded file."""
+
+    path: str
+    topic: str = ""
+    """Topic of the samples; empty: the name of the file."""
+    by: str = ""
+    """Column that names the unit; it is added to the topic after a slash."""
+    time: str = ""
+    speed: float = 0.0
+
+    def check(self) -> None:
+        """The file must exist, and have the columns."""
+        if not Path(self.path).exists():
+            raise ValueError(f"replay: there is no file {self.path}.")
+        if not self.speed >= 0.0:
+            raise ValueError(f"replay: speed must be at least 0 (0: as fast as possible); got {self.speed}.")
+        columns = pl.scan_parquet(self.path) if self.path.endswith(".parquet") else pl.scan_csv(self.path)
+        known = columns.collect_schema().names()
+        for name in (self.by, self.time):
+            if name and name not in known:
+                raise ValueError(f"replay: {self.path} has no column {name!r}; it has {', '.join(known)}.")
+
+    def open(self, position: Any) -> Reader:
+        """Continue after the rows that were read."""
+        table = pl.read_parquet(self.path) if self.path.endswith(".parquet") else pl.read_csv(self.path)
+        return _Replay(self, table, int(position or 0))
+
+
+class _Replay(Reader):
+    def __init__(self, options: Replay, table: pl.DataFrame, at: int) -> None:
+        self.options, self.table, self.at, self.topic = options, table, at, options.topic or Path(options.path).name
+        self.clock = [seconds(_plain(cell), 1.0) for cell in table[options.time]] if options.time else []
+        self.begun, self.first = time.monotonic(), at
+
+    def _due(self) -> int:
+        """Rows up to which it is time."""
+        speed, passed = self.options.speed, time.monotonic() - self.begun
+        if speed == 0.0:
+            return len(self.table)
+        if not self.clock:
+            return self.first + 1 + math.floor(passed * speed)
+        upto, end = self.at, self.clock[self.first] + passed * speed
+        while upto < len(self.clock) and not self.clock[upto] > end:
+            upto += 1
+        return upto
+
+    def read(self, wait: float) -> Batch | None:
+        """The rows that are due."""
+        if self.at >= len(self.table):
+            return END
+        until = time.monotonic() + wait
+        while (due := min(self._due(), len(self.table), self.at + PIECE)) <= self.at:
+            if time.monotonic() >= until:
+                return None
+            time.sleep(0.01)
+        piece, self.at = self.table[self.at : due], due
+        by = self.options.by
+        parts = piece.partition_by(by, maintain_order=True) if by else [piece]
+        samples = [
+            Samples(
+                f"{self.topic}/{part[by][0]}" if by else self.topic, len(part),
+                {name: [_plain(cell) for cell in part[name]] for name in part.columns},
+            )
+            for part in parts
+        ]  # fmt: skip
+        return Batch(samples, position=self.at, arrived=time.monotonic())
+
+
+def _plain(cell: Any) -> Any:
+    """A date as text; anything else as it is."""
+    return cell.isoformat() if hasattr(cell, "isoformat") else cell

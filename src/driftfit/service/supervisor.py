@@ -1,0 +1,173 @@
+"""The service as a process: engine, sources, sinks, the control socket, and the page in a process of its own."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from driftfit.engine.version import __version__
+from driftfit.service.control import Control
+from driftfit.service.core.engine import Engine
+from driftfit.service.runners import Runner, SinkRunner, SourceRunner
+from driftfit.service.settings.config import Config
+
+log = logging.getLogger("driftfit.service")
+LOOK = 1.0
+"""Seconds between two looks at the page's process."""
+STOP = 10.0
+"""Seconds that sinks have to write what is stored when the service stops."""
+
+
+class JsonLines(logging.Formatter):
+    """A log line as a JSON object."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        extra = {key: record.__dict__[key] for key in ("unit", "name_of", "detail") if key in record.__dict__}
+        line = {"at": round(record.created, 3), "level": record.levelname.lower(), "message": record.getMessage()}
+        if record.exc_info:
+            line["error"] = self.formatException(record.exc_info)
+        return json.dumps(line | extra, default=str)
+
+
+def log_to_stderr(level: str) -> None:
+    """Structured logs."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonLines())
+    log.handlers[:] = [handler]
+    log.setLevel(level.upper())
+    log.propagate = False
+
+
+class Service:
+    """A running service; `run` returns after `stop`, or a signal."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self.config, self.folder = config, folder
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._lock = open(folder / "lock", "w")  # noqa: SIM115  (held as long as the service runs)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ValueError(f"another service uses the folder {folder}; stop it, or use another folder.") from None
+        self.begun = time.time()
+        self.engine = Engine(config, folder)
+        if self.engine.recovered:
+            log.info("recovered", extra={"detail": {"samples": self.engine.recovered}})
+        self._private = Path(tempfile.mkdtemp(prefix="driftfit-"))
+        self.control = Control(self.engine, self._private / "control", self.status)
+        self.sources = [SourceRunner(self.engine, one) for one in config.sources]
+        self.sinks = [SinkRunner(self.engine, one) for one in config.sinks]
+        self.page: subprocess.Popen[bytes] | None = None
+        self.page_starts = 0
+        self._stopping = threading.Event()
+
+    def status(self) -> dict[str, Any]:
+        """Numbers for the page, `/metrics` and `/healthz`."""
+        return self.engine.status() | {
+            "sources": {one.label: one.status() for one in self.sources},
+            "sinks": {one.label: one.status() for one in self.sinks},
+            "since": self.begun, "version": __version__, "page_starts": self.page_starts,
+        }  # fmt: skip
+
+    def run(self, signals: bool = True) -> None:
+        """Work until `stop`."""
+        if signals:
+            for one in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(one, lambda *_: self.stop())
+        runners: list[Runner] = [*self.sources, *self.sinks]
+        for runner in (*runners, self.control):
+            runner.start()
+        keeper = threading.Thread(target=self._keep, daemon=True)
+        keeper.start()
+        notify("READY=1")
+        log.info("running", extra={"detail": {"units": len(self.engine.units), "folder": str(self.folder)}})
+        try:
+            self.engine.run()
+        finally:
+            self._close(runners)
+            keeper.join(STOP)
+            self._end_page()
+
+    def stop(self) -> None:
+        """Let `run` return."""
+        self._stopping.set()
+        for one in self.sources:
+            one.stop()
+        self.engine.stop()
+
+    def _close(self, runners: list[Runner]) -> None:
+        self._stopping.set()
+        with self.engine.news:
+            self.engine.news.notify_all()
+        for runner in runners:
+            runner.stop()
+        until = time.monotonic() + STOP
+        for runner in runners:
+            runner.join(max(0.1, until - time.monotonic()))
+        self.control.close()
+        self.engine.close()
+        shutil.rmtree(self._private, ignore_errors=True)
+        self._lock.close()
+        log.info("stopped")
+
+    def _keep(self) -> None:
+        """Start the page, and start it again when it dies; tell systemd that the service lives."""
+        pause, at = LOOK, 0.0
+        while not self._stopping.is_set():
+            if self.config.page.enabled and (self.page is None or self.page.poll() is not None):
+                if self.page is not None and time.monotonic() - at < 60.0:
+                    pause = min(2.0 * pause, 30.0)
+                    self._stopping.wait(pause)
+                    if self._stopping.is_set():
+                        break
+                at = time.monotonic()
+                self._start_page()
+            notify("WATCHDOG=1")
+            self._stopping.wait(LOOK)
+
+    def _start_page(self) -> None:
+        given = {
+            "page": asdict(self.config.page), "folder": str(self.folder), "control": str(self.control.path),
+            "level": self.config.service.log,
+        }  # fmt: skip
+        self.page = subprocess.Popen([sys.executable, "-m", "driftfit.service.page"], stdin=subprocess.PIPE)
+        self.page_starts += 1
+        assert self.page.stdin is not None
+        try:
+            self.page.stdin.write(json.dumps(given).encode() + b"\n")
+            self.page.stdin.flush()  # it stays open: the page ends when this process does
+        except OSError as error:
+            log.error("page", extra={"detail": str(error)})
+
+    def _end_page(self) -> None:
+        if self.page is None:
+            return
+        self.page.terminate()
+        try:
+            self.page.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.page.kill()
+            self.page.wait()
+        if self.page.stdin is not None:
+            self.page.stdin.close()
+
+
+def notify(text: str) -> None:
+    """Tell systemd, if it started the service."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as one:
+            one.sendto(text.encode(), address.replace("@", "\0", 1))

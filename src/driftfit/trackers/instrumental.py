@@ -1,0 +1,253 @@
+"""Recursive instrumental variables: least squares that coloured noise does not bias.
+
+    y_t = phi_t' theta_t + v_t,   E zeta_t v_t = 0 although E phi_t v_t != 0
+
+    predict   C <- C / lambda_e,  G <- G / lambda_e           (lambda_e as in `driftfit.trackers.rls`)
+    correct   e = y - phi' theta;  K = G zeta / (1 / w + phi' G zeta)
+              theta <- theta + K e;  G <- G - K phi' G
+              C <- (I - K phi') C (I - K phi')' + K K' / w
+
+with w the weight of the sample. G is the inverse of sum lambda^(t-k) zeta_k phi_k', which is not symmetric. C is the
+covariance of theta in units of the noise variance, which is estimated as in `RLS`.
+
+In an ARX model the noise of an output is in the regressors of the next samples. If it is coloured, it is correlated
+with them, and least squares is biased however long the record. Instruments are correlated with the regressors, but not
+with the noise: the inputs themselves, and in the place of past outputs those of an auxiliary model
+
+    x_t = zeta_t' a_t,  |x_t| <= the largest output so far;   a_{t+1} = a_t + 0.05 (theta_t - a_t)
+    zeta_t = [x_{t-1} .. x_{t-na}, the other regressors]
+
+that is driven by the inputs alone, and follows theta at a distance. The first 10 n samples are used as in least
+squares, to have an auxiliary model; their bias fades with the memory.
+
+Use it if the residuals of `RLS` are correlated (`Track.diagnose`), and the inputs do not depend on past outputs: under
+feedback they are correlated with the noise too. The estimate has a larger variance than least squares. `std`
+treats the noise as white. A model without past outputs has its regressors as instruments, which is exponential `RLS`.
+There is no smoother: this is not the estimate of a random walk.
+
+A sample with 1 / w + phi' G zeta below one half of 1 / w is not learned from: G would more than double in a direction,
+which happens where instruments and regressors have nothing in common.
+
+Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 6 (the auxiliary model, and its filter);
+Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
+diffuse start and the cap of `RLS`; the limit of x; the skipped samples; C in the place of the variance matrix of white
+noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import covariance, matrix, numbers, vector
+from driftfit.models.base import Model
+from driftfit.trackers import rls
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.diffuse import LEFT, MACHINES, knowing, knowing_nothing, prediction, symmetric_product
+from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.rls import growth, learn_scale, no_scale
+
+FOLLOWING = 0.05
+"""Share of the distance to theta that the auxiliary model goes at a sample: twenty samples behind."""
+
+LEAST_SQUARES = 10.0
+"""Samples for each parameter, at the start, that are used as in least squares."""
+
+LEAST = 0.5
+"""Least share of its noise variance that 1 / w + phi' G zeta may be."""
+
+start_of_rls = rls.begin
+
+
+@kernel
+def forget(s: State, l: int) -> None:
+    grow = growth(s, l)
+    for i in range(s.theta.shape[0]):
+        for j in range(i + 1):
+            s.P[i, j, l] *= grow
+        for j in range(s.theta.shape[0]):
+            s.G[i, j, l] *= grow
+
+
+@kernel
+def weigh_instruments(s: State, l: int) -> float:
+    """s.f = G zeta and s.b = G' phi; returns phi' G zeta."""
+    n = s.theta.shape[0]
+    for i in range(n):
+        f, b = 0.0, 0.0
+        for j in range(n):
+            f += s.G[i, j, l] * s.zeta[j, l]
+            b += s.G[j, i, l] * s.phi[j, l]
+        s.f[i, l], s.b[i, l] = f, b
+    total = 0.0
+    for i in range(n):
+        total += s.phi[i, l] * s.f[i, l]
+    return total
+
+
+@kernel
+def learn(s: State, l: int) -> None:
+    n = s.theta.shape[0]
+    noise, y_hat = s.noise[l], prediction(s, l)
+    v = symmetric_product(s, l) + noise  # s.g = C phi
+    common = noise + weigh_instruments(s, l)
+    e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise)
+    gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
+    for i in range(n):
+        k = gain * s.f[i, l]
+        s.theta[i, l] += k * e
+        for j in range(n):
+            s.G[i, j, l] -= k * s.b[j, l]
+        for j in range(i):
+            k_j = gain * s.f[j, l]
+            s.P[i, j, l] -= k * s.g[j, l] + s.g[i, l] * k_j - k * k_j * v_used
+        left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
+        s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
+    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+    learn_scale(s, l)
+
+
+@lru_cache
+def steps(na: int) -> TrackerSteps:
+    """The steps for models whose first na regressors are past outputs."""
+
+    @kernel
+    def instruments(s: State, l: int) -> None:
+        """zeta, and the present output of the auxiliary model, s.x."""
+        n, settled = s.theta.shape[0], s.learned[l] >= s.settling[l]
+        x = 0.0
+        for i in range(na):
+            x += s.x_lag[i, l] * s.auxiliary[i, l]
+            s.zeta[i, l] = s.x_lag[i, l] if settled else s.phi[i, l]
+        for i in range(na, n):
+            x += s.phi[i, l] * s.auxiliary[i, l]
+            s.zeta[i, l] = s.phi[i, l]
+        s.largest[l] = max(s.largest[l], abs(s.y[l]))
+        s.x[l] = max(-s.largest[l], min(s.largest[l], x))
+        s.learned[l] += s.ok[l]
+
+    @kernel
+    def follow(s: State, l: int) -> None:
+        """The auxiliary model follows theta, and its output is the first of its lags."""
+        share = FOLLOWING if s.learned[l] >= s.settling[l] else 1.0
+        for i in range(s.theta.shape[0]):
+            s.auxiliary[i, l] += share * (s.theta[i, l] - s.auxiliary[i, l])
+        for i in range(na - 1, 0, -1):
+            s.x_lag[i, l] = s.x_lag[i - 1, l]
+        if na > 0:
+            s.x_lag[0, l] = s.x[l]
+
+    @kernel
+    def correct(s: State, l: int) -> None:
+        resolve(s, l)
+        instruments(s, l)
+        learn(s, l)
+        follow(s, l)
+
+    @kernel
+    def begin(s: State, l: int) -> None:
+        instruments(s, l)
+        start_of_rls(s, l)
+        for i in range(s.theta.shape[0]):
+            for j in range(i + 1):
+                s.G[i, j, l] = s.P[i, j, l]
+                s.G[j, i, l] = s.P[i, j, l]
+        follow(s, l)
+
+    return TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
+
+
+@dataclass(frozen=True)
+class InstrumentalVariables(Tracker):
+    """Recursive instrumental variables for ARX models in coloured noise, with an auxiliary model and forgetting.
+
+    Parameters
+    ----------
+    forgetting : number in (0, 1]
+        lambda per nominal sample; 1 never forgets.
+    p0 : number, (n,), (n, n), or None
+        Covariance of theta before the first sample, in units of the noise variance. None: exact diffuse start.
+    theta0 : number or (n,)
+        Mean of theta before the first sample.
+    c_max : number
+        Cap of the growth of a variance, as a multiple of its value at the start.
+
+    Raises
+    ------
+    ValueError
+        If forgetting is outside (0, 1], p0 is not a covariance, or c_max is below 1; when a run begins, if the model
+        does not say which of its regressors are past outputs.
+    """
+
+    forgetting: float | None = None
+    p0: Any = None
+    theta0: Any = 0.0
+    c_max: float = 1e8
+
+    required: ClassVar[tuple[str, ...]] = ("forgetting",)
+
+    def __post_init__(self) -> None:
+        name = "InstrumentalVariables"
+        if self.forgetting is not None:
+            self._set("forgetting", numbers(name, "forgetting", self.forgetting, ndim=0, low=0.0, strict=True))
+            if self.forgetting > 1.0:
+                raise ValueError(f"{name}: forgetting must be in (0, 1]; got {self.forgetting!r}.")
+        if self.p0 is not None:
+            self._set("p0", covariance(name, "p0", self.p0))
+        self._set("theta0", numbers(name, "theta0", self.theta0))
+        self._set("c_max", numbers(name, "c_max", self.c_max, ndim=0, low=1.0))
+
+    def state(self, n: int) -> Mapping[str, Any]:
+        name = "InstrumentalVariables"
+        P = np.zeros((n, n)) if self.p0 is None else matrix(name, "p0", self.p0, n)
+        first = self.c_max * np.diag(P)
+        theta0 = vector(name, "theta0", self.theta0, n)
+        return {
+            "theta": theta0,
+            "P": P,
+            "G": P,
+            "g": np.zeros(n),
+            "f": np.zeros(n),
+            "b": np.zeros(n),
+            "zeta": np.zeros(n),
+            "auxiliary": theta0,
+            "x": 0.0,
+            "x_lag": np.zeros(n),
+            "largest": 0.0,
+            "learned": 0.0,
+            "settling": LEAST_SQUARES * n,
+            "forgetting": self.forgetting,
+            "log_forgetting": np.log(np.asarray(self.forgetting)),
+            "r": 1.0,
+            "c_max": self.c_max,
+            "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
+            **no_scale(),
+            **(knowing_nothing(n) if self.p0 is None else knowing(n)),
+        }
+
+    @property
+    def steps(self) -> TrackerSteps:
+        """Those for a model without past outputs."""
+        return steps(0)
+
+    def steps_for(self, model: Model) -> TrackerSteps:
+        if model.output_lags is None:
+            raise ValueError(
+                f"InstrumentalVariables: {type(model).__name__} does not say which of its regressors are past outputs "
+                "(`Model.output_lags`), so they cannot be replaced by instruments; use ARX."
+            )
+        return steps(model.output_lags)
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        super().widen(lane, p)
+        scale = float(lane["scale"])
+        np.einsum("ii->i", lane["G"])[:] += p / scale if scale > 0.0 else p
+
+    def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
+        return resolution(run.state)

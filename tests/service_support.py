@@ -1,0 +1,71 @@
+"""Small services for tests: one model and tracker, which other tests compile too."""
+
+import json
+import time
+
+import numpy as np
+
+from driftfit import ARX, Kalman
+from driftfit.service.core.engine import Engine
+from driftfit.service.settings.config import parse
+from driftfit.service.sources.samples import Batch, decode
+
+MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-4, r=0.1)
+UNIT = """
+[[unit]]
+match = "plant/{pump}"
+y = "y"
+u = ["u"]
+time = "t"
+dt = 1.0
+model = "ARX(1, 1)"
+tracker = "Kalman(q=1e-4, r=0.1)"
+"""
+HTTP = '[source.web]\nkind = "http"\n'
+
+
+def configured(unit=UNIT, more="", source=HTTP):
+    return parse(source + unit + more)
+
+
+def record(T=400, seed=0):
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=T), np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.8 * y[t - 1] + 0.5 * u[t - 1] + 0.1 * rng.normal()
+    return y, u
+
+
+def message(topic, t, y, u, **more):
+    columns = {"t": list(map(float, t)), "y": list(map(float, y)), "u": list(map(float, u))}
+    return Batch([decode(topic, json.dumps(columns | more))], arrived=time.monotonic())
+
+
+def feed(engine, batch):
+    """One message, journaled and processed; True once it was acknowledged."""
+    done = []
+    engine.intake.put("web", batch._replace(acknowledge=lambda: done.append(1)))
+    engine.step(0.0)
+    return bool(done)
+
+
+def settled(engine):
+    """Store the results that wait for the next transaction."""
+    while engine._pending:
+        engine.step(0.0)
+
+
+def told(engine):
+    """All stored results, as rows."""
+    settled(engine)
+    return [row for _, rows, _ in engine.journal.outcomes(0, 10**6) for row in rows]
+
+
+def events(engine, kind=None):
+    settled(engine)
+    found = engine.journal.db.execute("select kind, detail from event order by id").fetchall()
+    return [json.loads(detail) for one, detail in found if kind in (None, one)]
+
+
+def opened(config, folder):
+    return Engine(config, folder)

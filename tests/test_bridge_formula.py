@@ -1,0 +1,89 @@
+"""Formulas and results in the manner of statsmodels: the same numbers as its recursive least squares."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from driftfit import RLS, Kalman, Regression, track
+
+pytest.importorskip("formulaic", reason="formulaic is not installed")
+
+from driftfit.bridges.formula import TimeVaryingRegression
+
+
+def table(T=80, seed=0):
+    rng = np.random.default_rng(seed)
+    data = pd.DataFrame(
+        rng.normal(size=(T, 2)), columns=["x1", "x2"], index=pd.date_range("2020-01-31", periods=T, freq="ME")
+    )
+    data["y"] = 1 + 2 * data.x1 - np.where(np.arange(T) < T // 2, 1.0, 3.0) * data.x2 + 0.1 * rng.normal(size=T)
+    return data
+
+
+def test_same_numbers_as_track():
+    data = table()
+    result = TimeVaryingRegression.from_formula("y ~ x1 + x2", data, Kalman(q=1e-3, r=0.01)).fit()
+    run = track(
+        Regression(["x1", "x2"], intercept=True),
+        Kalman(q=1e-3, r=0.01),
+        data.y.to_numpy(),
+        data[["x1", "x2"]].to_numpy(),
+    )
+    np.testing.assert_array_equal(result.params, run.theta[-1])
+    np.testing.assert_array_equal(result.bse_path, run.std)
+    assert list(result.names) == ["x1", "x2", "Intercept"]
+    assert result.params_path.index.equals(data.index)
+    low, high = run.band(0.9)
+    np.testing.assert_allclose(result.conf_int(0.1), np.c_[low[-1], high[-1]], rtol=1e-9)
+    np.testing.assert_array_equal(result.smoothed_path, run.smooth().theta)
+
+
+def test_same_numbers_as_statsmodels():
+    api = pytest.importorskip("statsmodels.api", reason="statsmodels is not installed")
+    data = table().iloc[:40]
+    mine = TimeVaryingRegression.from_formula("y ~ x1 + x2", data, RLS(1.0)).fit()
+    theirs = api.RecursiveLS.from_formula("y ~ x1 + x2", data).fit()
+    order = list(theirs.model.exog_names)
+    np.testing.assert_allclose(mine.params[order], theirs.params, rtol=1e-8)
+    np.testing.assert_allclose(mine.bse[order], theirs.bse, rtol=1e-8)
+    np.testing.assert_allclose(
+        mine.params_path[order].iloc[5:], theirs.recursive_coefficients.filtered.T[5:], rtol=1e-6
+    )
+    np.testing.assert_allclose(mine.cusum[3:], theirs.cusum, rtol=1e-6, atol=1e-8)
+
+
+def test_formula_keeps_missing_rows_and_reads_transforms():
+    data = table()
+    data.loc[data.index[10], "x1"] = np.nan
+    data.loc[data.index[20], "y"] = np.nan
+    result = TimeVaryingRegression.from_formula("y ~ x1 + np.exp(x2) - 1", data, RLS(1.0)).fit()
+    assert len(result.params_path) == 80
+    assert result.nobs == 78
+    assert list(result.names) == ["x1", "np.exp(x2)"]
+    with pytest.raises(ValueError, match="no output"):
+        TimeVaryingRegression.from_formula("x1 + x2", data)
+
+
+def test_cusum_leaves_its_limits_when_a_coefficient_jumps():
+    constant, jump = table(), table()
+    constant["y"] = 1 + 2 * constant.x1 + 0.1 * np.random.default_rng(3).normal(size=80)
+    jump["y"] = constant.y + np.where(np.arange(80) < 40, 0.0, 0.5)
+    outside = []
+    for data in (constant, jump):
+        result = TimeVaryingRegression.from_formula("y ~ x1", data, RLS(1.0)).fit()
+        limits = result.cusum_limits(0.05)
+        outside.append(bool(((result.cusum > limits.upper) | (result.cusum < limits.lower)).any()))
+    assert outside == [False, True]
+    with pytest.raises(ValueError, match="tabulated"):
+        result.cusum_limits(0.2)
+    assert len(result.plot_cusum().axes[0].lines) == 4
+
+
+def test_summary_as_text_html_and_latex():
+    summary = TimeVaryingRegression.from_formula("y ~ x1 + x2", table(), RLS(1.0)).fit().summary()
+    row = summary.table.loc["x1"]
+    for text in (summary.as_text(), summary.as_html(), summary.as_latex()):
+        assert f"{row['coef']:.4f}" in text
+        assert f"{row['0.975]']:.4f}" in text
+    assert summary.as_latex().count(r"\\") == 5 + 1 + 3
+    assert str(summary) == summary.as_text()

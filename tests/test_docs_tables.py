@@ -1,0 +1,42 @@
+"""The tables of functions of other packages: every line of code in the last column runs after the page's own code."""
+
+import re
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+import driftfit
+
+DOCS = Path(__file__).parent.parent / "docs"
+PAGES = [DOCS / "from_matlab.md", DOCS / "from_r.md"]
+ROW = re.compile(r"^\| (?P<theirs>.+?) \| .+? \| `(?P<ours>.+)` \|$", re.M)
+
+
+@pytest.mark.filterwarnings("ignore::driftfit.DataWarning")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_line_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    text = page.read_text()
+    namespace: dict[str, object] = {}
+    exec(re.search(r"```python\n(.*?)```", text, re.S)[1], namespace)
+    failed = {}
+    for row in ROW.finditer(text):
+        try:
+            exec(row["ours"], namespace)
+        except Exception as error:  # collected, so that one run shows all of them
+            failed[row["theirs"]] = error
+    assert failed == {}
+    assert len(list(ROW.finditer(text))) == sum(line.startswith("| `") for line in text.splitlines())
+
+
+def test_matlab_has_sixty_functions():
+    rows = ROW.finditer((DOCS / "from_matlab.md").read_text())
+    assert sum(row["theirs"].count("`") // 2 for row in rows) >= 60
+
+
+def test_the_reference_has_every_public_name():
+    pages = "\n".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
+    named = re.findall(r"^::: driftfit\.(\w+)$", pages, re.M)
+    assert sorted(named) == sorted({*driftfit.__all__} - {"__version__"})

@@ -1,0 +1,225 @@
+"""Alarms on a frozen reference model: a naive twin of the statistics, rates, delays, and what changed."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from support import arx_record, rows_of
+
+from driftfit import ARX, AugmentedFLS, Kalman, Live, Regression, track
+from driftfit.judge.alarms import bootstrap
+from driftfit.judge.alarms.frozen import frozen_model, noise_model
+from driftfit.judge.alarms.onsets import onsets
+from driftfit.run.live.likelihood_ratio import (
+    ALPHA,
+    BETA,
+    CLIP,
+    CUSUM,
+    JOINT,
+    KAPPA,
+    LONGEST,
+    NOISE,
+    NORMAL,
+    ONE,
+    RAW,
+    SCALE,
+    SHIFT,
+    SIZE,
+    WHICH,
+    Frozen,
+    K,
+    V,
+    memory_of,
+    scan,
+)
+
+HELD = Kalman(q=0.0, r=1.0)
+GAIN = Regression(["gain"], intercept=True)
+
+
+def naive_scores(rows, model):
+    """(phi, x, g, index of the row) of the usable rows, from the definition."""
+    n, p, numbers = len(model.theta), len(model.ar), model.numbers
+    run, h, found, past = 0, 1.0, [], []
+    for t, row in enumerate(rows):
+        phi, (y, ok, noise, dt) = row[:n], row[n:]
+        if dt == 0.0:
+            continue
+        run = 0 if ok == 0.0 or dt > 1.5 else run
+        if ok == 0.0:
+            continue
+        past.append(np.append(phi / model.unit, y - phi @ model.theta) / np.sqrt(noise))
+        run += 1
+        if run <= p:
+            continue
+        white = past[-1] - sum(model.ar[i] * past[-2 - i] for i in range(p))
+        x = white[n] / (numbers[SCALE] * np.sqrt(h))
+        g = np.clip(x, -numbers[CLIP], numbers[CLIP])
+        found.append((white[:n] / np.sqrt(h), x, g, t))
+        h = 1.0 - numbers[ALPHA] - numbers[BETA] + (numbers[ALPHA] * g * g / numbers[V] + numbers[BETA]) * h
+    return found
+
+
+def naive_window(part, model):
+    """(one, which, size, joint, noise) of the scores of a window."""
+    numbers, L = model.numbers, len(part)
+    phi, x, g = (np.array([one[k] for one in part]) for k in range(3))
+    G = phi.T @ phi
+    inverse = np.linalg.inv(numbers[V] * G + numbers[K] ** 2 * G @ model.cov @ G)
+    S, U, n = phi.T @ g, phi.T @ x, phi.shape[1]
+    length = np.array([G[j] @ inverse @ G[j] for j in range(n)])
+    one = np.abs(np.array([G[j] @ inverse @ S for j in range(n)])) / np.sqrt(length)
+    j = int(np.argmax(one))
+    c = 2.0 / (9.0 * n)
+    joint = ((S @ inverse @ S / n) ** (1.0 / 3.0) - (1.0 - c)) / np.sqrt(c)
+    shape = L * numbers[V] ** 2 / numbers[KAPPA]
+    noise = ((np.mean(g * g) / numbers[V]) ** (1.0 / 3.0) - (1.0 - 1.0 / (9.0 * shape))) * 3.0 * np.sqrt(shape)
+    noise = abs(noise) / np.sqrt(1.0 + L / numbers[NORMAL]) if numbers[LONGEST] >= L else np.nan
+    return one[j], j, G[j] @ inverse @ U / length[j], joint, noise
+
+
+@pytest.mark.parametrize("ar", [(), (0.6, -0.2)], ids=["white", "autoregression"])
+def test_statistics_are_those_of_a_naive_twin(ar):
+    rng = np.random.default_rng(4)
+    n, T = 3, 230
+    numbers = np.zeros(NORMAL + 1)
+    for place, value in {
+        SCALE: 1.3, CLIP: 2.5, K: 0.98, V: 0.95, KAPPA: 1.2, ALPHA: 0.1, BETA: 0.8, RAW: 1.1, LONGEST: 60, NORMAL: 480
+    }.items():  # fmt: skip
+        numbers[place] = value
+    root = 0.05 * rng.normal(size=(n, n))
+    model = Frozen(rng.normal(size=n), np.array([1.0, 10.0, 0.1]), np.array(ar), root @ root.T, numbers)
+    rows = np.ones((T, n + 4))
+    rows[:, :n] = rng.normal(size=(T, n)) * [1.0, 10.0, 0.1] + [0.0, 5.0, 0.0]
+    rows[:, n] = rows[:, :n] @ model.theta + 2.0 * rng.normal(size=T)
+    rows[[30, 31, 90], n + 1] = 0.0
+    rows[40:60, n + 2] = 4.0
+    rows[120, n + 3], rows[150, n + 3] = 0.0, 3.0
+    told = np.empty((T, CUSUM + n + 1))
+    memory = memory_of(n, len(ar))
+    scan(rows[:100], model, memory, told[:100])
+    scan(rows[100:], model, memory, told[100:])  # in two parts, as a stream
+    scores, best = naive_scores(rows, model), {}
+    up, down = np.zeros(n + 1), np.zeros(n + 1)
+    for count, (phi, _, g, t) in enumerate(scores, start=1):
+        for level in range(6):
+            for blocks in (8, 12):
+                L = blocks << level
+                if count % (1 << level) == 0 and count >= L:
+                    best[L] = naive_window(scores[count - L : count], model)
+        z, power = np.append(phi * g, g * g - numbers[V]), np.append(phi * phi, 1.0)
+        mean, var = np.full(n + 1, SHIFT * numbers[K]), np.full(n + 1, numbers[V])
+        mean[n], var[n] = SHIFT * numbers[V], numbers[KAPPA]
+        up = np.maximum(0.0, up + (mean * z - 0.5 * mean**2 * power) / var)
+        down = np.maximum(0.0, down + (-mean * z - 0.5 * mean**2 * power) / var)
+        assert told[t, CUSUM:] == pytest.approx(np.sqrt(2.0 * np.maximum(up, down)))
+        if not best:
+            assert np.isnan(told[t, ONE])
+            continue
+        one = max(best.values())
+        assert told[t, [ONE, WHICH, SIZE]] == pytest.approx(one[:3])
+        assert told[t, JOINT] == pytest.approx(max(found[3] for found in best.values()))
+        assert told[t, NOISE] == pytest.approx(np.nanmax([found[4] for found in best.values()]))
+    assert np.array_equal(told[30], told[29])
+    assert np.array_equal(told[120], told[119])
+
+
+def noise_of(kind, T, rng):
+    if kind == "t3":
+        return rng.standard_t(3, size=T) / np.sqrt(3.0)
+    z, e = rng.normal(size=T), np.zeros(T)
+    h = 1.0
+    for t in range(T):
+        if kind == "AR(.6)":
+            e[t] = 0.6 * e[t - 1] + 0.8 * z[t]
+        else:
+            e[t] = np.sqrt(h) * z[t]
+            h = 0.05 + 0.1 * e[t] ** 2 + 0.85 * h if kind == "GARCH" else 1.0
+    return e
+
+
+@pytest.mark.parametrize("kind", ["normal", "t3", "AR(.6)", "GARCH"])
+def test_rates_of_false_alarms(kind, monkeypatch):
+    """Four references of 1000 samples, 5000 more from each, one alarm in 100 set: within four standard errors."""
+    monkeypatch.setattr(bootstrap, "SAMPLES", 64_000)
+    begun = {"glr": [], "cusum": []}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u, v = rng.normal(size=6000), noise_of(kind, 6000, rng)
+        run = track(GAIN, HELD, 2.0 * u + 1.0 + 3.0 * v, u)
+        for name, counts in begun.items():
+            counts.append(len(run.detect(name, every=100.0, reference=1000, seed=seed).onsets))
+    for counts in begun.values():
+        assert abs(np.mean(counts) / 50.0 - 1.0) < 4.0 * max(np.std(counts) / 50.0, 0.15) / 2.0
+
+
+@pytest.mark.parametrize(("unit", "name", "size"), [(1.0, "gain", 0.6), (1e-4, "intercept", -1.0), (1e5, "noise", 2.0)])
+def test_a_change_is_found_named_and_sized(unit, name, size, monkeypatch):
+    """With one false alarm in 1000 samples; in the units of y, whatever they are."""
+    monkeypatch.setattr(bootstrap, "SAMPLES", 128_000)
+    late, covered, since = [], [], []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, v, after = rng.normal(size=1600), rng.normal(size=1600), np.arange(1600) >= 1200
+        y = (2.0 + after * size * (name == "gain")) * u + 1.0 + after * size * (name == "intercept")
+        y += v * np.where(after & (name == "noise"), size, 1.0)
+        said = track(GAIN, AugmentedFLS(mu=10.0), unit * y, u).detect(every=1000.0, reference=1000, hold=20)
+        begun = said.onsets[said.onsets >= 1200]
+        late.append(begun[0] - 1200)
+        settled = said.change(int(begun[0]) + 150)
+        scale = 1.0 if name == "noise" else unit
+        covered.append(settled.low < size * scale < settled.high)
+        assert settled.name == name
+        since.append(said.change(int(begun[0])).since - 1200)
+    assert np.median(late) < 60
+    assert sum(covered) >= 3
+    assert np.median(np.abs(since)) < 20
+
+
+def test_the_noise_model_of_a_reference():
+    rng = np.random.default_rng(1)
+    constant, _ = noise_model(rng.standard_t(3, size=2000), 2)
+    assert constant[ALPHA] == constant[BETA] == 0.0
+    changing, h = noise_model(noise_of("GARCH", 2000, rng), 2)
+    assert 0.03 <= changing[ALPHA] <= 0.15
+    assert 0.8 <= changing[ALPHA] + changing[BETA] < 1.0
+    assert 0.6 < np.median(h) < 1.4
+    phi, e = rng.normal(size=(2000, 2)) * [1.0, 1e6], noise_of("AR(.6)", 2000, rng)
+    ok = np.ones(2000, bool)
+    ok[100:103] = False
+    frozen, rows = frozen_model(phi, phi @ [2.0, 1e-6] + e, ok)
+    assert len(frozen.ar) == 1
+    assert frozen.ar[0] == pytest.approx(0.6, abs=0.07)
+    assert frozen.theta == pytest.approx([2.0, 1e-6], abs=0.1)
+    assert len(rows.x) == 2000 - 5  # a gap of three and the lag after it, and the first row
+    unexcited, _ = frozen_model(np.column_stack([phi[:, 0], phi[:, 0]]), phi[:, 0] + e, ok)
+    assert np.linalg.eigvalsh(unexcited.cov)[-1] > 100.0  # nothing is known of their difference
+
+
+def test_the_chance_of_an_extreme_and_the_default_reference():
+    y, u = arx_record(900, 4)
+    quiet = track(ARX(2, 2), HELD, y, u).detect()
+    assert quiet.kind == "glr"
+    assert quiet.start == 300
+    assert quiet.every == 10_000.0
+    loud = track(ARX(2, 2), HELD, y + 0.3 * (np.arange(900) > 600), u).detect()
+    assert quiet.p > 0.01
+    assert loud.p < 1e-6
+    assert any("since" in row for row in rows_of(loud))
+    assert onsets(loud.active)[0] == loud.onsets[0] > 600
+    # extrapolation: a limit that is ten times as rare is the one that the tail of a normal variable has, roughly
+    rare = track(ARX(2, 2), HELD, y, u).detect(every=100_000.0)
+    ratio = stats.norm.sf(rare.limits[0]) / stats.norm.sf(quiet.limits[0])
+    assert 0.03 < ratio < 0.3
+    assert loud.cause(int(loud.onsets[0])) == "offset"
+
+
+def test_errors():
+    y, u = arx_record(400, 4)
+    run = track(ARX(2, 2), HELD, y, u)
+    with pytest.raises(ValueError, match="at least 100 usable samples"):
+        run.detect(reference=90)
+    with pytest.raises(ValueError, match="must be a number of samples"):
+        run.detect("glr", reference={"b1": (0.0, 1.0)})
+    rule = run.detect(reference=300).rule
+    with pytest.raises(ValueError, match="has 4 parameters"):
+        Live(ARX(1, 1), HELD).detect(rule)

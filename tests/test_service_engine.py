@@ -1,0 +1,355 @@
+"""The engine of the service: the journal alone determines the states, whatever happens to the process."""
+
+import shutil
+import sqlite3
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
+
+from service_support import (
+    MODEL,
+    TRACKER,
+    UNIT,
+    configured,
+    events,
+    feed,
+    message,
+    opened,
+    record,
+    settled,
+    told,
+)  # fmt: skip
+
+from driftfit import track
+from driftfit.service.core.archive import export
+from driftfit.service.core.intake import Intake
+from driftfit.service.core.unit import Unit
+from driftfit.service.sources.samples import Batch
+
+
+def run_of(y, u, time=None, **more):
+    return track(MODEL, TRACKER, y, u, time=np.arange(len(y)) * 1.0 if time is None else time, dt=1.0, **more)
+
+
+@pytest.fixture
+def engine(tmp_path):
+    one = opened(configured(), tmp_path)
+    yield one
+    one.close()
+
+
+def test_states_and_results_are_those_of_track(engine):
+    y, u = record()
+    for k in range(0, 400, 50):
+        for pump in "ab":
+            assert feed(engine, message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
+    run = run_of(y, u)
+    rows = [row for row in told(engine) if row[1] == 2]
+    assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
+    assert np.array_equal([row[5] for row in rows], run.innovation, equal_nan=True)
+    assert np.array_equal([row[8] for row in rows], run.theta)
+    assert np.array_equal([row[9] for row in rows], run.std)
+    assert [row[2] for row in rows] == run.time.tolist()
+
+
+def test_a_new_process_continues_with_the_same_bits(tmp_path):
+    y, u = record()
+    config = configured()
+    for k in range(0, 400, 40):
+        engine = opened(config, tmp_path)
+        feed(engine, message("plant/a", range(k, k + 40), y[k : k + 40], u[k : k + 40]))
+        if k % 80:  # sometimes the state is stored, sometimes only the journal has it; the results wait either way
+            engine._store_states(everything=True)
+            engine._commit()
+        engine.journal.close()
+    engine = opened(config, tmp_path)
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
+    assert [row[0] for row in told(engine)] == list(range(1, 401))
+    blocks = engine.journal.db.execute("select sum(count), count(*) from block").fetchone()
+    assert blocks[0] <= 400
+    assert engine.journal.rows_of(1)[0] == list(range(400))
+    engine.close()
+
+
+def test_late_rows_are_put_in_order(tmp_path):
+    y, u = record(200)
+    engine = opened(configured(UNIT + "hold_back = 5\n"), tmp_path)
+    rng = np.random.default_rng(3)
+    order = np.argsort(np.arange(200) + rng.uniform(0, 4.0, 200))
+    order = np.concatenate([order, order[-3:]])  # the last three come twice
+    for part in np.array_split(order, 40):
+        feed(engine, message("plant/a", part, y[part], u[part]))
+    feed(engine, message("plant/a", [3.0], [9.0], [9.0]))  # far too late
+    unit = engine.units.get(1)
+    assert unit.counts["late"] == 1
+    assert unit.counts["duplicate"] == 3
+    assert len(unit.waiting) == 5
+    state = unit.state()
+    run = run_of(y[:195], u[:195])
+    assert np.array_equal(unit.live.theta, run.theta[-1])
+    times, rows = engine.journal.rows_of(1)
+    assert sorted(times) == list(range(200))
+    assert len(rows) == 200
+    again = Unit.of(1, "a", unit.settings, state)
+    assert again.waiting == unit.waiting
+    assert np.array_equal(again.live.theta, run.theta[-1])
+    engine.close()
+
+
+def test_clocks_that_jump(engine):
+    y, u = record(100)
+    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
+    feed(engine, message("plant/a", range(20, 60), y[20:60], u[20:60]))  # back by 30 s
+    unit = engine.units.get(1)
+    assert unit.counts["late"] + unit.counts["duplicate"] == 30
+    feed(engine, message("plant/a", [time.time() + 1e6], [0.0], [0.0]))  # ahead: it would make all others late
+    assert unit.counts["time in the future"] == 1
+    feed(engine, message("plant/a", range(60, 100), y[60:], u[60:]))
+    assert np.array_equal(unit.live.theta, run_of(y, u).theta[-1])
+
+
+def test_limits_are_those_of_track(tmp_path):
+    y, u = record(200)
+    y[100], u[50] = 500.0, -70.0
+    engine = opened(configured(UNIT + "limits = { y = [-50, 50], u = [-60, 60] }\n"), tmp_path)
+    feed(engine, message("plant/a", range(200), y, u))
+    run = run_of(y, u, limits={"y": (-50, 50), "u": (-60, 60)})
+    assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
+    assert engine.units.get(1).counts["y outside its limits"] == 1
+    engine.close()
+
+
+def test_one_unit_fails_and_the_others_go_on(engine, monkeypatch):
+    y, u = record(100)
+    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
+    feed(engine, message("plant/b", range(50), y[:50], u[:50]))
+    broken = engine.units.get(1).live
+
+    def fails(*args, **kwargs):
+        raise ArithmeticError("a fault")
+
+    monkeypatch.setattr(broken, "update", fails, raising=False)
+    for pump in "ab":
+        assert feed(engine, message(f"plant/{pump}", range(50, 100), y[50:], u[50:]))
+    assert "a fault" in engine.units.get(1).failure
+    assert events(engine, "failed")[0]["error"].startswith("ArithmeticError")
+    assert np.array_equal(engine.units.get(2).live.theta, run_of(y, u).theta[-1])
+    engine.act("a", {"do": "restart", "who": "me", "why": "a test"})
+    engine.step(0.0)
+    feed(engine, message("plant/a", range(100, 150), y[:50], u[:50]))
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y[:50], u[:50]).theta[-1])
+
+
+def test_actions_are_part_of_the_journal(tmp_path):
+    y, u = record(300)
+    config = configured()
+    engine = opened(config, tmp_path)
+    feed(engine, message("plant/a", range(100), y[:100], u[:100]))
+    actions = [
+        {"do": "hold", "on": True}, {"do": "hold", "on": False}, {"do": "reset", "p": 1.0, "which": "a1"},
+        {"do": "limits", "limits": {"y": [-0.5, 0.5]}}, {"do": "reset", "p": -1.0}, {"do": "nonsense"},
+    ]  # fmt: skip
+    for k, action in enumerate(actions):
+        engine.act("a", action | {"who": "Ann", "why": "maintenance"})
+        engine.step(0.0)
+        part = slice(100 + 20 * k, 120 + 20 * k)
+        feed(engine, message("plant/a", range(100 + 20 * k, 120 + 20 * k), y[part], u[part]))
+    theta, counts = engine.units.get(1).live.theta, engine.units.get(1).counts
+    assert counts["y outside its limits"] > 10
+    engine.journal.close()  # nothing of the state was stored
+    engine = opened(config, tmp_path)
+    assert engine.recovered == 100 + 6 * 21
+    assert np.array_equal(engine.units.get(1).live.theta, theta)
+    assert engine.units.get(1).counts == counts
+    found = events(engine, "action")
+    assert [(one["do"], one["who"], "refused" in one) for one in found] == [
+        ("hold", "Ann", False), ("hold", "Ann", False), ("reset", "Ann", False), ("limits", "Ann", False),
+        ("reset", "Ann", True), ("nonsense", "Ann", True),
+    ]  # fmt: skip
+    engine.close()
+
+
+ALARM = UNIT + 'alarm = { every = 2000, on = ["band", "innovation", "glr"], reference = 300 }\n'
+
+
+def test_alarms_from_a_frozen_reference(tmp_path):
+    y, u = record(900)
+    for t in range(600, 900):
+        y[t] = 0.8 * y[t - 1] - 0.5 * u[t - 1]
+    config = configured(ALARM)
+    engine = opened(config, tmp_path)
+    feed(engine, message("plant/a", range(300), y[:300], u[:300]))
+    deadline = time.monotonic() + 60
+    while not engine.units.get(1).calibrated and time.monotonic() < deadline:
+        engine.step(0.1)
+    rules = [alarm.rule for alarm in engine.units.get(1).live.alarms]
+    assert [rule.kind for rule in rules] == ["band", "innovation", "glr"]
+    run = track(MODEL.bind(["u"]), TRACKER, y[:300], u[:300], time=np.arange(300.0), dt=1.0)
+    assert rules == [run.detect(kind, reference=300, every=6000).rule for kind in ("band", "innovation", "glr")]
+    for k in range(300, 900, 100):
+        feed(engine, message("plant/a", range(k, k + 100), y[k : k + 100], u[k : k + 100]))
+    found = events(engine, "alarm")
+    assert {one["kind"] for one in found} == {"band", "innovation", "glr"}
+    assert min(one["time"] for one in found) > 600
+    assert not engine.units.get(1).acknowledged
+    before = [alarm.plain() for alarm in engine.units.get(1).live.alarms]
+    engine.journal.close()
+    engine = opened(config, tmp_path)
+    assert [alarm.plain() for alarm in engine.units.get(1).live.alarms] == before
+    assert len(events(engine, "alarm")) == len(found)
+    engine.close()
+
+
+def test_a_full_disk_holds_back_and_loses_nothing(tmp_path):
+    y, u = record(100)
+    engine = opened(configured(), tmp_path)
+    feed(engine, message("plant/a", range(50), y[:50], u[:50]))
+    settled(engine)
+    pages = engine.journal.db.execute("pragma page_count").fetchone()[0]
+    engine.journal.db.execute(f"pragma max_page_count = {pages}")
+    waits = []
+
+    def waited(seconds):
+        waits.append(engine.problem)
+        engine.journal.db.execute("pragma max_page_count = 1000000")
+        return False
+
+    engine._stop.wait = waited
+    wide = message("plant/a", range(50, 100), y[50:], u[50:], other=["x" * 200] * 50)
+    for k in range(40):  # other units until the file is full
+        engine.intake.put("web", message(f"plant/x{k}", range(50), y[:50], u[:50]))
+    assert feed(engine, wide)
+    assert "full" in waits[0]
+    assert engine.problem == ""
+    assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
+    engine.close()
+
+
+def test_a_torn_write_leaves_a_whole_journal(tmp_path):
+    y, u = record(400)
+    config = configured()
+    engine = opened(config, tmp_path / "whole")
+    for k in range(0, 400, 10):
+        feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
+    rng = np.random.default_rng(5)
+    wal = (tmp_path / "whole" / "driftfit.db-wal").read_bytes()
+    run, lengths = run_of(y, u), []
+    for attempt in range(8):
+        torn = tmp_path / f"torn{attempt}"
+        torn.mkdir()
+        shutil.copy(tmp_path / "whole" / "driftfit.db", torn / "driftfit.db")
+        cut = int(rng.integers(len(wal) // 4, len(wal)))
+        (torn / "driftfit.db-wal").write_bytes(wal[:cut] + rng.bytes(3000 * (attempt % 2)))
+        again = opened(config, torn)
+        times, _ = again.journal.rows_of(1)
+        assert times == list(range(len(times)))
+        if times:
+            assert np.array_equal(again.units.get(1).live.theta, run.theta[len(times) - 1])
+        lengths.append(len(times))
+        again.close()
+    assert len(set(lengths)) > 3
+    engine.close()
+
+
+def test_a_unit_that_floods_is_cut_off_alone(tmp_path):
+    y, u = record(200)
+    engine = opened(configured(UNIT + "rate = 10\n"), tmp_path)
+    feed(engine, message("plant/a", range(90), y[:90], u[:90]))
+    feed(engine, message("plant/a", range(90, 190), y[90:190], u[90:190]))
+    feed(engine, message("plant/b", range(90), y[:90], u[:90]))
+    assert engine.units.get(1).counts == {"samples": 90, "used": 89, "flood": 100}
+    assert engine.units.get(2).counts["samples"] == 90
+    engine.close()
+
+
+def test_the_queue_is_bounded():
+    y, u = record(100)
+    intake = Intake(150)
+    assert intake.put("a", message("plant/a", range(100), y, u))
+    second = threading.Thread(target=intake.put, args=("a", message("plant/a", range(100), y, u)), daemon=True)
+    second.start()
+    time.sleep(0.1)
+    assert second.is_alive()
+    assert intake.waiting == 100
+    assert len(intake.take(1000, 0.0).batches) == 1
+    second.join(5)
+    assert intake.waiting == 100
+    assert intake.held_back == 1
+    intake.close()
+    intake.put("a", Batch([]))
+
+
+def test_topics_that_no_unit_has(engine):
+    y, u = record(10)
+    for topic in ("other/a", "plant/", "plant/a/b", "plant/\x07", "x" * 300, ""):
+        assert feed(engine, message(topic, range(10), y, u))
+    assert engine.units.refused["no unit for the topic"] == 60
+    assert len(engine.units) == 0
+    engine.units.most = 2
+    for k in range(5):
+        feed(engine, message(f"plant/{k}", range(10), y, u))
+    assert len(engine.units) == 2
+    assert engine.units.refused["too many units"] == 3
+
+
+def test_old_journals_become_parquet(tmp_path):
+    import polars as pl
+
+    y, u = record(100)
+    engine = opened(configured(), tmp_path)
+    for k in range(0, 100, 10):
+        feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
+    engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
+    engine.step(0.0)
+    assert export(tmp_path, engine.journal.floor(), time.time() + 1) == 0  # the states are not stored
+    engine._store_states(everything=True)
+    engine._commit()
+    engine._archive.options = engine.config.service.__class__(keep=-1.0)
+    engine._archive._looked = -1e9
+    for _ in range(100):
+        engine._archive.forget(engine._pending, engine.journal, engine.next)
+        engine._commit()
+        if not engine.journal.rows_of(1)[0]:
+            break
+        time.sleep(0.05)
+    table = pl.concat(pl.read_parquet(file) for file in sorted((tmp_path / "journal").glob("*.parquet")))
+    samples = table.filter(pl.col("action").is_null())
+    assert samples["time"].to_list() == list(range(100))
+    run = run_of(*np.array(samples["values"].to_list()).T)
+    assert np.array_equal(run.theta[-1], engine.units.get(1).live.theta)
+    engine.close()
+    engine = opened(configured(), tmp_path)
+    assert engine.next == 102
+    feed(engine, message("plant/a", [100.0], [0.0], [0.0]))
+    assert engine.units.get(1).counts["samples"] == 101
+    engine.close()
+
+
+def test_a_folder_of_another_configuration_is_refused(tmp_path):
+    y, u = record(10)
+    engine = opened(configured(UNIT + UNIT.replace("plant", "other")), tmp_path)
+    feed(engine, message("other/a", range(10), y, u))
+    engine.close()
+    with pytest.raises(ValueError, match="use another folder"):
+        opened(configured(), tmp_path)
+
+
+def test_a_state_that_cannot_be_read_stops_its_unit_alone(tmp_path):
+    y, u = record(50)
+    engine = opened(configured(), tmp_path)
+    for pump in "ab":
+        feed(engine, message(f"plant/{pump}", range(50), y, u))
+    engine._store_states(everything=True)
+    engine._commit()
+    engine.close()
+    with sqlite3.connect(tmp_path / "driftfit.db") as db:
+        db.execute("update snapshot set state = x'00' where unit = 1")
+    db.close()
+    engine = opened(configured(), tmp_path)
+    assert "cannot be read" in engine.units.get(1).failure
+    assert np.array_equal(engine.units.get(2).live.theta, run_of(y, u).theta[-1])
+    engine.close()

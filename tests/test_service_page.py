@@ -1,0 +1,314 @@
+"""The page and the HTTP interface: who may do what, bounds, downsampling, and a real browser."""
+
+import asyncio
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import polars as pl
+import pytest
+
+pytest.importorskip("starlette", reason="the page needs driftfit[serve]")
+pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
+
+import browser
+from service_support import configured, feed, message, opened, record, settled
+
+from driftfit.service.control import Control
+from driftfit.service.page import history
+from driftfit.service.page.app import Page
+from driftfit.service.page.feed import Feed
+from driftfit.service.page.passwords import Sessions, hashed, new_token, password_fits, token_fits
+from driftfit.service.settings.options import PageOptions, UserOptions
+
+TOKEN, HASH = (line.split(": ")[1] for line in new_token())
+WATCHER = [line.split(": ")[1] for line in new_token()]
+PASSWORD = hashed("a long password")
+USERS = [
+    UserOptions("Ann", "operator", PASSWORD), UserOptions("robot", "operator", token=HASH),
+    UserOptions("screen", "viewer", token=WATCHER[1]),
+]  # fmt: skip
+
+
+class Client:
+    """Requests to an application, without a network."""
+
+    def __init__(self, app, host="localhost:8765"):
+        self.app, self.host = app, host
+
+    def __call__(self, method, path, body=b"", **headers):
+        path, _, query = path.partition("?")
+        body = body if isinstance(body, bytes) else json.dumps(body).encode()
+        given = {"host": self.host, "content-length": str(len(body))} | {
+            k.replace("_", "-"): v for k, v in headers.items()
+        }
+        scope = {
+            "type": "http", "method": method, "path": path, "raw_path": path.encode(), "query_string": query.encode(),
+            "headers": [(k.encode(), v.encode()) for k, v in given.items()], "client": ("10.0.0.1", 1),
+            "scheme": "http", "server": ("localhost", 8765), "root_path": "", "http_version": "1.1", "state": {},
+        }  # fmt: skip
+        sent, waiting = [], [{"type": "http.request", "body": body, "more_body": False}]
+
+        async def receive():
+            if not waiting:
+                await asyncio.sleep(60)  # the client stays
+            return waiting.pop(0)
+
+        async def send(message):
+            sent.append(message)
+
+        asyncio.run(self.app(scope, receive, send))
+        self.headers = {k.decode(): v.decode() for k, v in sent[0]["headers"]}
+        return sent[0]["status"], b"".join(one.get("body", b"") for one in sent)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory):
+    """An engine with two units and 400 samples each, and a feed over its folder."""
+    folder = tmp_path_factory.mktemp("service")
+    y, u = record()
+    engine = opened(configured(), folder)
+    for pump in ("a", "b c"):
+        feed(engine, message(f"plant/{pump}", range(400), y, u))
+    settled(engine)
+    control = Control(engine, folder / "c", engine.status)
+    control.start()
+    found = Feed(folder, folder / "c")
+    found.look()
+    found.rank()
+    yield engine, found, folder
+    control.close()
+    engine.close()
+
+
+@pytest.fixture
+def client(service):
+    _, found, folder = service
+    return lambda host="localhost:8765", **options: Client(
+        Page(PageOptions(**options), found, Sessions(folder)).app(), host
+    )
+
+
+def test_what_the_interface_says(service, client):
+    ask = client()
+    status, body = ask("GET", "/api/units")
+    assert status == 200
+    assert {one["unit"] for one in json.loads(body)["units"]} == {"a", "b c"}
+    assert "default-src 'self'" in ask.headers["content-security-policy"]
+    status, body = ask("GET", "/api/units/b c")
+    found = json.loads(body)
+    assert found["now"]["theta"]["a1"] == service[0].units.get(2).live.theta[0]
+    assert found["state"]["counts"]["samples"] == 400
+    assert ask("GET", "/api/units/nobody")[0] == 404
+    assert b"driftfit_units 2" in ask("GET", "/metrics")[1] or b"driftfit_samples_total" in ask("GET", "/metrics")[1]
+    assert b"<title>driftfit</title>" in ask("GET", "/")[1]
+    about = json.loads(ask("GET", "/api/openapi.json")[1])
+    routes = {
+        one.path.replace("{unit:path}", "{id}").replace(":path", "") for one in ask.app.routes if "api/" in one.path
+    }
+    assert {path for path in about["paths"] if "api" in path} | {"/api/openapi.json"} == routes
+
+
+def test_exports_and_history_are_the_samples(service, client):
+    engine = service[0]
+    ask, live = client(), engine.units.get(1).live
+    table = pl.read_csv(ask("GET", "/api/export?unit=a&format=csv")[1])
+    arrow = pl.read_ipc(io.BytesIO(ask("GET", "/api/export?unit=a&format=arrow")[1]))
+    assert table.columns[:5] == ["time", "y", "y_hat", "e", "e_std"]
+    assert arrow.shape == (400, 9)
+    assert np.array_equal(arrow["a1"][-1:], live.theta[:1])
+    part = pl.read_ipc(io.BytesIO(ask("GET", "/api/export?unit=a&format=arrow&from=100&to=109")[1]))
+    assert part["time"].to_list() == list(range(100, 110))
+    for points in (20, 100, 400):
+        told = json.loads(ask("GET", f"/api/history?unit=a&points={points}")[1])
+        assert told["count"] == 400
+        assert len(told["mean"][0]) <= points
+        low, high, mean = (np.array(told[name][1], float) for name in ("low", "high", "mean"))
+        assert (min(low), max(high)) == (min(arrow["y"]), max(arrow["y"]))
+        assert (low <= mean + 1e-12).all()
+        assert (mean <= high + 1e-12).all()
+    assert ask("GET", "/api/export?unit=a&format=exe")[0] == 400
+    assert ask("GET", "/api/history?unit=a&points=many")[0] == 400
+
+
+def test_a_million_samples_are_reduced_by_blocks(tmp_path):
+    engine = opened(configured(), tmp_path)
+    feed(engine, message("plant/a", range(2), [0, 1], [0, 1]))
+    rng, db = np.random.default_rng(0), engine.journal.db
+    db.execute("begin")
+    for k in range(2000):
+        values = np.column_stack([np.arange(64.0) + 64 * k, rng.normal(size=(64, 8))])
+        row = (1, 100 + 64 * k, 163 + 64 * k, values[0, 0], values[-1, 0], 64, values.tobytes())
+        db.execute("insert into block values (?, ?, ?, ?, ?, ?, ?, ?)", (*row, history.extremes_of(values).tobytes()))
+    db.execute("commit")
+    begun = time.process_time()
+    told = history.reduced(engine.journal, 1, [], -np.inf, np.inf, 500)
+    assert time.process_time() - begun < 2.0
+    assert told["count"] == 128_000
+    assert len(told["mean"][1]) == 500
+    assert abs(np.mean(told["mean"][1])) < 0.02
+    engine.close()
+
+
+def test_a_program_on_this_machine_needs_no_password_and_a_foreign_page_cannot_act(service, client):
+    engine = service[0]
+    act = {"unit": "a", "do": "hold", "on": True, "why": "cleaning the sensor"}
+    ask = client()
+    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}):
+        assert ask("POST", "/api/actions", act, **headers)[0] == 403
+    assert client("evil.example")("GET", "/api/units")[0] == 421
+    assert ask("POST", "/api/actions", act | {"why": ""})[0] == 400
+    assert ask("POST", "/api/actions", act | {"do": "shutdown"})[0] == 400
+    assert ask("POST", "/api/actions", b"[" * 50_000)[0] == 400
+    assert ask("POST", "/api/actions", act | {"unit": "nobody"})[0] == 404
+    assert engine.intake.take(10, 0.0).actions == []
+
+
+def test_roles(client):
+    ask = client(user=USERS)
+    act = {"unit": "a", "do": "acknowledge", "why": "seen"}
+    assert ask("GET", "/api/units")[0] == 401
+    assert ask("GET", "/", accept="text/html")[0] == 303
+    assert ask("GET", "/healthz")[0] in (200, 503)
+    viewer, robot = {"authorization": f"Bearer {WATCHER[0]}"}, {"authorization": f"Bearer {TOKEN}"}
+    assert ask("GET", "/api/units", **viewer)[0] == 200
+    assert ask("POST", "/api/actions", act, **viewer)[0] == 403
+    assert ask("POST", "/api/samples", {}, **viewer)[0] == 403
+    assert ask("POST", "/api/actions", {"unit": "a"}, **robot)[0] == 400
+    assert ask("GET", "/api/units", authorization="Bearer wrong")[0] == 401
+
+
+def test_sessions(client):
+    ask = client(user=USERS)
+    wrong = {"name": "Ann", "password": "not this one"}
+    assert ask("POST", "/api/login", wrong)[0] == 401
+    assert ask("POST", "/api/login", wrong | {"name": "nobody"})[0] == 401
+    status, body = ask("POST", "/api/login", {"name": "Ann", "password": "a long password"})
+    assert (status, json.loads(body)["role"]) == (200, "operator")
+    cookie = ask.headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=strict" in cookie
+    session = {"cookie": cookie.partition(";")[0]}
+    assert ask("GET", "/api/me", **session)[0] == 200
+    act = {"unit": "a", "do": "no", "why": "seen"}
+    assert ask("POST", "/api/actions", act, **session)[0] == 403  # no Origin
+    assert ask("POST", "/api/actions", act, origin="http://localhost:8765", **session)[0] == 400
+    forged = {"cookie": session["cookie"][:-2] + "00"}
+    assert ask("GET", "/api/me", **forged)[0] == 401
+    for _ in range(15):
+        status, _ = ask("POST", "/api/login", wrong | {"password": "short"})
+    assert status == 429
+
+
+def test_passwords():
+    assert password_fits("a long password", PASSWORD)
+    assert not password_fits("a long passwore", PASSWORD)
+    assert not password_fits("a", "scrypt$x")
+    assert token_fits(TOKEN, HASH)
+    assert not token_fits(TOKEN + "x", HASH)
+    with pytest.raises(ValueError, match="at least 10"):
+        hashed("short")
+    with pytest.raises(ValueError, match="TLS"):
+        PageOptions(host="0.0.0.0", user=USERS)
+
+
+def test_bounds(client):
+    ask = client(body=1000)
+    assert ask("POST", "/api/samples", b"x" * 2000)[0] == 413
+    assert ask("POST", "/api/samples", b"x" * 2000, content_length="10")[0] == 413
+    assert ask("POST", "/api/samples", b"x", content_length="-1")[0] == 413
+    ask = client(requests=5.0)
+    assert {ask("GET", "/healthz")[0] for _ in range(20)} == {200, 429} or ask("GET", "/healthz")[0] == 429
+
+
+def test_fuzzed_requests(service, client, monkeypatch):
+    monkeypatch.setattr(service[1], "control", service[2] / "nobody")  # nothing waits for the engine
+    ask, rng = client(requests=1e9), np.random.default_rng(2)
+    paths = ["/ws", "/static/../app.py", "/static/%2e%2e/app.py", "/metrics", "/login", "/api/samples/\x00"]
+    paths += [f"/api/{one}" for one in ("units", "units/", "history", "export", "events", "actions", "login")]
+    names = ["unit", "from", "to", "points", "limit", "format"]
+    seen = set()
+    for _ in range(1000):
+        path = str(rng.choice(paths)) + "?" + "&".join(
+            f"{rng.choice(names)}={''.join(map(chr, rng.integers(33, 500, 8)))}"
+            for _ in range(int(rng.integers(0, 4)))
+        ).replace("#", "").encode("ascii", "replace").decode()  # fmt: skip
+        status, _ = ask(str(rng.choice(["GET", "POST", "PUT", "HEAD"])), path, rng.bytes(int(rng.integers(0, 60))))
+        seen.add(status)
+    assert max(seen) < 504
+    assert 500 not in seen
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def started(port):
+    command = [sys.executable, "-m", "driftfit", "serve", "--demo", "--port", str(port)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 90
+    while time.monotonic() < until:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=2):
+                return process
+        except (urllib.error.URLError, OSError):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.2)
+    raise TimeoutError
+
+
+def stopped(process):
+    process.send_signal(signal.SIGTERM)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, said
+    return [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+
+
+@pytest.mark.skipif(browser.PROGRAM is None, reason="needs Chromium")
+def test_the_demo_in_a_browser(tmp_path):
+    pytest.importorskip("websockets", reason="the browser is driven by WebSocket")
+    pytest.importorskip("uvicorn", reason="the page needs driftfit[serve]")
+    port = free_port()
+    process = started(port)
+    page = browser.Browser()
+    try:
+        page.open(f"http://127.0.0.1:{port}/")
+        page.until("document.querySelectorAll('#units tbody tr').length === 6", 60)
+        page.until("document.querySelector('#units tbody tr').dataset.unit === 'pump 3'", 60)  # its valve closes
+        page.key("ArrowDown")
+        page.key("Enter")
+        page.until("document.querySelectorAll('.chart canvas').length === 5")
+        page.until("document.querySelector('#events .bad')?.textContent === 'alarm'", 60)
+        page.picture(tmp_path / "unit.png")
+        assert pl.Series((tmp_path / "unit.png").read_bytes()).n_unique() > 100  # something is drawn
+        page.value("[...document.querySelectorAll('#buttons button')].find(b => b.textContent === 'Hold').click()")
+        page.value(
+            "document.querySelector('[name=why]').value = 'a test'; document.querySelector('[value=do]').click()"
+        )
+        page.until("document.querySelector('#badges').textContent.includes('held')")
+        page.until("document.querySelector('#events').textContent.includes('a test')")
+        page.key("Escape")
+        page.until("!document.querySelector('#fleet').hidden")
+        assert page.console == []
+        logs = stopped(process)
+        assert any(one["message"] == "alarm" and one["unit"] == "pump 3" for one in logs)
+        page.until("document.querySelector('#link').textContent === 'reconnecting'")
+        process = started(port)
+        page.until("document.querySelector('#link').textContent === 'live'", 60)
+        page.until("document.querySelectorAll('#units tbody tr').length === 6", 60)
+    finally:
+        page.close()
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGTERM)
+            process.wait(60)
+        process.stderr.close()
