@@ -1,15 +1,18 @@
 """A Kalman filter that estimates its own settings: drift ratio, noise variance and jumps, from the data as they arrive.
 
-K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k r / c_i`` a nominal sample,
-where r is the present noise variance and c_i the mean square of regressor i, so ratio_k is the share of r that the
-drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. The filters are the
-modes of a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
+K random-walk filters run side by side. Filter k lets parameter i drift by ``q_ki = ratio_k w_ki r / c_i`` a nominal
+sample, where r is the present noise variance and c_i the mean square of regressor i, so ratio_k w_ki is the share of r
+that the drift of one parameter adds to the output per sample, whatever the units. The first ratio is 0. All weights w
+are 1 for one half of the filters; for the others they are learned from the record
+(`driftfit.trackers.parts.modes.weights`), so that parameters may drift at different rates. The filters are the modes of
+a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
 the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
 proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
-(`driftfit.trackers.parts.modes.ladder`), or more noise.
+(`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
+out too (`driftfit.trackers.parts.frozen`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -18,11 +21,11 @@ The start is exact diffuse least squares without drift, in which regressors out 
 there are enough residuals to estimate r. The filters then start from there, in the directions that the regressors span
 by then. Scaling inputs or outputs changes only the units.
 
-Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Two groups of parameters with
-very different rates are tracked at one common rate unless ``groups`` is given.
+Use it if nothing is known; if q and r are known, `Kalman` is as good and far cheaper. Which parameters drift is learned
+in a few hundred samples; ``groups`` tells it from the start.
 
 Source: interacting multiple models are Blom and Bar-Shalom (1988); the ladder of ratios, its transitions, the noise
-levels and the scaling are ours. Cost per sample: O(K n^2 + K J) for K modes and J levels.
+levels and the scaling are ours. Cost per sample: O(K^2 n^2 + K J) for K modes and J levels; K = 16 without groups.
 """
 
 from __future__ import annotations
@@ -49,6 +52,7 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
+from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
@@ -60,6 +64,7 @@ from driftfit.trackers.parts.modes.filters import (
 )
 from driftfit.trackers.parts.modes.ladder import filters, mix
 from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
+from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
@@ -119,6 +124,7 @@ def follow(s: State, entering: int, l: int) -> None:
         s.y_hat[l] = prediction(s, l)
         s.e[l], s.s[l] = s.y[l] - s.y_hat[l], np.inf
     leave_out(s, l)
+    leave_out_frozen(s, l)
     s.odd[l], s.weighed[l] = 0.0, 0
     column = entering if entering >= 0 else outgrown(s, l)
     if s.ok[l] > 0.0 and column >= 0:
@@ -127,6 +133,7 @@ def follow(s: State, entering: int, l: int) -> None:
         s.weighed[l] = 1
         weigh(s, l)
         update_filters(s, l)
+        learn_weights(s, l)
         learn_noise(s, l)
     learn_scales(s, l)
     learn(s, l, s.odd[l])
@@ -193,7 +200,8 @@ class AdaptiveKalman(Tracker):
     Parameters
     ----------
     groups : sequence of sequences of indices, or None
-        Parameters with separate drift rates, such as ``[[0, 1], [2]]``. None: one rate for all.
+        Parameters that drift together, such as ``[[0, 1], [2]]``: each group has filters in which it alone drifts.
+        None: only what is learned from the record.
 
     Raises
     ------
@@ -247,13 +255,17 @@ class AdaptiveKalman(Tracker):
             **no_excitation(n),
             **no_proportion(),
             **unresolved(),
+            **not_frozen(),
+            **no_weights(n),
             **modes,
             **levels,
         }
 
     @property
     def steps(self) -> TrackerSteps:
-        return TrackerSteps(predict, correct, report, begin, keep_density, note=note, machines=FRAME, doubts=True)
+        return TrackerSteps(
+            predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
+        )
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
@@ -286,7 +298,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

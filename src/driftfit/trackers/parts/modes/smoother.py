@@ -22,7 +22,7 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.modes.ladder import TOP
 from driftfit.trackers.parts.noise_levels import level_chain
 
-NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled")
+NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight")
 """Fields that a run notes at every sample."""
 
 
@@ -37,6 +37,7 @@ def note(o: State, s: State, l: int) -> None:
         o.nu[j, l] = s.nu[j, l]
     for i in range(s.c.shape[0]):
         o.c[i, l] = s.c[i, l]
+        o.weight[i, l] = s.weight[i, l]
     o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
     o.leapt[l], o.weighed[l], o.settled[l] = s.leapt[l], s.weighed[l], s.settled[l]
 
@@ -58,10 +59,12 @@ def varying(noted: Mapping[str, Array], e: Array, time: Array, state: Mapping[st
     running, weighed = noted["settled"] > 0, noted["weighed"] > 0
     r = np.where(running, noted["r"], noted["r"][np.argmax(running)])
     after = np.where(weighed[:, None], noted["joint"].sum(axis=1), noted["prior"])
-    w, span, ratio = given_all(after, state["transition"], weighed), r * time, state["ratio"]
+    w, span, learned = given_all(after, state["transition"], weighed), r * time, state["learned"]
+    ratio = np.where(learned > 0.0, 0.0, state["ratio"])
     with np.errstate(divide="ignore", invalid="ignore"):
         leapt = np.where(weighed, noted["leapt"] / span, 0.0)
-        q = (w @ ratio.T + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / noted["c"]
+        drift = w @ ratio.T + (w @ learned)[:, None] * noted["weight"]
+        q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / noted["c"]
     q = np.where(running[:, None] & (span[:, None] > 0.0) & (noted["c"] > 0.0), q, 0.0)
     levels = given_all(noted["nu"][:, :-1], level_chain(), weighed)
     v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], noted["coarse"][:, None]), axis=1)

@@ -1,0 +1,166 @@
+"""Weights of the drift of the single parameters, learned from the scores of the disturbance smoother.
+
+With p_i the drift that the mixture assumes for parameter i, in units of r / c_i, and e, 1 / s and k the innovation, its
+inverse variance and the gain of the mixture, a backward pass over the last samples gives
+
+    r <- phi e / s + (I - phi k') r,        N <- phi phi' / s + (I - phi k') N (I - k phi')
+
+If the parameters drift by rho instead of p, the mean of r_i^2 - N_ii is sum_j N_ij^2 (rho_j - p_j), so rho is estimated
+as the non-negative solution of
+
+    sum_j A_ij rho_j = b_i,    A_ij = sum N_ij^2,    b_i = sum (r_i^2 - N_ii + sum_j N_ij^2 p_j)
+
+whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, of which
+later samples tell what moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j rho_j
+(`driftfit.trackers.parts.modes.ladder`).
+
+Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
+arrive, is ours. Cost per sample: O(n^2).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, cubes, kernel, machine, shared
+
+BLOCK, WINDOW = 50, 100
+"""Samples between two passes, and samples of a pass."""
+FADE = 0.97
+"""Factor of the sums at every pass."""
+SWEEPS = 20
+"""Sweeps over the parameters for the solution."""
+FLOOR = 0.01
+"""Least weight."""
+TINY = 1e-300
+
+E, PRECISION, SPAN, MORE = 0, 1, 2, 3
+"""What is remembered of a sample after its regressor and gain: the innovation over its variance, the inverse variance
+(both in units of r), and the intervals of drift."""
+ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, CURVATURE = 0, 1, 2, 3, 4, 5
+"""Rows (n,) of the estimation: p, b, the weights, r, N k; then A, and N."""
+
+
+def no_weights(n: int) -> dict[str, Any]:
+    """Fields before the first sample."""
+    return {
+        "past": np.zeros((WINDOW, 2 * n + MORE)),
+        "remembered": 0,
+        "scores": np.zeros((CURVATURE + 2 * n, n)),
+        "weight": np.ones(n),
+    }
+
+
+@shared
+def step_back(past: Array, at: int, t: Array) -> None:
+    """One step back of r and N."""
+    n = t.shape[1]
+    N = CURVATURE + n
+    move, more = past[at, 2 * n + E], past[at, 2 * n + PRECISION]
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += t[N + i, j] * past[at, n + j]
+        t[SHIFT, i] = total
+    for i in range(n):
+        move -= past[at, n + i] * t[ADJOINT, i]
+        more += past[at, n + i] * t[SHIFT, i]
+    for i in range(n):
+        t[ADJOINT, i] += past[at, i] * move
+        for j in range(i + 1):
+            t[N + i, j] += past[at, i] * past[at, j] * more - past[at, i] * t[SHIFT, j] - t[SHIFT, i] * past[at, j]
+            t[N + j, i] = t[N + i, j]
+
+
+@shared
+def look_back(past: Array, newest: int, t: Array) -> None:
+    """Add the sums of the oldest block."""
+    n = t.shape[1]
+    A, N = CURVATURE, CURVATURE + n
+    for i in range(n):
+        t[ADJOINT, i] = 0.0
+        t[SLOPE, i] *= FADE
+        for j in range(n):
+            t[N + i, j] = 0.0
+            t[A + i, j] *= FADE
+    for back in range(WINDOW):
+        at = (newest + WINDOW - back) % WINDOW
+        step_back(past, at, t)
+        if back >= WINDOW - BLOCK:
+            span = past[at, 2 * n + SPAN]
+            for i in range(n):
+                t[SLOPE, i] += span * (t[ADJOINT, i] * t[ADJOINT, i] - t[N + i, i])
+                for j in range(n):
+                    square = span * span * t[N + i, j] * t[N + i, j]
+                    t[A + i, j] += square
+                    t[SLOPE, i] += square * t[ASSUMED, j]
+
+
+@shared
+def solve(t: Array) -> None:
+    """Weights, from the sums."""
+    n, A = t.shape[1], CURVATURE
+    for i in range(n):
+        t[WEIGHT, i] = max(t[SLOPE, i], 0.0) / (t[A + i, i] + TINY)
+    for _ in range(SWEEPS):
+        for i in range(n):
+            rest = t[SLOPE, i]
+            for j in range(n):
+                rest -= t[A + i, j] * t[WEIGHT, j]
+            t[WEIGHT, i] = max(0.0, t[WEIGHT, i] + rest / (t[A + i, i] + TINY))
+    most = 0.0
+    for i in range(n):
+        most = max(most, t[WEIGHT, i])
+    for i in range(n):
+        t[WEIGHT, i] = max(t[WEIGHT, i] / most, FLOOR) if most > 0.0 else 1.0
+
+
+@machine
+def machine_weights(past: int, newest: int, scores: int, n: int, L: int, l: int) -> None:
+    """A pass for lane l of L, from the addresses of fields."""
+    t = cubes(scores, CURVATURE + 2 * n, n, L)[:, :, l]
+    look_back(cubes(past, WINDOW, 2 * n + MORE, L)[:, :, l], newest, t)
+    solve(t)
+
+
+@kernel
+def remember(s: State, at: int, l: int) -> None:
+    """A sample that the filters took, in units of r and c; s.d is scratch here."""
+    n, K = s.theta.shape[0], s.mu.shape[0]
+    e, precision = 0.0, 0.0
+    for k in range(K):
+        e += s.mu[k, l] * s.step[k, l]
+        precision += s.mu[k, l] * s.row[k, l]
+    for i in range(n):
+        gain, assumed = 0.0, 0.0
+        for k in range(K):
+            gain += s.mu[k, l] * s.row[k, l] * s.gain[i, k, l]
+            assumed += s.prior[k, l] * s.ratio[i, k, l]
+        s.d[i, l] = gain
+        s.scores[ASSUMED, i, l] += (assumed - s.scores[ASSUMED, i, l]) / BLOCK
+    for i in range(n):
+        gain, unit = 0.0, np.sqrt(s.c[i, l])
+        for j in range(i, n):
+            gain += s.R[i, j, l] * s.d[j, l]
+        s.past[at, i, l] = s.phi[i, l] / unit if unit > 0.0 else 0.0
+        s.past[at, n + i, l] = gain * unit
+    s.past[at, 2 * n + E, l] = e * np.sqrt(s.r[l])
+    s.past[at, 2 * n + PRECISION, l] = precision * s.r[l]
+    s.past[at, 2 * n + SPAN, l] = s.dt[l] * s.drift[l]
+
+
+@kernel
+def learn_weights(s: State, l: int) -> None:
+    """Remember a sample, and look back at the end of a block."""
+    n, L = s.d.shape
+    at = s.remembered[l] % WINDOW
+    remember(s, at, l)
+    s.remembered[l] += 1
+    if s.remembered[l] >= WINDOW and s.remembered[l] % BLOCK == 0:
+        machine_weights(s.past.ctypes.data, at, s.scores.ctypes.data, n, L, l)
+        for i in range(n):
+            s.weight[i, l] = s.scores[WEIGHT, i, l]
+            for k in range(s.mu.shape[0]):
+                s.ratio[i, k, l] = s.learned[k, l] * s.weight[i, l] if s.learned[k, l] > 0.0 else s.ratio[i, k, l]
