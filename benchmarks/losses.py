@@ -11,7 +11,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from driftfit import AdaptiveKalman
-from driftfit.trackers.parts import drift_ladder, noise_levels
+from driftfit.trackers.parts import noise_levels
+from driftfit.trackers.parts.modes import ladder
 from lab.bench.contestants import run
 from lab.bench.records import simulated
 from lab.bench.scores import parameter_error
@@ -43,9 +44,9 @@ def main() -> None:
     plain = AdaptiveKalman()
     for name, kinds in {"no_drift": ("regression", "arx"), **LEARNED}.items():
         for kind in kinds:
-            ladder = {"UP": 0.0, "JUMP": 0.0} if name == "no_drift" else {"LADDER": (RATIO,) * len(drift_ladder.LADDER)}
+            other = {"UP": 0.0, "JUMP": 0.0} if name == "no_drift" else {"LADDER": (RATIO,) * len(ladder.LADDER)}
             base = errors(plain, name, kind)
-            with told(drift_ladder, **ladder):
+            with told(ladder, **other):
                 one = np.median(errors(plain, name, kind) / base)
                 with told(noise_levels, LEVELS=ONE_LEVEL):
                     both = np.median(errors(plain, name, kind) / base)
