@@ -137,7 +137,7 @@ def add_covariance(t: Any, L: int) -> None:
 
 @shared
 def widen_leaf(t: Any, k: int, q: Array) -> None:
-    """C + q of one parent, q being a lower triangle."""
+    """C + q of one parent, q being a lower triangle, which may be overwritten."""
     for i in range(t.n * (t.n + 1) // 2):
         t.parents[FIRST + t.n + i, k] += q[i]
 
@@ -255,11 +255,13 @@ def courses(t: Any, k: int) -> tuple[int, float]:
 @shared
 def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
     """Parent k in the course of one mode."""
-    path, stay, H, Hm = t.path, t.scratch[1], len(t.row), len(t.sensors)
+    path, stay, H, Hm, q = t.path, t.scratch[1], len(t.row), len(t.sensors), t.path[len(t.path) - 1]
     for e in range(H):
         stay[e] = stay[e] / kappa if e // Hm == best else 0.0
     next_event(t, t.sample[IN_DT] == 0.0, stay, k)
-    widen_leaf(t, k, path[2 * H + best])
+    for i in range(t.n * (t.n + 1) // 2):
+        q[i] = path[2 * H + best, i]
+    widen_leaf(t, k, q)
 
 
 @shared
