@@ -14,6 +14,7 @@ Needs river 0.21 or later (``pip install "driftfit[river]"``).
 from __future__ import annotations
 
 from collections import deque
+from sys import getsizeof
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,12 @@ class TrackedRegressor(base.Regressor):
     def intercept(self) -> float:
         """The present intercept; 0 if there is none."""
         return float(self._live.theta[-1]) if self._live is not None and self.fit_intercept else 0.0
+
+    @property
+    def _raw_memory_usage(self) -> int:
+        """Bytes of the state and of the samples that are kept; all models share the compiled code."""
+        state = 0 if self._live is None else sum(value.nbytes for value in self._live.lane().values())
+        return state + sum(getsizeof(x) + getsizeof(0.0) * (len(x) + 1) for x, _ in self._past)
 
     def _widen(self, m: int) -> None:
         """A stream with m columns, for which the samples that are kept are learned again."""

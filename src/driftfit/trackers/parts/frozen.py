@@ -62,7 +62,7 @@ def held_readings(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
     """What a summary says of it: nothing where no sensor was frozen."""
     count = int(lane["held"])
     return (
-        (("Frozen", f"{count} readings that repeat the one before, against all expectation: not used"),)
+        (("Frozen", f"{count} readings that repeat the one before where a change was expected: not used"),)
         if count
         else ()
     )
