@@ -197,7 +197,8 @@ class Pending:
 
 
 def _json(value: Any) -> str:
-    return msgspec.json.encode(value).decode()
+    text: str = msgspec.json.encode(value).decode()
+    return text
 
 
 class Names:

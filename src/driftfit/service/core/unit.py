@@ -223,7 +223,8 @@ class Unit:
         live = b"" if self.live is None else zlib.compress(self.live.to_bytes(), 1)
         kept = [live, self.newest, self.waiting, dict(self.counts), self.failure, self.acknowledged, self.calibrated,
                 self.reference.tobytes(), self.limits, self.last, self.seen]  # fmt: skip
-        return msgspec.msgpack.encode(kept)
+        packed: bytes = msgspec.msgpack.encode(kept)
+        return packed
 
     @classmethod
     def of(cls, number: int, name: str, settings: UnitSettings, state: bytes) -> Unit:

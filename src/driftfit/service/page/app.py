@@ -274,7 +274,8 @@ class Said(JSONResponse):
     """JSON by msgspec, which writes NaN as null."""
 
     def render(self, content: Any) -> bytes:
-        return msgspec.json.encode(content)
+        text: bytes = msgspec.json.encode(content)
+        return text
 
 
 def _number(request: Request, name: str, default: float) -> float:
