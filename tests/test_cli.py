@@ -219,6 +219,14 @@ def test_values():
     assert kalman == Kalman(q=(1e-4, 0.0), r=0.1, p0=None, theta0=-1.0)
     assert arguments.parse_model("ARX:2,1/2,nk=0/1,intercept") == ARX(2, (1, 2), (0, 1), intercept=True)
     assert arguments.parse_model("arx: na=2, nb=0") == ARX(2, 0)
+    assert arguments.parse_model("ARX(2, [1, 2], nk=[0, 1])") == ARX(2, (1, 2), (0, 1))
+    assert arguments.parse_model("ARX(1, 1)", ["a", "b"]).outputs == ("a", "b")
+    assert arguments.parse_tracker("Kalman(q=1e-4, r=0.1)", []) == Kalman(q=1e-4, r=0.1)
+    for wrong in ("Kalman(q=1)", "__import__('os')", "ARX(open('f'))", "ARX(*[1])", "ARX(na=oops)"):
+        with pytest.raises(ValueError, match=r"not a model|there is no|not allowed|not a number"):
+            arguments.parse_model(wrong)
+    with pytest.raises(ValueError, match="leave -p r=2 out"):
+        arguments.parse_tracker("Kalman(q=1)", ["r=2"])
     for words, basis in (
         ("polynomial/3", Polynomial(3)), ("Legendre/4/-2/2.5", Legendre(4, (-2, 2.5))),
         ("piecewise-linear/-1/0/1", PiecewiseLinear([-1, 0, 1])), ("bspline/2/-1/0/1", BSpline(2, [-1, 0, 1])),

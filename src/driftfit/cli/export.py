@@ -22,9 +22,9 @@ def _languages() -> None:
 
 @export.command(name="c")
 def to_c(
-    model: Annotated[str, typer.Option(help="As in `driftfit track`, such as arx:2,2.")],
+    model: Annotated[str, typer.Option(help="As in `driftfit track`: arx:2,2 or 'ARX(2, 2)'.")],
     out: Annotated[Path, typer.Option(help="The folder to write into.")],
-    tracker: Annotated[str, typer.Option(help="Tracker, as `driftfit trackers` lists them.")] = "adaptive-kalman",
+    tracker: Annotated[str, typer.Option(help="Tracker, by its name or as in Python.")] = "adaptive-kalman",
     p: Annotated[list[str] | None, typer.Option("-p", help="Setting of the tracker; repeat it.")] = None,
     own: Annotated[str | None, typer.Option("--with", metavar="MODULE:CLASS", help="Your own tracker.")] = None,
     fixed_rate: Annotated[bool, typer.Option("--fixed-rate", help="No uneven intervals, no known factors.")] = False,

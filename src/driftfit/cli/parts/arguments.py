@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, fields, replace
 from importlib import import_module
 from typing import Any, TypeVar
 
 import numpy as np
 
 from driftfit import models, trackers
+from driftfit.cli.parts import expressions
 from driftfit.engine.settings import Settings, near
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -48,7 +49,12 @@ def listed(given: Sequence[str] | None) -> list[str]:
 
 
 def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
-    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), with these names if there are several outputs."""
+    """``arx:2,2,nk=1,intercept`` as ARX(2, 2, nk=1, intercept=True), with these names if there are several outputs.
+
+    An expression such as ``ARX(2, 2)`` is read too.
+    """
+    if "(" in text:
+        return _with_outputs(expressions.read(text, Model, models.found()), outputs)  # type: ignore[type-abstract]
     name, _, rest = text.partition(":")
     kind = lookup("model", name, models.found())
     known = {field.name: field for field in given_fields(kind)}
@@ -73,6 +79,17 @@ def parse_model(text: str, outputs: Sequence[str] = ()) -> Model:
     return build(f"--model {text}", kind, settings)
 
 
+def _with_outputs(model: Model, outputs: Sequence[str]) -> Model:
+    """A model whose outputs have these names, if there are several."""
+    if len(outputs) < 2 or model.outputs == tuple(outputs):
+        return model
+    if len(model.outputs) not in (1, len(outputs)) or "ny" not in {field.name for field in given_fields(type(model))}:
+        raise ValueError(
+            f"--model {model!r} has outputs {', '.join(model.outputs)}, but --y names {', '.join(outputs)}."
+        )
+    return replace(model, ny=tuple(outputs))  # type: ignore[type-var]  # every model is a dataclass
+
+
 def parse_units(given: Sequence[str] | None) -> dict[str, str]:
     """``flow=l/min`` as a name and its unit."""
     pairs = {entry: entry.partition("=") for entry in given or []}
@@ -95,7 +112,11 @@ def own_tracker(place: str) -> type[Tracker]:
 
 
 def parse_tracker(name: str, given: Sequence[str], own: str | None = None) -> Tracker:
-    """A tracker from its name, or its place in a user's module, and ``key=value`` settings."""
+    """A tracker from its name, or its place in a user's module, and ``key=value`` settings; or from an expression."""
+    if "(" in name:
+        if given:
+            raise ValueError(f"--tracker {name} has its settings in the brackets; leave -p {given[0]} out.")
+        return expressions.read(name, Tracker, trackers.found())  # type: ignore[type-abstract]
     kind = own_tracker(own) if own else lookup("tracker", name, trackers.found())
     known = [field.name for field in given_fields(kind)]
     settings: dict[str, Any] = {}

@@ -42,11 +42,12 @@ class Given:
         Names,
         typer.Option(
             help="Model and settings by position or name: arx:2,2,nk=1,intercept; one value per input with a slash: "
-            "arx:2,2/1,nk=0/1; regression:intercept. Default: arx:2,2,intercept, without inputs arx:2,0,intercept."
+            "arx:2,2/1,nk=0/1; regression:intercept; or as in Python: 'ARX(2, [2, 1])'. Default: arx:2,2,intercept, "
+            "without inputs arx:2,0,intercept."
         ),
     ] = None
     tracker: Annotated[
-        str, typer.Option(help="Tracker, as `driftfit trackers` lists them; the default needs no settings.")
+        str, typer.Option(help="Tracker, as `driftfit trackers` lists them, or as in Python: 'Kalman(q=1e-4, r=0.1)'.")
     ] = "adaptive-kalman"
     p: Annotated[
         Names, typer.Option("-p", help="Setting of the tracker: q=1e-4, q=1e-4,0,0 or p0=none; repeat it.")

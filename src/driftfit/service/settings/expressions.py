@@ -1,97 +1,20 @@
-"""Models and trackers as text: ``ARX(2, [2, 2], intercept=True)``, or ``arx:2,2,intercept`` as on the command line.
-
-The text is read as a syntax tree of calls and literals, and nothing of it is evaluated: the only names are those of
-the library's settings, and arguments are numbers, texts, None, lists, tuples, mappings or such calls.
-"""
+"""Models and trackers as text: ``ARX(2, [2, 2], intercept=True)``, or ``arx:2,2,intercept`` as on the command line."""
 
 from __future__ import annotations
 
-import ast
-from typing import Any
-
-import driftfit
-from driftfit import models, trackers
 from driftfit.cli.parts.arguments import parse_model, parse_tracker
-from driftfit.engine.settings import Settings, near
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-
-LONGEST = 2000
-"""Characters of an expression."""
-CONSTRUCTORS = {("Sensor", "nominal")}
-"""Named constructors that may be called."""
 
 
 def model_of(text: str) -> Model:
     """A model from text; ValueError says what is wrong."""
-    if "(" not in text:
-        return parse_model(text)
-    found = _call(text, models.found())
-    if not isinstance(found, Model):
-        raise ValueError(f"{text!r} is a {type(found).__name__}, not a model; {near('', models.found())}")
-    return found
+    return parse_model(text)
 
 
 def tracker_of(text: str) -> Tracker:
-    """A tracker from text; ValueError says what is wrong."""
-    if "(" not in text:
-        name, _, settings = text.partition(":")
-        return parse_tracker(name, [one for one in settings.split(";") if one.strip()])
-    found = _call(text, trackers.found())
-    if not isinstance(found, Tracker):
-        raise ValueError(f"{text!r} is a {type(found).__name__}, not a tracker; {near('', trackers.found())}")
-    return found
-
-
-def _call(text: str, main: dict[str, Any]) -> Any:
-    """The object that a text describes."""
-    if len(text) > LONGEST:
-        raise ValueError(f"the expression has {len(text)} characters; at most {LONGEST} are read.")
-    try:
-        tree = ast.parse(text.strip(), mode="eval").body
-        return _value(tree, _known() | main)
-    except (SyntaxError, RecursionError, MemoryError):
-        raise ValueError(f"{text!r} is not an expression such as ARX(2, 2) or Kalman(q=1e-4, r=0.1).") from None
-
-
-def _known() -> dict[str, Any]:
-    """Settings that the library exports, by name."""
-    exported = {name: getattr(driftfit, name) for name in driftfit.__all__}
-    return {name: kind for name, kind in exported.items() if isinstance(kind, type) and issubclass(kind, Settings)}
-
-
-def _value(node: ast.expr, known: dict[str, Any]) -> Any:
-    """A literal, or a call of a known name with such values."""
-    if isinstance(node, ast.Call):
-        given = {one.arg: _value(one.value, known) for one in node.keywords if one.arg is not None}
-        if len(given) < len(node.keywords) or any(isinstance(one, ast.Starred) for one in node.args):
-            raise ValueError("* and ** are not allowed in an expression; name each setting.")
-        make = _constructor(node.func, known)
-        try:
-            return make(*(_value(one, known) for one in node.args), **given)
-        except TypeError as error:
-            raise ValueError(f"{ast.unparse(node)}: {str(error).replace('.__init__()', '')}.") from None
-    if isinstance(node, ast.List | ast.Tuple):
-        found = [_value(one, known) for one in node.elts]
-        return found if isinstance(node, ast.List) else tuple(found)
-    if isinstance(node, ast.Dict) and None not in node.keys:
-        keys = [_value(one, known) for one in node.keys if one is not None]
-        return dict(zip(keys, (_value(one, known) for one in node.values), strict=True))
-    try:
-        return ast.literal_eval(node)
-    except ValueError:
-        raise ValueError(
-            f"{ast.unparse(node)!r} is not a number, a text, a list or a setting of the library; expressions are read "
-            "as literals and never evaluated."
-        ) from None
-
-
-def _constructor(node: ast.expr, known: dict[str, Any]) -> Any:
-    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
-        if (node.value.id, node.attr) in CONSTRUCTORS and node.value.id in known:
-            return getattr(known[node.value.id], node.attr)
-    elif isinstance(node, ast.Name):
-        if node.id in known:
-            return known[node.id]
-        raise ValueError(f"there is no {node.id!r}; {near(node.id, known)}")
-    raise ValueError(f"{ast.unparse(node)!r} cannot be called here; name a model, a tracker or one of their settings.")
+    """A tracker from text, ``Kalman(q=1e-4, r=0.1)`` or ``kalman:q=1e-4;r=0.1``; ValueError says what is wrong."""
+    if "(" in text:
+        return parse_tracker(text, [])
+    name, _, settings = text.partition(":")
+    return parse_tracker(name, [one for one in settings.split(";") if one.strip()])
