@@ -115,6 +115,8 @@ def main(folder: str, figures: str | None = None) -> None:
     heads = ("ratio", "gain", "tracked", "in band", "persistence", "constant LS", "constant ARX")
     for head in ("record", "chosen by", *heads):
         table.add_column(head, justify="right" if head in heads else "left", no_wrap=True)
+    if figures:
+        Path(figures).mkdir(parents=True, exist_ok=True)
     for read in (river, building, building_arx, furnace):
         case = read(Path(folder))
         half = len(case.y) // 2
