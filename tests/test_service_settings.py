@@ -12,10 +12,11 @@ from typer.testing import CliRunner
 
 from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
+from driftfit.cli.parts.arguments import parse_model
 from driftfit.service.settings.config import ProblemsError, parse
-from driftfit.service.settings.expressions import model_of, tracker_of
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import Secret
+from driftfit.service.settings.trackers import tracker_of
 from driftfit.service.sources.incoming import decoded
 from driftfit.service.sources.samples import decode, number, seconds
 
@@ -114,7 +115,7 @@ def test_check_on_the_command_line(tmp_path):
     ],
 )
 def test_expressions(text, made):
-    assert (model_of if isinstance(made, ARX) else tracker_of)(text) == made
+    assert (parse_model if isinstance(made, ARX) else tracker_of)(text) == made
 
 
 @pytest.mark.parametrize(
@@ -126,7 +127,7 @@ def test_expressions(text, made):
 )  # fmt: skip
 def test_nothing_is_evaluated(text):
     with pytest.raises(ValueError):
-        model_of(text)
+        parse_model(text)
 
 
 def test_patterns():

@@ -51,7 +51,7 @@ from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import LEFT, MACHINES, knowing, knowing_nothing, prediction, symmetric_product
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import growth, learn_scale, no_scale
+from driftfit.trackers.rls import fade, learn_scale, no_scale
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model goes at a sample: twenty samples behind."""
@@ -67,10 +67,8 @@ start_of_rls = rls.begin
 
 @kernel
 def forget(s: State, l: int) -> None:
-    grow = growth(s, l)
+    grow = fade(s, l)
     for i in range(s.theta.shape[0]):
-        for j in range(i + 1):
-            s.P[i, j, l] *= grow
         for j in range(s.theta.shape[0]):
             s.G[i, j, l] *= grow
 

@@ -66,11 +66,18 @@ def growth(s: State, l: int) -> float:
 
 
 @kernel
-def forget(s: State, l: int) -> None:
-    grow = growth(s, l)
+def fade(s: State, l: int) -> float:
+    """P <- P / lambda_e; returns 1 / lambda_e."""
+    grow: float = growth(s, l)
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             s.P[i, j, l] *= grow
+    return grow
+
+
+@kernel
+def forget(s: State, l: int) -> None:
+    fade(s, l)
 
 
 def no_scale() -> dict[str, Any]:

@@ -12,16 +12,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from driftfit.cli.parts.arguments import parse_model
 from driftfit.data.clock import Clock
 from driftfit.data.signals import check_ready
 from driftfit.engine.settings import near
 from driftfit.models.base import Model
 from driftfit.run.live.rule import KINDS
 from driftfit.run.program import Program
-from driftfit.service.settings.expressions import model_of, tracker_of
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import PageOptions, ServiceOptions, build, kinds
 from driftfit.service.settings.toml_lines import Lines
+from driftfit.service.settings.trackers import tracker_of
 from driftfit.service.sinks.contract import Sink
 from driftfit.service.sources.contract import Source
 from driftfit.streams import Live
@@ -201,7 +202,7 @@ class _Reader:
         if not (isinstance(u, str) or (isinstance(u, list) and all(isinstance(one, str) for one in u))):
             raise KeyProblemError(("u",), f'u must be names of fields, such as ["pressure", "current"]; got {u!r}.')
         u = (u,) if isinstance(u, str) else tuple(u)
-        model = at("model", lambda: model_of(str(given.get("model", f"ARX(2, {2 if u else 0}, intercept=True)"))))
+        model = at("model", lambda: parse_model(str(given.get("model", f"ARX(2, {2 if u else 0}, intercept=True)"))))
         model = at("model", lambda: model.bind(list(u)))
         if len(model.outputs) > 1:
             raise KeyProblemError(("model",), "a unit has one output; write one [[unit]] for each.")

@@ -1,15 +1,9 @@
-"""Models and trackers as text: ``ARX(2, [2, 2], intercept=True)``, or ``arx:2,2,intercept`` as on the command line."""
+"""Trackers with their settings as one text."""
 
 from __future__ import annotations
 
-from driftfit.cli.parts.arguments import parse_model, parse_tracker
-from driftfit.models.base import Model
+from driftfit.cli.parts.arguments import parse_tracker
 from driftfit.trackers.base import Tracker
-
-
-def model_of(text: str) -> Model:
-    """A model from text; ValueError says what is wrong."""
-    return parse_model(text)
 
 
 def tracker_of(text: str) -> Tracker:
