@@ -66,23 +66,23 @@ class Experiment:
 class Experiments:
     """Several records of one system, as ``merge(z1, z2)`` makes them in MATLAB."""
 
-    all: tuple[Experiment, ...]
+    records: tuple[Experiment, ...]
 
     def __post_init__(self) -> None:
         shapes = {
-            (np.ndim(one.y) == 1 or one.y.shape[1], None if one.u is None else one.u.shape[1]) for one in self.all
+            (np.ndim(one.y) == 1 or one.y.shape[1], None if one.u is None else one.u.shape[1]) for one in self.records
         }
         if len(shapes) != 1:
             raise ValueError("Experiments: all experiments need the same numbers of outputs and inputs.")
 
     def __len__(self) -> int:
-        return len(self.all)
+        return len(self.records)
 
     def __iter__(self) -> Iterator[Experiment]:
-        return iter(self.all)
+        return iter(self.records)
 
     def __getitem__(self, place: int) -> Experiment:
-        return self.all[place]
+        return self.records[place]
 
     def joined(self, model: Model) -> tuple[Array, Array | None]:
         """(y, u) of all experiments as one record, for `track`, `tune` and `select`.
