@@ -220,3 +220,13 @@ def test_errors():
     rule = run.detect(reference=300).rule
     with pytest.raises(ValueError, match="has 4 parameters"):
         Live(ARX(1, 1), HELD).detect(rule)
+
+
+def test_an_idle_input_leaves_the_alarm_as_it_is():
+    """A column of zeros in the reference has no parameter: the gain's jump is found as without that column."""
+    rng = np.random.default_rng(1)
+    u, after = rng.normal(size=1600), np.arange(1600) >= 1200
+    y = (2.0 + 0.6 * after) * u + 1.0 + 0.5 * rng.normal(size=1600)
+    idle = track(Regression(2, intercept=True), Kalman(q=0.0, r=0.25), y, np.c_[u, np.zeros(1600)])
+    begun = idle.detect(every=1000.0, reference=800).onsets
+    assert 1200 <= begun[begun >= 1200][0] < 1250

@@ -145,6 +145,7 @@ def orthonormal(phi: Array) -> tuple[Array, Array]:
 def robust_fit(phi: Array, y: Array) -> Fit:
     """Constant coefficients with bounded influence of outliers in y; phi (N, n), y (N,)."""
     size = np.sqrt(np.mean(phi * phi, axis=0))
+    size[size == 0.0] = 1.0  # an idle column, whose parameter is 0
     Q, R = orthonormal(phi / size)
     theta, residual, scale = np.zeros(phi.shape[1]), np.empty(len(y)), np.empty(1)
     _run(Q, np.ascontiguousarray(y), theta, residual, scale)
