@@ -5,8 +5,10 @@ No other module makes tiles or drivers of a model and a tracker; a tile of sever
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -27,6 +30,17 @@ CHUNK = 1_000_000
 
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
+
+
+@contextmanager
+def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
+    """A progress bar that is called with what has been done; making one that is not shown would take a millisecond."""
+    if not shown:
+        yield lambda count: None
+        return
+    with Progress(console=Console(stderr=True), transient=True) as display:
+        task = display.add_task(what, total=total)
+        yield lambda count: display.advance(task, count)
 
 
 @dataclass(frozen=True)
@@ -77,6 +91,28 @@ class Program:
         """Names and shapes of the tracker's state: programs with equal shapes and equal steps may share a tile."""
         return tuple((name, np.shape(value)) for name, value in self.tracker.state_for(self.model).items())
 
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the fields of a lane are, and which of them a packed state holds."""
+        owner = {"model": storage.describe(self.model), "tracker": storage.describe(self.tracker)}
+        return Layout(self.tile().dtype, self.tracker.scratch, owner | {"output": self.output})
+
+    def pack(self, tile: Array, lane: int = 0) -> bytes:
+        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        return self.layout.pack(words_of(tile)[self.layout.held, lane])
+
+    def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
+        """A tile of one lane, or a lane of the given tile, with the state that `pack` wrote; microseconds.
+
+        Raises
+        ------
+        ValueError
+            For bytes that are damaged, or the state of another model, tracker, setting or layout.
+        """
+        into = self.tile() if tile is None else tile
+        self.layout.put(into, lane, self.layout.unpack(data))
+        return into
+
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         return drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
@@ -97,12 +133,11 @@ class Program:
         """Run a tile over a record, a lane for each output; returns the driver's output, (T,) of `output_type`."""
         T = len(record)
         out = self.written(tile, T, keep)
-        with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
-            task = progress.add_task("tracking", total=T)
+        with progress("tracking", T, T > CHUNK) as advance:
             for a in range(0, T, CHUNK):
                 b = min(a + CHUNK, T)
                 self.drivers(keep).run(tile, *lanes_of(record.part(slice(a, b))), out[a:b])
-                progress.advance(task, b - a)
+                advance(b - a)
         return out
 
 

@@ -62,6 +62,8 @@ class Tracker(Settings, ABC):
     """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the Gaussian
     density of the forecast.
     """
+    scratch: ClassVar[tuple[str, ...]] = ()
+    """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 
