@@ -91,6 +91,17 @@ class Program:
         """Names and shapes of the tracker's state: programs with equal shapes and equal steps may share a tile."""
         return tuple((name, np.shape(value)) for name, value in self.tracker.state_for(self.model).items())
 
+    def schema(self, arrays: bool = False) -> dict[str, str]:
+        """Columns and types of the results at a sample, which `to_table` writes after the signals, before any data.
+
+        Types have the names of SQL: "double", "boolean", "array<double>" (with ``arrays``, theta and std of all
+        parameters).
+        """
+        own = {"prediction": "double", "innovation": "double", "innovation_std": "double", "ok": "boolean"}
+        if arrays:
+            return own | {"theta": "array<double>", "std": "array<double>"}
+        return own | {f"{what}_{name}": "double" for name in self.names for what in ("theta", "std")}
+
     @cached_property
     def layout(self) -> Layout:
         """Where the fields of a lane are, and which of them a packed state holds."""
