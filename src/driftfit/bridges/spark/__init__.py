@@ -5,6 +5,8 @@ Spark partitions, shuffles, retries and keeps checkpoints; this package adds the
 """
 
 from driftfit.bridges.spark.batch import track
+from driftfit.bridges.spark.follow import follow
 from driftfit.bridges.spark.session import session
+from driftfit.bridges.spark.store import Store
 
-__all__ = ["session", "track"]
+__all__ = ["Store", "follow", "session", "track"]

@@ -51,6 +51,11 @@ class Task:
         """The nominal interval."""
         return Clock.of(self.dt, self.zone)
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns that are read."""
+        return (*self.by, self.time, self.y, *self.u)
+
     @cached_property
     def program(self) -> Program:
         """The program of a unit without settings of its own; ValueError if they are not complete."""
@@ -127,7 +132,7 @@ def units_of(table: pa.Table, by: Sequence[str]) -> Units:
 
 def numbers(column: pa.ChunkedArray) -> Array:
     """Floats, NaN where there is none."""
-    return np.asarray(pc.fill_null(column, np.nan).to_numpy(), float)
+    return np.asarray(pc.fill_null(column.cast(pa.float64()), np.nan).to_numpy(), float)
 
 
 def times(column: pa.ChunkedArray) -> Array:
