@@ -30,6 +30,7 @@ levels and the scaling are ours. Cost per sample: O(K^2 n^2 + K J) for K modes a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -77,6 +78,8 @@ from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
+LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
+"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
 
 @kernel
@@ -88,6 +91,13 @@ def learn_start(s: State, l: int) -> None:
     s.s[l] *= s.scale[l]
     scale = s.squares[l] / s.count[l]
     s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
+
+
+@kernel
+def start_density(e: float, s: float, nu: float) -> float:
+    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
+    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
+    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -182,8 +192,9 @@ def begin(s: State, l: int) -> None:
         take_in(s, l)
         s.noise[l] = noise
         if s.s[l] < np.inf:
+            residuals = s.count[l]
             learn_start(s, l)
-            s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
+            s.density[l] = start_density(s.e[l], s.s[l], residuals)
         spanned_variance(s, l)
         settle(s, l)
 

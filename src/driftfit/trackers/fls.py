@@ -113,6 +113,7 @@ class FLS(Tracker):
     differences: int = 1
 
     required: ClassVar[tuple[str, ...]] = ("mu",)
+    learns_noise: ClassVar[bool] = True
     drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -189,6 +189,7 @@ class InstrumentalVariables(Tracker):
     c_max: float = 1e8
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         name = "InstrumentalVariables"

@@ -207,6 +207,7 @@ class RLS(Tracker):
     kind: str = "exponential"
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.forgetting is not None:

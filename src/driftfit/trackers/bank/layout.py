@@ -58,10 +58,11 @@ is another than that of one nominal interval, PARTED that leaves go on as two (`
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
-) = range(21)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
+) = range(22)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`).
+prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
+variance before the tree grows: the residuals until then; inf for a variance that is given.
 """
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
