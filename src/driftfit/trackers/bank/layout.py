@@ -33,7 +33,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     expected                their z'C z and z'm
     scores                  their unit of covariance or log density; then two rows to spare
     scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
-    said                    what a likelihood of the user's own says (`leaves.own_sensor`)
+    said                    what a likelihood of the user's own says of each leaf (`leaves.own_sensor`)
     spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
