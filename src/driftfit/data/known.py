@@ -80,7 +80,7 @@ class Known:
         columns = self.over(T).columns.copy()
         for place, values in given.items():
             if values is not None:
-                columns[:, place] = values
+                columns[:, place] = values if columns.ndim == 2 else np.reshape(values, (-1, 1))
         return Known(columns)
 
     def begun(self, factors: Mapping[int, float]) -> Known:
@@ -111,6 +111,6 @@ class Known:
     def in_rows(self, T: int) -> Known:
         """(T ny, k): every output as a sample; between those of one instant no time passes."""
         ny = self.columns.shape[2]
-        columns = np.moveaxis(self.over(T).columns, 1, 2).reshape(T * ny, -1)
+        columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
         columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
         return Known(columns)

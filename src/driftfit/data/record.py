@@ -84,6 +84,8 @@ class Reading:
     units: Mapping[str, str] | None = None
     limits: Mapping[Any, Any] | None = None
     exclude: Any = None
+    indexed: bool = True
+    """Whether an index of dates labels the samples if no time is given."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,7 @@ def one_series(y: Any, u: Any, reading: Reading) -> Records:
     together(**signals, **factors)
     output = as_output(signals["y"].values)
     T = len(output)
-    times = times_of(reading.time, list(signals.values()))
+    times = times_of(reading.time, list(signals.values()) if reading.indexed else ())
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     drift = factors["drift"].values
