@@ -29,8 +29,10 @@ class Known:
     @classmethod
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
         """From numbers or arrays (T,)."""
-        parts = (np.atleast_1d(np.asarray(part, float)) for part in (interval, noise, drift))
-        return cls(np.stack(np.broadcast_arrays(*parts), axis=1))
+        parts = (interval, noise, drift)
+        if not any(map(np.ndim, parts)):
+            return cls(np.array([parts], float))
+        return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:
         return len(self.columns)

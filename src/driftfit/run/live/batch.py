@@ -194,7 +194,7 @@ class Batched(ABC):
             return Batch(np.empty(0, self._row_type), rows)
         records = self._records(y, u, Reading(weights=weights, drift=drift, indexed=False), prob)
         held, told = self.held, records.known.columns.shape[1] > len(HELD)
-        before = row_of(self._tile, self._row_type)
+        before = None if time is None else row_of(self._tile, self._row_type)
         records, taken = self._arrived(records, time)
         if held:
             records = replace(records, known=Known.of(*HELD))
@@ -202,7 +202,9 @@ class Batched(ABC):
         if len(out):
             self._drive((records.in_rows() if self.model.shared else records).part(0), out)
             self._settle(held, told)
-        return Batch(out if taken.all() else with_ignored(out, before, np.repeat(taken, rows)), rows)
+        if before is not None and not taken.all():
+            out = with_ignored(out, before, np.repeat(taken, rows))
+        return Batch(out, rows)
 
     def _records(self, y: Any, u: Any, reading: Reading, prob: Any) -> Records:
         """The samples as a record, without their times."""
