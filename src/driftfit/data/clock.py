@@ -73,6 +73,8 @@ class Clock:
     @classmethod
     def of(cls, dt: Any, zone: str | None = None) -> Clock:
         """The clock of ``dt``, for times shown in a zone; ValueError if ``dt`` is not valid."""
+        if dt is None:
+            return UNSET
         clock = cls._of(dt)
         return replace(clock, zone=zone) if clock.kind in CALENDARS and zone is not None else clock
 
@@ -80,8 +82,6 @@ class Clock:
     def _of(cls, dt: Any) -> Clock:
         if isinstance(dt, Clock):
             return dt
-        if dt is None:
-            return cls("unset")
         if isinstance(dt, str):
             return _of_text(dt)
         if isinstance(dt, np.timedelta64 | timedelta):
@@ -240,6 +240,10 @@ class Clock:
         ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays the last day
         there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
         return self._in_utc(np.asarray(there + part))
+
+
+UNSET = Clock("unset")
+"""No dt was given."""
 
 
 def instant(time: Any) -> Any:

@@ -31,7 +31,7 @@ class Known:
         """From numbers or arrays (T,)."""
         parts = (interval, noise, drift)
         if not any(map(np.ndim, parts)):
-            return cls(np.array([parts], float))
+            return cls(np.array([parts], float))  # a row for all samples
         return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:

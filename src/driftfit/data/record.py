@@ -238,7 +238,7 @@ class Records:
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
     signals = {"y": held("y", y), "u": held("u", u)}
-    factors = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    factors = {"weights": held("weights", reading.weights), "drift": held("drift", reading.drift)}
     together(**signals, **factors)
     output = as_output(signals["y"].values)
     T = len(output)

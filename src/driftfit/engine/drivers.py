@@ -172,9 +172,7 @@ def repeat_tile(tile: Array, count: int) -> Array:
 def _aligned(dtype: np.dtype[Any], count: int) -> Array:
     """``count`` records, all zero, the first at the start of a cache line."""
     raw = np.zeros(dtype.itemsize * count + 64, np.uint8)
-    offset = -raw.ctypes.data % 64
-    records: Array = raw[offset : offset + dtype.itemsize * count].view(dtype)
-    return records
+    return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
 
 
 def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std") -> np.dtype[Any]:
@@ -284,11 +282,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
+        y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
+        _check_shapes(tile, len(out), y, u, known)
         ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
+        run(tile, y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
 
