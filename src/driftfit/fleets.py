@@ -83,11 +83,14 @@ class Judged(many.Many):
         """
         return crossings(dict(self.items()), self.by, what, below, above, horizon, u, level)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""
@@ -182,11 +185,14 @@ class Shared(shared_outputs.Shared, public=True):
         """Parameters with bands, predictions and innovations of the rows."""
         return plot_track(self.rows, level)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The results as one table, one row per sample; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The results as one table, one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
 
 def _public(run: result.Track) -> Track:

@@ -70,11 +70,14 @@ class Track(result.Track, public=True):
         """Parameters with bands, prediction against output, innovations; a matplotlib figure."""
         return plot_track(self, level)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""

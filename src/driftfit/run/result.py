@@ -266,7 +266,8 @@ class Track(Plain):
 
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        return End((self.program,), ({name: value.copy() for name, value in self.state.items()},), self.last)
+        state = {name: value.copy() for name, value in self.state.items()}
+        return End((self.program,), (state,), self.last, dt=self.labels.dt, zone=self.labels.zone)
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""

@@ -51,7 +51,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.filters import (
@@ -227,6 +227,9 @@ class AdaptiveKalman(Tracker):
     density: ClassVar[str] = "density"
     noted: ClassVar[tuple[str, ...]] = NOTED
     adapts: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = (
+        *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.groups is not None:

@@ -66,6 +66,8 @@ class Tracker(Settings, ABC):
     """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before: their
     number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
     """
+    scratch: ClassVar[tuple[str, ...]] = ()
+    """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 
