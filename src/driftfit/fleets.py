@@ -15,6 +15,7 @@ from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
 from driftfit.run import fleet, many, outputs, result, shared_outputs
 from driftfit.run.live.rule import AlarmRule
+from driftfit.show.cells import cell_of
 from driftfit.show.fleet_summary import FleetSummary, summarise
 from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
 from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
@@ -40,6 +41,9 @@ class Judged(many.Many):
     def items(self) -> Iterator[tuple[Hashable, Track]]:
         """Keys and results."""
         return ((key, _public(run)) for key, run in super().items())
+
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
@@ -149,6 +153,9 @@ class Outputs(outputs.Outputs, Judged, public=True):
 
 class Shared(shared_outputs.Shared, public=True):
     __doc__ = shared_outputs.Shared.__doc__
+
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
         """The smoothed path: theta (T, n), and residuals of every output (T, ny)."""

@@ -16,6 +16,7 @@ from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.run import result
 from driftfit.run.live.rule import AlarmRule
+from driftfit.show.cells import cell_of
 from driftfit.show.plots import plot_track
 from driftfit.show.report import report
 from driftfit.show.summary import Summary, summarise
@@ -65,6 +66,9 @@ class Track(result.Track, public=True):
     def summary(self) -> Summary:
         """Present parameters, and one-step errors compared with those of simpler methods; print it."""
         return summarise(self)
+
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
     def plot(self, level: float = 0.95) -> Figure:
         """Parameters with bands, prediction against output, innovations; a matplotlib figure."""

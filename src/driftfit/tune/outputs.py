@@ -10,11 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
+
 from driftfit.data.record import Reading
 from driftfit.models.base import Model
 from driftfit.run.outputs import Outputs
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
+from driftfit.show.parts.text import Printed
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task
@@ -24,7 +28,7 @@ STILL = Kalman(q=0.0, r=1.0)
 """Constant parameters with a diffuse start."""
 
 
-class TunedOutputs(Mapping[str, Tuned]):
+class TunedOutputs(Mapping[str, Tuned], Printed):
     """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
@@ -41,6 +45,11 @@ class TunedOutputs(Mapping[str, Tuned]):
 
     def __repr__(self) -> str:
         return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for place, (name, one) in enumerate(self.items()):
+            yield Text(f"\n{name}" if place else name, "bold")
+            yield one
 
     @property
     def tracker(self) -> dict[str, Tracker]:

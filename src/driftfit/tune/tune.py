@@ -35,10 +35,7 @@ from driftfit.tune.objective import Criterion, along
 from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
-from driftfit.tune.tuned import Tuned
-
-METHODS = ("ml", "h-step", "loo", "gcv")
-
+from driftfit.tune.tuned import METHODS, Tuned
 
 def tune(
     model: Model,
@@ -103,7 +100,7 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
-    one_of("tune", "method", method, METHODS)
+    one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")

@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.show.parts.text import Printed, facts, shortened, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.search import Search
 
@@ -17,9 +20,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+METHODS = {
+    "ml": "maximum likelihood",
+    "h-step": "h-step prediction error",
+    "loo": "leave-one-out error",
+    "gcv": "generalised cross-validation",
+}
+"""The criteria, in words."""
+
+
 @dataclass(frozen=True)
-class Tuned:
-    """The result of `tune`.
+class Tuned(Printed):
+    """The result of `tune`; printing it shows the estimates with their intervals.
 
     Attributes
     ----------
@@ -67,6 +79,21 @@ class Tuned:
         """The estimates by name of setting as in ``interval``; drifts are relative to the noise variance."""
         names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
         return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield facts(
+            ("Tracker", shortened(repr(self.tracker))),
+            ("Criterion", METHODS[self.method]),
+            *([("Log-likelihood", f"{self.loglik:.6g}")] if np.isfinite(self.loglik) else []),
+            ("Noise variance", f"{self.noise:.4g}"),
+        )
+        ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
+        table = table_of("Settings", "", "estimate", *ends)
+        for name, value in self.chosen.items():
+            table.add_row(Text(name), *(f"{number:.4g}" for number in (value, *self.interval[name])))
+        yield table
+        if self.at_bound:
+            yield Text(f" at zero or at a bound of the search: {', '.join(self.at_bound)}")
 
     def _criterion(self, values: Array) -> Array:
         """Values of the objective converted to the criterion."""

@@ -89,6 +89,9 @@ class Hypotheses:
                 stacklevel=3,
             )
 
+    def __repr__(self) -> str:
+        return f"Hypotheses of {len(self.run)} samples: {', '.join(self.names)}; {self.tracker!r}"
+
     def _told(self, name: str) -> Array:
         return self.tracker.told(self._report, name)
 
