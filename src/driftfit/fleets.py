@@ -122,9 +122,12 @@ class Fleet(fleet.Fleet, Judged, public=True):
         """Results ranked by how much their parameters moved; print it."""
         return summarise(self)
 
-    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-        """Small multiples of one parameter for the results that moved most; a matplotlib figure."""
-        return plot_fleet(self, which, most, level)
+    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
+        """Small multiples of one parameter for the results that moved most; a matplotlib figure.
+
+        ``ax`` as for `Track.plot`.
+        """
+        return plot_fleet(self, which, most, level, ax)
 
 
 class Outputs(outputs.Outputs, Judged, public=True):
@@ -146,9 +149,9 @@ class Outputs(outputs.Outputs, Judged, public=True):
         """The summaries of all outputs, by name; print it."""
         return summarise_outputs(self)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands: one row of panels for each output."""
-        return plot_outputs(self, level)
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands: one row of panels for each output. ``ax`` as for `Track.plot`."""
+        return plot_outputs(self, level, ax)
 
 
 class Shared(shared_outputs.Shared, public=True):
@@ -185,9 +188,9 @@ class Shared(shared_outputs.Shared, public=True):
         """Present parameters, and the one-step error of each output; print it."""
         return summarise_shared(self)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, predictions and innovations of the rows."""
-        return plot_track(self.rows, level)
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, predictions and innovations of the rows. ``ax`` as for `Track.plot`."""
+        return plot_track(self.rows, level, ax)
 
     def to_table(self, kind: str = "polars") -> Any:
         """The results as one table, one row per sample; see `driftfit.show.export`."""

@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
@@ -179,19 +179,18 @@ class TimeVaryingResults:
         limit = factors[alpha] * (np.sqrt(count) + 2 * np.cumsum(there) / np.sqrt(count))
         return pd.DataFrame({"lower": -limit, "upper": limit}, self.endog.index)
 
-    def plot_cusum(self, alpha: float = 0.05) -> Figure:
+    def plot_cusum(self, alpha: float = 0.05, ax: Any = None) -> Figure:
         """`cusum` with its limits; a matplotlib figure. A path that leaves them contradicts constant coefficients."""
-        figure = new_figure(8.0, 3.0)
-        axis = figure.subplots()
+        figure, (axis,) = panels(ax, (8.0, 3.0))
         axis.plot(_places(self.endog), self.cusum, color=BLUE, label="cumulative sum of recursive residuals")
         axis.plot(_places(self.endog), self.cusum_limits(alpha), color=RED, linestyle="--", linewidth=1)
         axis.axhline(0.0, color="black", linewidth=0.6)
         axis.set_title(f"CUSUM, limits at {alpha:.0%}")
         return figure
 
-    def plot_coefficients(self, level: float = 0.95) -> Figure:
-        """Every coefficient over time with its band, the prediction and the errors; a matplotlib figure."""
-        return self.run.plot(level)
+    def plot_coefficients(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Every coefficient over time with its band, the prediction and the errors; ``ax`` as for `Track.plot`."""
+        return self.run.plot(level, ax)
 
     def summary(self, alpha: float = 0.05) -> CoefficientTable:
         """The table of coefficients after the last row, as text, HTML or LaTeX."""

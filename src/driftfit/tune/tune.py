@@ -37,6 +37,7 @@ from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
 from driftfit.tune.tuned import METHODS, Tuned
 
+
 def tune(
     model: Model,
     tracker: Tracker,

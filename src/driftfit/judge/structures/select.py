@@ -160,12 +160,15 @@ class Selection(Printed):
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
-    def plot(self, most: int = 20) -> Figure:
-        """Distances from the best structure, with standard errors, and where in time the structures lost."""
+    def plot(self, most: int = 20, ax: Any = None) -> Figure:
+        """Distances from the best structure, with standard errors, and where in time the structures lost.
+
+        ``ax`` as for `Track.plot`.
+        """
         rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
         terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
         below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
-        return plot_selection([row.name for row in rows], below, std, terms)
+        return plot_selection([row.name for row in rows], below, std, terms, ax)
 
 
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
