@@ -7,7 +7,7 @@ whose predictions also fill missing lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -15,7 +15,9 @@ from rich.text import Text
 
 from driftfit.data.record import Reading
 from driftfit.models.base import Model
+from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
+from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
 from driftfit.show.parts.text import Printed
@@ -68,13 +70,24 @@ class TunedOutputs(Mapping[str, Tuned], Printed):
 
 
 def tune_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
-) -> Tuned | TunedOutputs:
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, by: Any,
+    one: Callable[[Task], Tuned],
+) -> Tuned | TunedOutputs:  # fmt: skip
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known), data=data)
+    run = track(model, STILL, y, u, Reading(**known), data=data, by=by)
     if isinstance(run, Shared):
-        return one(Task(run.rows.model, run.rows.record))
-    assert isinstance(run, Outputs)
-    return TunedOutputs({name: one(Task(run[name].model, run[name].record)) for name in run.outputs})
+        return one(Task(run.rows.model, (run.rows.record,)))
+    if model.shared:
+        assert isinstance(run, Fleet)
+        return one(_together(list(run.values())))
+    assert isinstance(run, Outputs | Fleet)
+    lanes = list(run.values())
+    names = run.outputs if isinstance(run, Outputs) else run.records.outputs
+    return TunedOutputs({name: one(_together(lanes[k :: len(names)])) for k, name in enumerate(names)})
+
+
+def _together(runs: Sequence[Track]) -> Task:
+    """The records of some runs with one model."""
+    return Task(runs[0].model, tuple(run.record for run in runs))
