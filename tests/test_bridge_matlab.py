@@ -102,7 +102,7 @@ def test_the_structure_of_merged_experiments():
     merged = merge(*(Experiment(*arx_record(130, seed)) for seed in range(4)))
     models = [ARX(1, 1), ARX(2, 2)]
     said = select(models, tracker=RLS(1.0), **merged.arguments)
-    assert said.best == said.simplest == "ARX(na=2, nb=2, inputs=1)"
+    assert said.best == said.simplest == "ARX(na=2, nb=2)"
     alone = [select(models, one.y, one.u, tracker=RLS(1.0)) for one in merged]
     assert said.scored == sum(one.scored for one in alone)
     for row in said.rows:

@@ -183,7 +183,7 @@ class Functions(Basis):
 
     def __repr__(self) -> str:
         """With the places of the functions, from which they are imported again."""
-        said = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
+        said: dict[str, Any] = {name: _place(getattr(self, name)) for name in ("values", "slopes")}
         said |= {} if self.n == 1 else {"n": self.n}
         said |= {} if self.numbers == (0.0,) else {"numbers": self.numbers}
         said |= {} if self.labels is None else {"labels": self.labels}
