@@ -56,6 +56,11 @@ class Stream(Batched, Plain, storage.Kept):
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(warm_start, self.programs))
 
+    def __repr__(self) -> str:
+        settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
+        last = "" if self._last is None else f" at {self._last}"
+        return f"{type(self).__name__}{last}: {self.model!r}, {settings}"
+
     @property
     def trackers(self) -> tuple[Tracker, ...]:
         """The tracker of each output, or of the theta that they share."""
