@@ -42,6 +42,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coloured import learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -145,12 +146,14 @@ def follow(s: State, entering: int, l: int) -> None:
         update_filters(s, l)
         learn_weights(s, l)
         learn_noise(s, l)
+    learn_colour(s, l)
     learn_scales(s, l)
     learn(s, l, s.odd[l])
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    whiten_noise(s, l)
     whiten(s, l)
     follow(s, -1, l)
 
@@ -176,6 +179,7 @@ def begin(s: State, l: int) -> None:
     are."""
     if s.settled[l] > 0:
         predict(s, l)
+        whiten_noise(s, l)
         follow(s, whiten_within(s, l), l)
         mixture(s, l)
         if s.ok[l] > 0.0:
@@ -271,6 +275,7 @@ class AdaptiveKalman(Tracker):
             **unresolved(),
             **not_frozen(),
             **no_weights(n),
+            **white(n),
             **modes,
             **levels,
         }
