@@ -95,7 +95,8 @@ def test_a_unit_is_run_in_parts(monkeypatch):
     rows = pl.concat([rows_of(6, 1, 60), rows_of(1, 2, 900).with_columns(unit=pl.lit("z"))]).sort("unit", "t")
     task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t")
     kinds = {"unit": "string", "t": "double"}
-    batches = rows.to_arrow().cast(pa.schema({"unit": pa.string(), **dict.fromkeys("tyu", pa.float64())})).to_batches(30)
+    types = pa.schema({"unit": pa.string(), **dict.fromkeys("tyu", pa.float64())})
+    batches = rows.to_arrow().cast(types).to_batches(30)
     sizes, tables = [], {kind: [] for kind in ("samples", "states")}
     for kind, parts in tables.items():
         part = Partition(task, kind, _schema(task, kinds, kind))

@@ -65,11 +65,10 @@ def _prepared(
     inputs = records.labels.u or records.u.shape[-1]
     made = {id(one): programs_of(model, one, inputs) for one in {id(one): one for one in trackers}.values()}
     programs = [program for one in trackers for program in made[id(one)]]
-    distinct = list(dict.fromkeys(programs for programs in made.values()))
-    for tracker in {program.tracker for some in distinct for program in some}:
-        if keep == "cov" and not tracker.covariance:
-            raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
-    for lane, one in enumerate(distinct[0]):
+    for one in programs if keep == "cov" else ():
+        if not one.tracker.covariance:
+            raise ValueError(f"track: {type(one.tracker).__name__} carries no covariance to keep; use keep='std'.")
+    for lane, one in enumerate(programs[: records.ny]):
         if one.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
             (one.model if one.alone is None else one.alone.model).inspect(y, records.u)

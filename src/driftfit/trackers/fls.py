@@ -121,6 +121,7 @@ class FLS(Tracker):
     differences: int = 1
 
     required: ClassVar[tuple[str, ...]] = ("mu",)
+    learns_noise: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
     drift_each: ClassVar[bool] = True
 

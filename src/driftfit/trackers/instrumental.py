@@ -197,6 +197,7 @@ class InstrumentalVariables(Tracker):
     c_max: float = 1e8
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
 
     def __post_init__(self) -> None:

@@ -208,6 +208,7 @@ class RLS(Tracker):
     kind: str = "exponential"
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
 
     def __post_init__(self) -> None:

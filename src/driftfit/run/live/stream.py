@@ -15,6 +15,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.batch import Batched
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.run.live.rule import AlarmRule
@@ -25,7 +26,7 @@ from driftfit.run.warm_start import UNSAID, End, Run, by_output, carried, ended,
 from driftfit.trackers.base import Tracker
 
 
-class Stream(Plain, storage.Kept):
+class Stream(Batched, Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
     A class of streams says how a sample goes through the tile (`_step`), and what a sample that is ignored returns.
@@ -54,6 +55,11 @@ class Stream(Plain, storage.Kept):
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+
+    def __repr__(self) -> str:
+        settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
+        last = "" if self._last is None else f" at {self._last}"
+        return f"{type(self).__name__}{last}: {self.model!r}, {settings}"
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
