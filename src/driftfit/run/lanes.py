@@ -91,10 +91,14 @@ def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
     kinds: dict[Tracker, Any] = {}
+    places: dict[int, list[int]] = {}
     for k, program in enumerate(programs):
-        if program.tracker not in kinds:
-            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
-        groups[kinds[program.tracker]].append(k)
+        place = places.get(id(program))  # hashing the steps of every series would take half the time of a short one
+        if place is None:
+            if program.tracker not in kinds:
+                kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
+            place = places[id(program)] = groups[kinds[program.tracker]]
+        place.append(k)
     return list(groups.values())
 
 
