@@ -96,6 +96,29 @@ def by_statsmodels(part: Any) -> Any:
     return part
 
 
+def step() -> None:
+    """Processor time of a worker for a piece of 64,000 rows of a table, without Spark."""
+    import pyarrow as pa
+
+    from driftfit.bridges.spark.batch import Partition, schema_of
+    from driftfit.bridges.spark.task import ROWS, Task
+
+    print(
+        f"{'units':>8} {'rows each':>9} {'us per row':>11} {'us per unit':>12}   one worker, {ROWS} rows, without Spark"
+    )
+    task = Task(MODEL, TRACKER, "y", ("u",), ("unit",), "t")
+    made = schema_of(task, {"unit": "string", "t": "double"}, "samples")
+    for each in (1000, 100, 40, 10, 1):
+        rows = rows_of(ROWS // each, each).sort("unit", "t").to_arrow()
+        rows = rows.cast(pa.schema([("unit", pa.string()), *((name, pa.float64()) for name in "tyu")])).combine_chunks()
+        took = []
+        for _ in range(3):
+            begin = time.process_time()
+            list(Partition(task, "samples", made).run(rows, False))
+            took.append(time.process_time() - begin)
+        print(f"{ROWS // each:>8} {each:>9} {1e6 * min(took) / ROWS:>11.2f} {1e6 * min(took) / (ROWS // each):>12.1f}")
+
+
 def batch(session: Any, folder: Path, sizes: list[int]) -> None:
     """Rows per second of a table."""
     print(f"{'units':>8} {'rows':>9} {'floor':>11} {'spark.track':>12} {'times':>6} {'summary':>11}   rows per second")
@@ -151,6 +174,7 @@ def main(quick: bool = False) -> None:
     session = bridge.session("local[2]", spark__ui__enabled="false", spark__driver__memory="3g",
                              spark__sql__shuffle__partitions="4")  # fmt: skip
     session.sparkContext.setLogLevel("OFF")
+    step()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rows_of(100, EACH).write_parquet(folder / "warm.parquet")
