@@ -28,6 +28,7 @@ from driftfit.use.forecast import Forecast, forecast_outputs
 
 if TYPE_CHECKING:
     import polars
+    import xarray
     from matplotlib.figure import Figure
 
 
@@ -92,6 +93,12 @@ class Judged(many.Many):
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
         return to_table(self, kind)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All results as one xarray dataset, with one dimension more than a `Track`; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""
@@ -191,6 +198,12 @@ class Shared(shared_outputs.Shared, public=True):
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands, predictions and innovations of the rows. ``ax`` as for `Track.plot`."""
         return plot_track(self.rows, level, ax)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The results as an xarray dataset, predictions by time and output; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def to_table(self, kind: str = "polars") -> Any:
         """The results as one table, one row per sample; see `driftfit.show.export`."""
