@@ -78,6 +78,8 @@ class TrackedRegressor(base.Regressor):
         """
         self._stream = lambda: live
         self._state = {} if live is None else live.lane()
+        self._width = 0 if live is None else live.model.m
+        self._early = 0 if live is None else 5 * live.model.n
 
     @property
     def _live(self) -> Live | None:
@@ -94,31 +96,27 @@ class TrackedRegressor(base.Regressor):
     def learn_one(self, x: dict[Any, Any], y: Any) -> None:
         """Learn one sample: features by name, and the output; None and NaN are missing."""
         output = _number(y)
-        known = len(self._columns)
-        for name in sorted(x.keys() - self._columns.keys(), key=str):
-            self._columns[name] = len(self._columns)
-        live = self._live
-        if live is None or len(self._columns) > live.model.m:
-            live = self._widen(len(self._columns) if known == 0 else 2 * known)
-        live.update(output, self._row(x, live.model.m))
+        known, live = len(self._columns), self._live
+        if live is None or not x.keys() <= self._columns.keys():
+            for name in sorted(x.keys() - self._columns.keys(), key=str):
+                self._columns[name] = len(self._columns)
+            if live is None or len(self._columns) > self._width:
+                live = self._widen(len(self._columns) if known == 0 else 2 * known)
+        live.update(output, self._row(x, self._width))
         self._past.append((dict(x), output))
-        if np.isfinite(output) and self._starts(live):
+        if self._count < self._early and np.isfinite(output):
             self._count += 1
             self._range = (min(self._range[0], output), max(self._range[1], output))
-
-    def _starts(self, live: Live) -> bool:
-        """Whether predictions are still clipped to the range of the outputs."""
-        return self._count < 5 * live.model.n
 
     def predict_one(self, x: dict[Any, Any]) -> float:
         """The output that is expected for these features."""
         live = self._live
         if live is None:
             return 0.0
-        y_hat = live.predict(self._row(x, live.model.m))[0]
+        y_hat = live.predict(self._row(x, self._width))[0]
         if not np.isfinite(y_hat):
             return 0.0
-        return float(np.clip(y_hat, *self._range)) if self._starts(live) and self._count else y_hat
+        return float(np.clip(y_hat, *self._range)) if 0 < self._count < self._early else y_hat
 
     @property
     def coef(self) -> dict[Any, float]:
@@ -146,12 +144,11 @@ class TrackedRegressor(base.Regressor):
 
     def _row(self, x: dict[Any, Any], m: int) -> Array:
         """The regressors (m,): an absent feature is 0, one that is None is NaN. Unknown features are left out."""
-        row = np.zeros(m)
+        row, columns = [0.0] * m, self._columns
         for name, value in x.items():
-            column = self._columns.get(name)
-            if column is not None:
-                row[column] = _number(value)
-        return row
+            if name in columns:
+                row[columns[name]] = _number(value)
+        return np.array(row)
 
     def _by_name(self, values: Any) -> dict[Any, float]:
         return {name: float(values[column]) for name, column in self._columns.items() if column < len(values)}
