@@ -250,12 +250,17 @@ def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[
 
 
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
-    """theta and its standard errors, Huber's for noise that is white after whitening."""
-    c = found.level[a:b]
+    """theta and its standard errors, Huber's for noise that is white after whitening.
+
+    A segment too short for that has plain least squares, and errors that are not known.
+    """
+    c, n = found.level[a:b], phi.shape[1]
+    if b - a - len(found.ar) <= n:
+        return np.linalg.lstsq(phi / c[:, None], y / c, rcond=None)[0], np.full(n, np.nan)
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
     fit = robust_fit(X, z)
-    N, n = X.shape
+    N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
     return fit.theta, np.sqrt(np.maximum(variance * np.diag(np.linalg.pinv(X.T @ X)), 0.0))
 
