@@ -88,11 +88,14 @@ class Judged(many.Many):
         """
         return crossings(dict(self.items()), self.by, what, below, above, horizon, u, level)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
     def to_xarray(self) -> xarray.Dataset:
         """All results as one xarray dataset, with one dimension more than a `Track`; see `driftfit.show.datasets`."""
@@ -205,11 +208,14 @@ class Shared(shared_outputs.Shared, public=True):
 
         return to_xarray(self)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The results as one table, one row per sample; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The results as one table, one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
 
 def _public(run: result.Track) -> Track:

@@ -80,11 +80,14 @@ class Track(result.Track, public=True):
         """
         return plot_track(self, level, ax)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
     def to_xarray(self) -> xarray.Dataset:
         """The result as an xarray dataset with the dimensions time and parameter; see `driftfit.show.datasets`."""

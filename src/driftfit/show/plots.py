@@ -37,6 +37,8 @@ def plot_track(run: Track, level: float = 0.95, ax: Any = None) -> Figure:
 def plot_fleet(fleet: Fleet, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
     """One parameter of the results that moved most and have it, one panel per result, all on one scale."""
     units = summarise(fleet).units
+    if not units:
+        raise ValueError("plot: no series has a result to draw; fleet.failed has the reasons.")
     if which is None:
         which = Counter(unit.parameter for unit in units[:most]).most_common(1)[0][0]
     if which not in fleet.names:
