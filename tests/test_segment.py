@@ -119,7 +119,7 @@ def test_parameters_and_standard_errors_of_segments():
     assert said.theta.shape == (500, 2)
     assert str(only.date)[:13].replace("T", " ") in said.summary()
     top, *panels = said.plot().axes
-    assert (top.lines[0].get_ydata() == run.y).all()
+    np.testing.assert_array_equal(top.lines[0].get_ydata(), run.y)
     for i, panel in enumerate(panels):
         drawn = [line.get_ydata()[0] for line in panel.lines[: len(said.segments)]]
         assert drawn == [part.theta[i] for part in said.segments]

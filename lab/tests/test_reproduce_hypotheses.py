@@ -25,8 +25,7 @@ EXACT = {
 
 
 def test_errors_on_clean_records_are_those_of_the_reference():
-    """As they are to four digits, so that nothing changes unseen; and the reference, which has records of its own, up to
-    their scatter."""
+    """As they are to four digits, so that nothing changes unseen; and the reference, up to the scatter of records."""
     clean = contests()[0]
     found = {name: measure(clean, name, RUNS).values for name in EXACT}
     for name, values in found.items():

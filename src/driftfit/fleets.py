@@ -10,8 +10,8 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
-from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
 from driftfit.run import fleet, many, outputs, result, shared_outputs

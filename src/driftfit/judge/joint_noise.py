@@ -9,9 +9,9 @@ of a run have M, V and the innovations e_t (ny,) with q_t = phi' V phi + 1 / w, 
                                             - (nu+1)/2 log(1 + e' S^-1 e / q)
     S <- lambda S + e e' / q,   nu <- lambda nu + 1,   R_t = S / nu,   cov(Theta) = R (x) V
 
-from the improper prior |R|^(-(ny+1)/2) on, nu = 0 and S = 0. The diagonal of R_t is what each output estimates of its own
-noise; the rest is what their noises have in common. With it the outputs can be followed as one: `JointNoise.rows` are
-regressions whose noises are independent with one variance, so that a `Bank` has one tree of events for all outputs.
+from the improper prior |R|^(-(ny+1)/2) on, nu = 0 and S = 0. The diagonal of R_t is what each output estimates of its
+own noise; the rest is what their noises have in common. With it the outputs can be followed as one: `JointNoise.rows`
+are regressions whose noises are independent with one variance, so that a `Bank` has one tree of events for all outputs.
 
 A sample at which an output is missing has the marginal density of the others and leaves S as it is; afterwards V is not
 quite the same for all, and every innovation is divided by its own q.
