@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib import dates
 from scipy import signal
 
 from driftfit import ARX, RLS, Regression, segment, track
@@ -123,7 +122,7 @@ def test_parameters_and_standard_errors_of_segments():
     for i, panel in enumerate(panels):
         drawn = [line.get_ydata()[0] for line in panel.lines[: len(said.segments)]]
         assert drawn == [part.theta[i] for part in said.segments]
-        assert panel.lines[-1].get_xdata()[0] == dates.date2num(only.date)
+        assert panel.lines[-1].get_xdata()[0] == only.date
     assert i == 1
     large = segment(1000.0 * y, u, Regression(2))
     assert [one.at for one in large.breaks] == [only.at]
