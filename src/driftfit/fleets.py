@@ -11,6 +11,7 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
 from driftfit.run import fleet, many, outputs, result, shared_outputs
@@ -154,6 +155,10 @@ class Outputs(outputs.Outputs, Judged, public=True):
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
         return forecast_outputs(self, h, u)
+
+    def joint_noise(self, memory: float | None = None) -> JointNoise:
+        """One noise covariance for all outputs, and their joint density; see `driftfit.judge.joint_noise`."""
+        return JointNoise(self, memory)
 
     def summary(self) -> OutputsSummary:
         """The summaries of all outputs, by name; print it."""

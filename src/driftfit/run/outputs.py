@@ -145,9 +145,13 @@ class Outputs(Many):
     @cached_property
     def _collected(self) -> Array:
         """The samples as the tracker received them, with the regressors that all outputs share."""
-        steps = self._programs[0].steps._replace(store=collect)
+        return self.replayed(collect, COLLECTED)
+
+    def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
+        """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = np.empty(len(self), output_type(tile, COLLECTED))
+        out = np.empty(len(self), output_type(tile, fields))
+        steps = self._programs[0].steps._replace(store=store)
         self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 

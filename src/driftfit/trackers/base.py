@@ -63,8 +63,8 @@ class Tracker(Settings, ABC):
     of the forecast, Gaussian or Student's.
     """
     learns_noise: ClassVar[bool] = False
-    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before: their
-    number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
+    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
     """
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""
