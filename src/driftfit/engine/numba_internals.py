@@ -9,6 +9,8 @@ in a sentence what broke. Tried with the versions in `TRIED`.
                    CompileResult._reduce, _rebuild
     code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted
                    codegen's factories
+    typing         Function.get_call_type, _impl_keys,  the types of Numba's own operations are found once
+                   Flags._values, Record.__repr__
     memory         _reset_overloads,                what the compiler made of a part is let go
                    remove_user_function, _dispose
     object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
@@ -44,12 +46,13 @@ from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompileResult
+from numba.core.compiler import CompileResult, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.core.targetconfig import ConfigStack
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
@@ -273,6 +276,47 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 _builders: dict[Any, Any] = {}
 """What makes LLVM's passes, by its options: Numba makes one for every function, and LLVM does not free all of it."""
+
+
+# ---- typing ---------------------------------------------------------------------------------------------------------
+
+# Numba tries dozens of templates for every sum, product and index of every function, and compares compile options one
+# by one for each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
+
+
+def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:
+    """The types of a call of one of Numba's own operations, as ``find`` gives them."""
+    known: dict[Any, tuple[Any, Any]] = {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or not all(isinstance(one, _PLAIN) for one in args):
+            return find(self, context, args, kws)
+        key = self, context, tuple(args), ConfigStack.top_or_none()
+        if key not in known:
+            found = find(self, context, args, kws)
+            known[key] = found, self._impl_keys[found.args]
+            return found
+        found, implementation = known[key]
+        self._impl_keys[found.args] = implementation  # options of another function may have changed it
+        return found
+
+    return get_call_type
+
+
+_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.Literal, int
+"""Arguments that are kept: not functions, whose code would never be let go; int is an index that Numba knows."""
+
+
+def _equal_options(equal: Callable[..., Any]) -> Callable[..., Any]:
+    """Whether two sets of options are equal, as ``equal`` says; seen at once where the same ones were set."""
+    return lambda self, other: (type(self) is type(other) and self._values == other._values) or equal(self, other)
+
+
+_NAMES = hash(tuple(sorted(Flags.options)))  # what Numba's own hash amounts to: it sorts names, not values
+types.Function.get_call_type = _remembered(types.Function.get_call_type)
+Flags.__eq__ = _equal_options(Flags.__eq__)
+Flags.__hash__ = lambda self: _NAMES
+types.Record.__repr__ = lambda self: self.name  # written out for every pass over a function, and read by nobody
 
 
 # ---- memory ---------------------------------------------------------------------------------------------------------
