@@ -115,6 +115,17 @@ def test_parts_are_linked_and_not_emitted():
         doubled(np.ones(2))
 
 
+def test_passes_for_what_is_not_used_are_left_out():
+    def passes(made):
+        made.compile((VECTOR,))
+        (times,) = made.overloads[(VECTOR,)].metadata["pipeline_times"].values()
+        return {name.split("_", 1)[1] for name in times}
+
+    every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
+    assert every - ours == internals.UNUSED, "DefaultPassBuilder or the names of its passes changed."
+    assert ours < every
+
+
 def test_operations_are_typed_once(monkeypatch):
     def total(y, i):
         return y[i] + y[i] * y[i]
