@@ -19,7 +19,7 @@ from driftfit.data.labels import by_name
 from driftfit.data.signals import noise_of
 from driftfit.data.storage import Kept
 from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import one_or_all
+from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm
@@ -94,6 +94,7 @@ class Live(Operated, Stream):
         self._unknown = np.full(self._m, np.nan)
         self._shape = (self._m,)
         self._update = self.program.drivers().updater(tile, self._m)
+        self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
     def _expect(self, what: int) -> None:
@@ -132,14 +133,14 @@ class Live(Operated, Stream):
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
         if type(u) is float and self._m == 1:
-            return self._update(self._tile, y, u)  # type: ignore[no-any-return]
+            return self._update(self._seen, y, u)  # type: ignore[no-any-return]
         if u is LATER and self._m:
             return self._update_later(y)
         # the compiled step reads m floats from any address, so they must exist
         if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
             u = self._inputs(u)
         # as `one_or_all`, whose call would take 30 ns
-        return self._update(self._tile, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
+        return self._update(self._seen, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
 
     def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
@@ -168,7 +169,7 @@ class Live(Operated, Stream):
     def _step(self, y: float, u: Array, known: tuple[float, float, float], time: Any) -> Step:
         known = HELD if self.held else known
         self._rest(known)
-        step: Step = self._update(self._tile, y, one_or_all(u))
+        step: Step = self._update(self._seen, y, one_or_all(u))
         for _, alarm in self._watching:
             alarm.take(self._tile, 0, step[1], step[2], time)
         if known is not HELD:
@@ -185,7 +186,7 @@ class Live(Operated, Stream):
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
-        step: Step = self._update(self._tile, y, one_or_all(self._unknown))
+        step: Step = self._update(self._seen, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step
 
@@ -197,7 +198,7 @@ class Live(Operated, Stream):
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, one_or_all(inputs))
+        y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
         return y_hat, s
 
     def smooth(self) -> FixedLag:
