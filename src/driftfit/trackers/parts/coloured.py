@@ -25,9 +25,9 @@ import numpy as np
 
 from driftfit.engine.kernel import State, kernel
 
-FADE = 0.998
+FADE = 0.995
 """Factor of the sums A and b at every sample."""
-SURE = 9.0
+SURE = 5.0
 """Square of the estimate in standard deviations below which innovations count as white."""
 MOST = 0.95
 """Largest size of c: the past is forgotten at this rate at least."""
