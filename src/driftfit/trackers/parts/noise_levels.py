@@ -21,7 +21,7 @@ from driftfit.trackers.parts.resolution import lasting
 
 LEVELS = (1.0, 4.0, 16.0, 100.0)
 """Noise levels in units of r; the last is the outlier's."""
-STAY = 0.985
+STAY = 0.99
 """Probability that the level is the same at the next sample."""
 OUTLIER = 0.02
 """Probability of an outlier."""
