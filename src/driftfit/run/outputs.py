@@ -133,9 +133,9 @@ class Outputs(Many):
         """Sum over the outputs: their noises are assumed to be independent."""
         return sum(track.loglik for track in self.values())
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, ny, n): pointwise bands of theta at this level."""
-        low, high = zip(*(track.band(level) for track in self.values()), strict=True)
+    def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T, ny, n): pointwise bands of theta at this level; ``conformal`` as for `Track.band`."""
+        low, high = zip(*(track.band(level, conformal) for track in self.values()), strict=True)
         return np.stack(low, axis=1), np.stack(high, axis=1)
 
     def cov(self, t: int) -> Array:

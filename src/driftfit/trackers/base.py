@@ -118,6 +118,10 @@ class Tracker(Settings, ABC):
             "track with FLS or Kalman."
         )
 
+    def regression(self, noted: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        """phi (T, n) and y (T,) as the tracker took them, if it filtered both; ``noted`` as for `varying`."""
+        return phi, y
+
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.
 
