@@ -216,21 +216,24 @@ def _aligned(dtype: np.dtype[Any], count: int) -> Array:
     return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
 
 
-def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std") -> np.dtype[Any]:
-    """The record that a driver writes for one sample of a tile.
+def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dtype: Any = np.float64) -> np.dtype[Any]:
+    """The record that is kept of one sample of a tile; in double precision, and not of theta alone, a driver writes it.
 
-    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok. What is
-    not common comes first: Numba takes a record that continues another one for the same type, with a warning.
+    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok; of
+    "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
+    type, with a warning.
     """
-    return _output_type(tile.dtype, tuple(outputs), keep)
+    return _output_type(tile.dtype, tuple(outputs), keep, np.dtype(dtype))
 
 
 @lru_cache(maxsize=256)
-def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str) -> np.dtype[Any]:
+def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
     n, L = tile["theta"].shape
-    names = (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
-    fields: list[Any] = [("P", np.float64, (n, n, L))] if keep == "cov" else []
-    fields += [(name, tile[name].base, tile[name].shape) for name in names]
+    names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []
+    for name in names:
+        own = tile[name].base
+        fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
     return np.dtype(fields, align=True)
 
 

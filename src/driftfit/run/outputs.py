@@ -24,7 +24,7 @@ from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
 from driftfit.run.many import Many
-from driftfit.run.program import Program, lanes_of, shown, state_of, tile_of
+from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -185,7 +185,7 @@ class Outputs(Many):
         own = [name for name, shape in shapes.items() if shape == state[name].shape]
         for name in own:
             tile[name][0, ..., 0] = state[name]
-        out = alone.written(tile, len(self), "cov" if "P" in names_of(lane.out) else "std")
+        out = alone.written(tile, len(self), *kept(lane.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = lane.written(name)
         start = {name: value for name, value in self._starts[j].items() if name in own} if self._starts else None

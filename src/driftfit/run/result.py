@@ -16,7 +16,7 @@ from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.conformal import quantile, widened
-from driftfit.run.program import Program, State, lanes_of, state_of
+from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -40,7 +40,7 @@ class Lane(NamedTuple):
         if self.tile["theta"].shape[-1] == 1:
             return self
         tile = program.tile(state_of(self.tile, self.lane))
-        out = program.written(tile, len(self.out), "cov" if "P" in names_of(self.out) else "std")
+        out = program.written(tile, len(self.out), *kept(self.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = self.written(name)
         return Lane(out, tile)
@@ -118,9 +118,25 @@ class Track(Plain):
         """The state after the last sample, field by field; these are views and must not be written to."""
         return state_of(self._lane.tile, self._lane.lane)
 
+    @property
+    def undetermined(self) -> Array:
+        """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""
+        return np.isinf(self._lane.tile["var"][0, :, self._lane.lane])
+
     def written(self, name: str) -> Array:
-        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example."""
-        return self._lane.written(name)
+        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example.
+
+        Replays the record, once, if only theta was kept.
+        """
+        return (self._lane if name in self.stores() else self._complete).written(name)
+
+    @cached_property
+    def _complete(self) -> Lane:
+        """The results with everything that ``keep="std"`` stores."""
+        if kept(self._lane.out.dtype)[0] != "theta":
+            return self._lane
+        tile = self.fresh()
+        return Lane(self.program.run(tile, self.record), tile)
 
     def stores(self) -> tuple[str, ...]:
         """Names of these fields."""
@@ -209,11 +225,11 @@ class Track(Plain):
         the noise variance (`driftfit.trackers.parts.student`); for a tracker that weighs hypotheses it is that of their
         mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
-        s, e = self.innovation_var, self.innovation
+        s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))
         counted = self.ok & np.isfinite(s) & (s > 0.0)
-        own = self.tracker.log_density(self._lane.out)
+        own = self.tracker.log_density(self._complete.out)
         if own is not None:
-            terms = own[:, self._lane.lane]
+            terms = own[:, self._complete.lane]
         elif self.tracker.learns_noise:
             terms = log_student(e, s, residuals_before(self.ok, s, float((self.start or {}).get("count", 0.0))))
         else:
@@ -304,7 +320,7 @@ class Track(Plain):
             "model": storage.describe(self.model),
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
-            "keep": "cov" if self.keeps_cov else "std",
+            "keep": kept(self._lane.out.dtype)[0],
         }
         arrays = {"y": self.y, "u": self.u, "known": self.known.columns}
         if self.record.time is not None:
@@ -332,7 +348,7 @@ class Track(Plain):
         )
         tile = program.tile()
         storage.restore(path, program.tracker, arrays, "state_", state_of(tile))
-        out = program.written(tile, len(record), header["keep"])
+        out = program.written(tile, len(record), header["keep"], arrays["out_theta"].dtype)
         storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
         start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
         return cls(program, record, Lane(out, tile), start or None)
