@@ -35,7 +35,7 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
-    warm_start: Run | None = None,
+    warm_start: Run | bytes | None = None,
     prob: Any = None,
 ) -> Track: ...
 
@@ -57,7 +57,7 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
-    warm_start: Fleet | None = None,
+    warm_start: Fleet | Mapping[Any, Run | bytes] | None = None,
 ) -> Fleet: ...
 
 
@@ -125,8 +125,10 @@ def track(
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
     keep : "std" or "cov"
         "cov" also stores the covariance of every sample, n * n numbers each.
-    warm_start : Track, Live, Fleet or None
-        Continue where that run ended, for a fleet series by series (new series start from the beginning).
+    warm_start : Track, Live, Fleet, bytes, mapping or None
+        Continue where that run ended, given itself or as bytes (``live.to_bytes()``, ``run.end().to_bytes()``); for a
+        fleet series by series, from a fleet or a mapping from key to any of these (new series start from the
+        beginning).
     prob : (T, changes), (T, joint events) or None
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
 

@@ -71,6 +71,7 @@ def innovate(s: State, l: int) -> None:
             s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
     mean = 0.0
     for k in range(K):
+        s.e_k[k, l] += s.explained[l]
         mean += s.prior[k, l] * s.e_k[k, l]
     level = 0.0
     for j in range(J - 1):
