@@ -6,7 +6,7 @@ Each function makes the kernels for one set of orders, which are constants, so t
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
 
 
 @lru_cache
-def _filters(p: Places) -> tuple[Step, Step]:
+def _filters(p: Places) -> tuple[Any, Any]:
     """D/C and 1/C of the present sample of a row: ``colour(s, raw, filtered, l)`` returns it, ``whiten`` stores it."""
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
@@ -122,7 +122,7 @@ def _filters(p: Places) -> tuple[Step, Step]:
 
 
 @lru_cache
-def _point(p: Places) -> Step:
+def _point(p: Places) -> Any:
     """The point of the linearisation: theta, where C and F are stable."""
     n, at_c, at_d, at_f, nc, nf, m = p.n, p.at_c, p.at_d, p.at_f, p.nc, p.nf, p.m
     past_f = at_f[0] + sum(nf)
@@ -178,7 +178,7 @@ def taking_inputs(p: Places) -> Step:
 
 
 @lru_cache
-def _responses(p: Places) -> Step:
+def _responses(p: Places) -> Any:
     """``respond(s, filtered, l)`` stores the present w of every input, with ``filtered`` D/(C F) of it too."""
     m, nb, nf, nk, at_b, at_f = p.m, p.nb, p.nf, p.nk, p.at_b, p.at_f
 
@@ -204,7 +204,7 @@ def _responses(p: Places) -> Step:
 
 
 @lru_cache
-def _predictions(p: Places) -> tuple[Step, Step]:
+def _predictions(p: Places) -> tuple[Any, Any]:
     """``predict(s, filtered, l)``: y_hat at s.point; ``noise(s, l)``: the part of it that earlier noise explains."""
     na, nc, nd, at_c, at_d, at_offset = p.na, p.nc, p.nd, p.at_c, p.at_d, p.at_offset
     respond = _responses(p)
@@ -232,7 +232,7 @@ def _predictions(p: Places) -> tuple[Step, Step]:
 
 
 @lru_cache
-def _gradient(p: Places) -> Step:
+def _gradient(p: Places) -> Any:
     """s.phi: the gradient of y_hat, or at the start the regression vector."""
     na, nc, nd, m, nb, nf, nk = p.na, p.nc, p.nd, p.m, p.nb, p.nf, p.nk
     at_b, at_c, at_d, at_f, at_offset, n = p.at_b, p.at_c, p.at_d, p.at_f, p.at_offset, p.n
@@ -269,7 +269,7 @@ def _gradient(p: Places) -> Step:
 
 
 @lru_cache
-def _regress(p: Places) -> Step:
+def _regress(p: Places) -> Any:
     n, m = p.n, p.m
     linearise, take_inputs, gradient, (predict, _) = _point(p), taking_inputs(p), _gradient(p), _predictions(p)
 
@@ -310,7 +310,7 @@ def _regress(p: Places) -> Step:
 
 
 @lru_cache
-def _push(p: Places) -> Step:
+def _push(p: Places) -> Any:
     na, n = p.na, p.n
     at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
     linearise, (predict, noise), (colour, whiten) = _point(p), _predictions(p), _filters(p)
