@@ -235,6 +235,12 @@ def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
     memory = model.memory_for(programs[0].steps.doubts)
+    tracker = programs[0].tracker
+    if both := sorted((set(memory) & set(starts[programs[0]])) - set(tracker.replaces)):
+        raise ValueError(
+            f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "
+            "which would be one and the same; rename it in one of them, or list it in the tracker's `replaces`."
+        )
     return make_tile(model.n, model.m, memory, [starts[one] for one in programs])
 
 

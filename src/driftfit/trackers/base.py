@@ -50,6 +50,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     noted: ClassVar[tuple[str, ...]] = ()
