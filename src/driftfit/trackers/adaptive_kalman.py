@@ -12,7 +12,8 @@ the levels are merged at once, which is a rank-one update (`driftfit.trackers.pa
 proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
 (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
-out too (`driftfit.trackers.parts.frozen`).
+out too (`driftfit.trackers.parts.frozen`). Where innovations are correlated, the previous one is one more regressor
+(`driftfit.trackers.parts.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -42,7 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coloured import learn_colour, white, whiten_noise
+from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -286,6 +287,10 @@ class AdaptiveKalman(Tracker):
             predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
         )
 
+    def regression(self, noted: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        running = noted["settled"] > 0
+        return np.where(running[:, None], noted["white"], phi), np.where(running, y - noted["explained"], y)
+
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
 
@@ -317,7 +322,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])
