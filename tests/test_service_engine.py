@@ -20,8 +20,8 @@ from service_support import (
     message,
     opened,
     record,
+    results_of,
     settled,
-    told,
 )  # fmt: skip
 
 from driftfit import track
@@ -48,7 +48,7 @@ def test_states_and_results_are_those_of_track(engine):
         for pump in "ab":
             assert feed(engine, message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
     run = run_of(y, u)
-    rows = [row for row in told(engine) if row[1] == 2]
+    rows = [row for row in results_of(engine) if row[1] == 2]
     assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
     assert np.array_equal([row[5] for row in rows], run.innovation, equal_nan=True)
     assert np.array_equal([row[8] for row in rows], run.theta)
@@ -68,7 +68,7 @@ def test_a_new_process_continues_with_the_same_bits(tmp_path):
         engine.journal.close()
     engine = opened(config, tmp_path)
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    assert [row[0] for row in told(engine)] == list(range(1, 401))
+    assert [row[0] for row in results_of(engine)] == list(range(1, 401))
     blocks = engine.journal.db.execute("select sum(count), count(*) from block").fetchone()
     assert blocks[0] <= 400
     assert engine.journal.rows_of(1)[0] == list(range(400))
@@ -305,7 +305,7 @@ def test_old_journals_become_parquet(tmp_path):
         feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
     engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
     engine.step(0.0)
-    assert export(tmp_path, engine.journal.floor(), time.time() + 1) == 0  # the states are not stored
+    assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
     engine._store_states(everything=True)
     engine._commit()
     engine._archive.options = engine.config.service.__class__(keep=-1.0)

@@ -13,7 +13,7 @@ from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
-from driftfit.run import fleet, many, outputs, result, shared_outputs
+from driftfit.run import fleet, keyed_results, outputs, result, shared_outputs
 from driftfit.run.live.rule import AlarmRule
 from driftfit.show.fleet_summary import FleetSummary, summarise
 from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Judged(many.Many):
-    """Methods of many runs with keys; see `driftfit.judge.fleet_verdict`."""
+class Judged(keyed_results.KeyedResults):
+    """Verbs of results by key; see `driftfit.judge.fleet_verdict`."""
 
     def values(self) -> Iterator[Track]:
         """The results."""

@@ -179,10 +179,10 @@ class Records:
         """With everything that is known of the samples as columns of ``known``, as these trackers take it."""
         if self.drifts is None and prob is None:
             return self
-        columns, *others = (one.beside(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
+        columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
         if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
             raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
-        return replace(self, known=self.known.with_more(columns), drifts=None)
+        return replace(self, known=self.known.with_extra(columns), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""

@@ -35,7 +35,7 @@ typedef double tracker_real;
 /* theta: {names} */
 
 /* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
-   data have not told apart yet). {known} */
+   data have not distinguished yet). {known} */
 typedef struct {{
 {fields}
 }} tracker_state;

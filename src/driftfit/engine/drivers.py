@@ -94,12 +94,12 @@ def unknown(s: State, l: int) -> None:
 
 @kernel
 def nothing_more(o: State, s: State, l: int) -> None:
-    """Store nothing beside the common fields."""
+    """Store nothing but the common fields."""
 
 
 @kernel
-def nothing_told(s: State, known: Array, t: int, l: int) -> None:
-    """Take nothing from further columns of what is known."""
+def nothing_extra(s: State, known: Array, t: int, l: int) -> None:
+    """Ignore extra columns."""
 
 
 class TrackerSteps(NamedTuple):
@@ -111,9 +111,9 @@ class TrackerSteps(NamedTuple):
     that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
     symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
     of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
-    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
-    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
-    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
+    columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
+    ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -121,8 +121,8 @@ class TrackerSteps(NamedTuple):
     report: Step = diagonal
     begin: Step | None = None
     store: Any = nothing_more
-    told: Any = nothing_told
-    note: Any = nothing_more
+    read_extra: Any = nothing_extra
+    store_for_smoother: Any = nothing_more
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
@@ -264,8 +264,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
-    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
+    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does
+    one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     regress, push, ready = model
@@ -274,7 +274,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
     sample = _sample(regress, push, _advance(tracker))
-    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+    run = _run(driver, sample, tracker.read_extra, tracker.store, covariance if keep == "cov" else nothing_more)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
@@ -308,7 +308,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: Any, keep_more: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
@@ -326,7 +326,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, ke
                 s.drift[l] = known[t * changing, 2, l]
             if known.shape[1] > 3:
                 for l in range(L):
-                    told(s, known, t, l)
+                    read_extra(s, known, t, l)
             if given:
                 for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
                     for l in range(L):

@@ -89,7 +89,7 @@ def shared(function: Callable[..., Any]) -> Any:
     """Compile a function of arrays once for all sizes, to be called.
 
     A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
-    or arrays at addresses, is compiled once and found on disk after that. Unless it is told otherwise, Numba inlines
+    or arrays at addresses, is compiled once and found on disk after that. By default Numba inlines
     what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
     times as long.
     """

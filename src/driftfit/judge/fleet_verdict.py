@@ -258,7 +258,7 @@ def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
 
 def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: str) -> dict[Hashable, Said]:
     """The result of ``judge`` for each run, on all cores; the first runs alone, so that only one thread compiles."""
-    from driftfit.run.lanes import cores
+    from driftfit.run.parallel_lanes import cores
 
     keys, tracks = list(runs), list(runs.values())
     said = [judge(track) for track in tracks[:1]]

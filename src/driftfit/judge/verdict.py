@@ -180,7 +180,7 @@ class Verdict(Printed):
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
-        return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
+        return f"These move: {'; '.join(_sentence(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
         steady = self.constants
@@ -207,14 +207,14 @@ class Verdict(Printed):
 
     def _caution(self) -> str:
         better = [rival.name for rival in self.rivals if rival.rms < self.rms]
-        told = f"Lower error than this run: {', '.join(better)}. " if better else ""
+        text = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
-            told += (
+            text += (
                 "The residuals are correlated, even within segments of constant parameters. A model with too few "
                 f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
                 f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model."
             )
-        return told.strip()
+        return text.strip()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for sentence in self.sentences:
@@ -238,7 +238,7 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
     return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
-def _told(moved: Moved) -> str:
+def _sentence(moved: Moved) -> str:
     """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:

@@ -106,7 +106,7 @@ class Program:
         return out
 
 
-STANDING = ("interval", "noise", "drift", "each")
+STANDING = ("interval", "noise", "drift", "drift_root")
 """Fields with the known factors of one sample."""
 
 

@@ -7,13 +7,13 @@ from collections import Counter
 import numpy as np
 
 from driftfit.engine.settings import warn
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.program import Program, State
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 
 
-def warn_unlearned(run: Track | Shared | Many) -> None:
+def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
     """Warn of what `Tracker.unlearned` names."""
     one = run.rows if isinstance(run, Shared) else run
     ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())

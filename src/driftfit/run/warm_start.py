@@ -16,7 +16,7 @@ from driftfit.data.clock import Clock, instant
 from driftfit.data.record import Labels
 from driftfit.run.program import Program, State
 
-_LEFT = ("interval", "noise", "drift", "each", "F")
+_LEFT = ("interval", "noise", "drift", "drift_root", "F")
 """Fields that are not carried over: an operator's settings of the stream, and the diffuse likelihood of that run."""
 
 

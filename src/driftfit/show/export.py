@@ -21,14 +21,14 @@ from driftfit.data.clock import Clock
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.run.fleet import Fleet
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
 
-Result = Track | Shared | Many
+Result = Track | Shared | KeyedResults
 Single = Track | Outputs | Shared
 """One record."""
 

@@ -169,9 +169,9 @@ def _checks(health: Diagnosis) -> str:
         low, high = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
         state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
         rows.append((check.name, f"{check.value:.4g}", low, high, "not known" if np.isnan(check.value) else state))
-    told = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
+    text = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
     listed = table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
-    return listed + (f"<ul>{told}</ul>" if told else "")
+    return listed + (f"<ul>{text}</ul>" if text else "")
 
 
 def _settings(run: Track, facts: Summary) -> str:

@@ -63,7 +63,7 @@ from driftfit.trackers.parts.modes.filters import (
     weigh,
 )
 from driftfit.trackers.parts.modes.ladder import filters, mix
-from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
+from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
 from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.outlying_readings import (
@@ -214,7 +214,7 @@ class AdaptiveKalman(Tracker):
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("density",)
     density: ClassVar[str] = "density"
-    noted: ClassVar[tuple[str, ...]] = NOTED
+    smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -264,11 +264,20 @@ class AdaptiveKalman(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
-            predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
+            predict,
+            correct,
+            report,
+            begin,
+            keep_density,
+            store_for_smoother=store_for_smoother,
+            machines=(*FRAME, machine_weights),
+            doubts=True,
         )
 
-    def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
-        return varying(noted, e, time, self.state(model.n))
+    def estimated_variances(
+        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
+    ) -> tuple[Array, Array]:
+        return estimated_variances(fields, e, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:

@@ -92,7 +92,9 @@ def _movement(path: Smoothed) -> float:
     path = path.rows if isinstance(path, SmoothedShared) else path
     walk = path.walk
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
-    factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
+    factors = np.broadcast_to(
+        walk.drift[1:, None] * (walk.drift_root[1:] ** 2 if len(walk.drift_root) else 1.0), steps.shape
+    )
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
 
 

@@ -139,7 +139,7 @@ def alarms(
     runs: Mapping[Hashable, Track], kind: str, *, every: float, level: float, reference: Any, **settings: Any
 ) -> ManyAlarms:
     """Watch runs by key; ``reference`` is the same for all, or a mapping from every key to its own."""
-    from driftfit.run.lanes import cores
+    from driftfit.run.parallel_lanes import cores
 
     if not runs:
         raise ValueError("detect: no series has a result to watch.")

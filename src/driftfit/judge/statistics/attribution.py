@@ -28,7 +28,7 @@ from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
 ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be distinguished."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01

@@ -18,9 +18,9 @@ record. Zero drift lies on the boundary of "q >= 0", which invalidates likelihoo
 
 L averages over the record and is most powerful against slow drift. The suprema over one break and over an interval
 (`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. If the scores are white
-and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild`), which also finds a break
-in the last few samples. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, so that the error
-rate is that of all together.
+and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild_bootstrap`), which finds
+a break in the last few samples too. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, whose
+error rate is that of all together.
 
 The noise is estimated under the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which
 are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
@@ -50,7 +50,7 @@ from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
-from driftfit.judge.statistics.wild import wild_supremum
+from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
 POINTS = 48
 """Largest number of points of the path for the suprema and their null; the mean squares use every second point."""

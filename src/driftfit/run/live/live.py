@@ -126,7 +126,7 @@ class Live(Operated, Stream):
         (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
-            return self._update_told(y, u, time, weight, drift, prob)
+            return self._update_with_extra(y, u, time, weight, drift, prob)
         if time is not None or weight != 1.0 or drift != 1.0 or self._careful:
             return self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
         if not isinstance(y, float):
@@ -141,16 +141,16 @@ class Live(Operated, Stream):
         # as `one_or_all`, whose call would take 30 ns
         return self._update(self._tile, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
 
-    def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
-            self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
+            self.tracker.set_extra(self.lane(), self.model, prob, drift if each else None)
         try:
             return self._sample(y, u, time, weight, 1.0 if each else float(drift))  # type: ignore[no-any-return]
         finally:
             if each or prob is not None:
-                self.tracker.tell(self.lane(), self.model, None, None)
+                self.tracker.set_extra(self.lane(), self.model, None, None)
 
     def _factors(self, interval: float, weight: Any, drift: Any) -> tuple[float, float, float]:
         noise = 1.0 if weight == 1.0 else float(noise_of(weight))

@@ -96,7 +96,7 @@ class LiveOutputs(Stream):
         known[2] = 1.0 if each else factor("drift", drift)
         if not each:
             return known
-        columns = self.trackers[0].beside(self._rows, 1, None, np.asarray(drift)[None])
+        columns = self.trackers[0].extra_columns(self._rows, 1, None, np.asarray(drift)[None])
         return np.vstack([known, np.repeat(columns.T, ny, axis=1)])
 
     def predict(self, u: Any = None) -> tuple[Array, Array]:
@@ -176,8 +176,8 @@ class LiveOutputs(Stream):
 
     def _rest(self, tile: Array) -> None:
         """Reset what was known of one sample, because it does not hold for the next."""
-        if "each" in storage.fields(tile):
-            tile["each"] = 1.0
+        if "drift_root" in storage.fields(tile):
+            tile["drift_root"] = 1.0
 
     def _result(self) -> Steps:
         """What the driver wrote, one number per lane."""

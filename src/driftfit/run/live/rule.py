@@ -191,4 +191,4 @@ def change_probability(tracker: Any, fields: Any) -> float:
     """The probability of a change in the tracker's window, from the fields of one lane."""
     if CHANGE in tracker.outputs:
         return float(np.reshape(fields[CHANGE], -1)[0])
-    return float(tracker.told(fields[REPORT], CHANGE))
+    return float(tracker.reported(fields[REPORT], CHANGE))

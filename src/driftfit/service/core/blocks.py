@@ -24,8 +24,8 @@ class Blocks:
         self.unit = unit
         self._rows: list[list[Any]] = []
 
-    def add(self, told: list[Any]) -> None:
-        self._rows.append(told)
+    def add(self, result: list[Any]) -> None:
+        self._rows.append(result)
 
     def flush(self, all_of_it: bool = False) -> list[tuple[Any, ...]]:
         """Rows of the table ``block``: full blocks, or everything so far."""

@@ -23,7 +23,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import Item, Journal, Pending
+from driftfit.service.core.journal import NEEDED_FROM, Item, Journal, Pending
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -50,7 +50,7 @@ class Engine:
         """Notified when results have been stored."""
         self.problem = ""
         self.samples = 0
-        self.told = 0
+        self.last_stored = 0
         """The last group whose results were stored by this process."""
         self.next = self.journal.next_number()
         self.latencies: deque[float] = deque(maxlen=2000)
@@ -64,14 +64,14 @@ class Engine:
 
     def _recover(self) -> int:
         """Bring all states to the end of the log; the number of samples that were processed again."""
-        told, again = self.journal.told(), 0
-        for first, items in self.journal.groups(self.journal.floor()):
+        unstored, again = self.journal.first_without_results(), 0
+        for first, items in self.journal.groups(self.journal.first_needed()):
             out, number = Out(), first
             for item in items:
                 if self._apply(number, item, out, replay=True):
                     again += item.length
                 number += item.length
-            if first >= told:
+            if first >= unstored:
                 self._pending.add_results(first, out.results, out.events, time.time())
             self._flush_blocks(items)
         for unit in self.units.resident:
@@ -204,9 +204,9 @@ class Engine:
             self._pending.snapshots.append((number, upto, unit.state()))
             self._pending.blocks += unit.blocks.flush(all_of_it=True)
         upto = self._pending.log[0] if self._pending.log is not None else self.next
-        floor = next(iter(self._dirty.values()))[0] if self._dirty else upto
+        needed = next(iter(self._dirty.values()))[0] if self._dirty else upto
         if self._pending:
-            self._pending.meta["floor"] = str(floor)
+            self._pending.meta[NEEDED_FROM] = str(needed)
 
     def _commit(self) -> bool:
         """Write the next transaction; wait while that is impossible. False if the service was stopped meanwhile."""
@@ -229,7 +229,7 @@ class Engine:
         self.problem = ""
         self.positions |= self._pending.positions
         results = bool(self._pending.results)
-        self.told = max([self.told, *(first for first, *_ in self._pending.results)])
+        self.last_stored = max([self.last_stored, *(first for first, *_ in self._pending.results)])
         self._pending = Pending()
         if results:
             with self.news:

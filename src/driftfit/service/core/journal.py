@@ -39,6 +39,8 @@ create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
 FORMAT = "1"
+RESULTS_FROM, NEEDED_FROM = "told", "floor"
+"""Keys of ``meta``, as format 1 has them: of `Journal.first_without_results` and `Journal.first_needed`."""
 NAME = "driftfit.db"
 
 
@@ -95,13 +97,13 @@ class Journal:
         row = self.db.execute("select first + count from log order by first desc limit 1").fetchone()
         return max(int(row[0]) if row else 1, int(self.meta("next") or 1))
 
-    def told(self) -> int:
+    def first_without_results(self) -> int:
         """The first group whose results are not yet stored."""
-        return int(self.meta("told") or 1)
+        return int(self.meta(RESULTS_FROM) or 1)
 
-    def floor(self) -> int:
+    def first_needed(self) -> int:
         """The number from which the log is needed, because some state is not stored after it."""
-        return int(self.meta("floor") or 1)
+        return int(self.meta(NEEDED_FROM) or 1)
 
     def positions(self) -> dict[str, Any]:
         """Where sources and sinks have come to."""
@@ -171,7 +173,7 @@ class Pending:
         if rows or events:
             self.results.append((first, len(rows), at, _encode((rows, events))))
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
-        self.meta["told"] = str(first + 1)
+        self.meta[RESULTS_FROM] = str(first + 1)
 
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""

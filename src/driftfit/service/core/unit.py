@@ -131,11 +131,11 @@ class Unit:
             out.event(number, self.number, "over", {"time": time})
         theta = self._theta.tolist() if self._theta is not None else []
         std = [math.sqrt(v) if v >= 0.0 else math.nan for v in self._var.tolist()] if self._var is not None else []
-        told = [number, self.number, time, row[0], y_hat, e, s, ok, theta, std, on]
-        self.last = told
+        result = [number, self.number, time, row[0], y_hat, e, s, ok, theta, std, on]
+        self.last = result
         self.seen += 1
-        self.blocks.add(told)
-        out.results.append(told)
+        self.blocks.add(result)
+        out.results.append(result)
         if not self.calibrated:
             self._remember(time, row, out)
 

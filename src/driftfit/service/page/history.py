@@ -31,7 +31,7 @@ def reduced(
     if total <= 2 * points:
         values = samples(journal, unit, recent, start, stop)
         parts = _parts(values, points)
-        return _told([extremes_of(part) for part in parts], [len(part) for part in parts])
+        return _as_lists([extremes_of(part) for part in parts], [len(part) for part in parts])
     low_high_mean, counts, end = [], [], -1
     query = "select last, count, extremes from block where unit = ? and stop >= ? and start <= ? order by first"
     for last, count, extremes in journal.db.execute(query, (unit, start, stop)):
@@ -42,7 +42,7 @@ def reduced(
     if tail:
         low_high_mean.append(extremes_of(columns_of(tail)))
         counts.append(len(tail))
-    return _told(*_joined(low_high_mean, counts, points))
+    return _as_lists(*_joined(low_high_mean, counts, points))
 
 
 def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float) -> Array:
@@ -108,7 +108,7 @@ def _one(found: list[Array], counts: list[int]) -> Array:
     return np.where(fine.any(axis=0), np.stack([low, high, mean]), np.nan)
 
 
-def _told(found: list[Array], counts: list[int]) -> dict[str, Any]:
+def _as_lists(found: list[Array], counts: list[int]) -> dict[str, Any]:
     """Columns as lists, None where there is no number."""
     if not found:
         return {"count": 0, "low": [], "high": [], "mean": []}

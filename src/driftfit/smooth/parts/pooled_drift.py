@@ -56,16 +56,16 @@ def average_drift(walk: Walk, time: Array) -> Walk:
 
     It is returned as it was if the likelihood cannot be computed accurately.
     """
-    q, span = walk.each**2, time[:, None]
+    q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))
     log_p = np.full((len(shapes), len(SCALES)), -np.inf)
     for k, (one, price) in enumerate(shapes):
         for j, scale in enumerate(SCALES):
-            solved = smooth_and_weigh(walk._replace(each=np.sqrt(scale * one)))
+            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)))
             if solved is None:
                 return walk
             log_p[k, j] = solved[1] - price
     p = np.exp(log_p - log_p.max())
     share = (p / p.sum()) @ np.array(SCALES)
-    return walk._replace(each=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))
+    return walk._replace(drift_root=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))

@@ -54,9 +54,9 @@ from driftfit.trackers.bank.layout import (
     LAST,
     LEAVES,
     LIMIT,
+    MOST_REPORTED,
     ROW,
     SIZE,
-    TOLD,
     WHOLE,
     R,
 )
@@ -312,7 +312,7 @@ class Bank(Tracker):
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
 
-    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
+    def extra_columns(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where none are given; then
         factors of the changes (T, H_d).
         """
@@ -332,9 +332,9 @@ class Bank(Tracker):
             columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 
-    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+    def set_extra(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
-        columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
+        columns, Hd = self.extra_columns(model, 1, prob, drift)[0], len(self.all_changes)
         given = np.split(columns, (self._count, len(columns) - Hd))
         for name, values in zip(("given", "given_chain", "drift"), given, strict=True):
             start = lane["table"][ROW[name], 0] // 8
@@ -372,24 +372,22 @@ class Bank(Tracker):
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return B[:, : max(int(lane["counters"][LEAVES]), 1)]
 
-    def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (of the levels `floors_told`, H) or decided (held, 3) from reports
-        (.., size).
-        """
+    def reported(self, report: Array, name: str) -> Array:
+        """A quantity of reports (.., size): lag_prob (.., levels, H), decided (.., held, 3), or a number."""
         if name in SINGLE:
             return report[..., SINGLE.index(name)]
         shape = self._shape
-        floors = len(self.floors_told)
+        levels = len(self.reported_levels)
         start, rows, columns = {
-            "lag_prob": (HEAD, floors, self._count), "decided": (HEAD + floors * self._count, shape.held, 3),
+            "lag_prob": (HEAD, levels, self._count), "decided": (HEAD + levels * self._count, shape.held, 3),
         }[name]  # fmt: skip
         return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
 
     @property
-    def floors_told(self) -> tuple[int, ...]:
+    def reported_levels(self) -> tuple[int, ...]:
         """The levels of the tree that a report contains, counted back from the present: the newest, and the oldest."""
-        W = self._shape.floors
-        return (*range(min(W, TOLD) - 1), W - 1)
+        W = self._shape.levels
+        return (*range(min(W, MOST_REPORTED) - 1), W - 1)
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
@@ -399,15 +397,15 @@ class Bank(Tracker):
         return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        told = run.hypotheses
-        kinds = [event.kind for event in told.found()]
+        hypotheses = run.hypotheses
+        kinds = [event.kind for event in hypotheses.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
         faults = int(run.state["counters"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
-        if told.impossible:
-            said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
+        if hypotheses.impossible:
+            said.append(("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused"))
         lane = run.state
         if (never := np.isinf(lane["var"])).any():
             names = ", ".join(np.array(run.names)[never])

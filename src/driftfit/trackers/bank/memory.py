@@ -10,7 +10,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
+from driftfit.trackers.bank.layout import COUNT, HEAD, MOST_REPORTED, PACKED, REPORTED, ROW, ROWS, SAMPLE_HEAD, SIZE
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
@@ -52,7 +52,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     """
     Hd, Hm, twice = len(bank.all_changes), len(bank.all_sensors), 2 if bank.chained else 1
     shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
-    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.floors
+    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
@@ -73,8 +73,9 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
-        "ring": np.zeros((RING, BESIDE + H)), "new_events": news_of(H, Hm, remembered), "lag_prob": np.zeros((W, H)),
-        "newest": np.zeros((min(W, TOLD), H)), "decided": np.full((shape.held, 3), -1.0),
+        "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
+        "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
+        "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 

@@ -31,7 +31,7 @@ class Shape(NamedTuple):
 
     parents: int
     children: int
-    floors: int
+    levels: int
     held: int
     knobs: Array
     bases: Array

@@ -66,7 +66,7 @@ def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int)
 
 @machine
 def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l: int) -> None:
-    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has told apart."""
+    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has determined."""
     S_l, R_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l]
     refresh(S_l, R_l, cubes(work, WORK, n, L)[:, :, l])
     floats(now, NOW, L)[VOLUME, l] = unseen(S_l, R_l, cubes(Q, n, n, L)[:, :, l], 0.0)
@@ -107,7 +107,7 @@ def whiten_within(s: State, l: int) -> int:
 
 @kernel
 def frame(s: State, l: int) -> None:
-    """After a change of M: its inverse R, and s.H, a basis of what is not told apart."""
+    """After a change of M: its inverse R, and s.H, a basis of what is not determined."""
     n, L = s.d.shape
     machine_frame(
         s.S.ctypes.data, s.R.ctypes.data, s.H.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l
@@ -179,7 +179,7 @@ def in_units_of_theta(s: State, l: int) -> None:
 
 @kernel
 def unseen_variance(s: State, l: int) -> None:
-    """An infinite variance for what no sample has told apart yet."""
+    """An infinite variance for what no sample has determined yet."""
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i, n):

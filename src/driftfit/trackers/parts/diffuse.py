@@ -352,7 +352,7 @@ def drifted(s: State, time: float, l: int) -> None:
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i, n):
-            s.H[i, j, l] = s.each[i, l] * s.G[i, j, l]
+            s.H[i, j, l] = s.drift_root[i, l] * s.G[i, j, l]
     wander(s, np.sqrt(time), l)
 
 

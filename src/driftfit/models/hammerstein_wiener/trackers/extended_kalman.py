@@ -37,7 +37,7 @@ from driftfit.models.hammerstein_wiener.step_memory import MINIMAL
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import drift, drift_matrix
 from driftfit.trackers.parts.diffuse import LEFT, product_with
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 
 
 def structure_of(owner: str, model: Model) -> Structure:
@@ -119,7 +119,7 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
         s.e[l] = e
         s.s[l] = v
 
-    return TrackerSteps(drift_matrix if together else drift, correct, told=told)
+    return TrackerSteps(drift_matrix if together else drift, correct, read_extra=read_drift)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class ExtendedKalman(Tracker):
     inflation: float = 0.0
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
-    drift_each: ClassVar[bool] = True
+    drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.q is not None:
@@ -178,7 +178,7 @@ class ExtendedKalman(Tracker):
             "r": self.r,
             "inflation": self.inflation,
             "g": np.zeros(n),
-            "each": np.ones(n),
+            "drift_root": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
         }

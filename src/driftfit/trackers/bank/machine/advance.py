@@ -14,7 +14,6 @@ from driftfit.engine.kernel import Array, machine, shared
 from driftfit.trackers.bank.layout import (
     AGAIN,
     ALIKE,
-    BESIDE,
     CHAINED,
     CLOCK,
     ELAPSED,
@@ -22,7 +21,6 @@ from driftfit.trackers.bank.layout import (
     EXPANDED,
     FAULTS,
     FLIPPED,
-    FLOORS,
     GROUPS,
     HELD,
     IMPOSSIBLE,
@@ -42,9 +40,11 @@ from driftfit.trackers.bank.layout import (
     PARTED,
     REFUSED,
     S2,
+    SAMPLE_HEAD,
     SETTLED,
     STORED,
     TAKEN,
+    TREE_LEVELS,
     WIDE,
     WINDOW,
     Y_HAT,
@@ -104,7 +104,7 @@ def copy(P: Array, to: Array) -> None:
 
 @shared
 def increments_now(t: Any) -> None:
-    """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
+    """Covariances of the changes in this interval; where it is one level, a change happens in one nominal sample."""
     time, dt = t.sample[IN_TIME], t.sample[IN_DT]
     increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
 
@@ -252,7 +252,7 @@ def choose(t: Any, L: int) -> None:
 
 @shared
 def reduce(t: Any) -> int:
-    """Carry out what `choose` said: the parents of the next floor, whose number is returned."""
+    """Carry out what `choose` said: the parents of the next level, whose number is returned."""
     counters, L, kind, order = t.counters, t.counters[LEAVES], int(t.reduction[KIND]), t.order
     t.sample[KEPT] = 1.0
     full = kind == REFILTER and counters[STORED] >= int(t.reduction[DEPTH])
@@ -329,7 +329,7 @@ def take_in(t: Any) -> None:
         accept(t, gone)
     else:
         reject(t, K)
-    counters[FLOORS] += 1
+    counters[TREE_LEVELS] += 1
     if counters[WIDE] > 0 and waits:  # the interval to come is a nominal one
         increments(t, 1.0, 1.0)
         ready(t)
@@ -371,7 +371,7 @@ def let_pass(t: Any, L: int) -> None:
     for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
         for l in range(L):
             B[FIRST + n + k, l] = t.C[k, l]
-    counters[FLOORS] += 1
+    counters[TREE_LEVELS] += 1
 
 
 @shared
@@ -431,12 +431,12 @@ def lone_density(sample: Array) -> float:
 @shared
 def note(t: Any, window: float) -> None:
     """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
-    known at last of the event W - 1 floors back.
+    known at last of the event W - 1 levels back.
     """
     row, ring, lag_prob = (t.counters[CLOCK] - 1) % len(t.ring), t.ring, t.lag_prob
     ring[row, 0], ring[row, 1], ring[row, 2] = window, t.sample[IN_OK], t.sample[ELAPSED]
     for e in range(lag_prob.shape[1]):
-        ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
+        ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 @machine

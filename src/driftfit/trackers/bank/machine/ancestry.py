@@ -1,7 +1,7 @@
 """What leaves remember of their past, for tables of probabilities: marginals of events, and of no change since.
 
-Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k floors back | leaf), entry
-k (H + 1) + H is p(no change in the newest k + 1 floors | leaf). A leaf's memory is one piece, so that handing it on is
+Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k levels back | leaf), entry
+k (H + 1) + H is p(no change in the newest k + 1 levels | leaf). A leaf's memory is one piece, so that handing it on is
 one copy and a marginal one sum of rows; the last row of the table is for such sums. What an event adds is a row of
 `new_events`, after which come two rows of factors for what was remembered: where nothing changed, and where something
 did.
@@ -58,7 +58,7 @@ def write_out(t: Any, L: int) -> None:
 
 @shared
 def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
-    """One more floor of which nothing was seen: its events are as likely as before."""
+    """One more level of which nothing was seen: its events are as likely as before."""
     H = len(prior)
     block = H + 1
     for l in range(L):
@@ -101,7 +101,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 @shared
 def summary(lags: Array, newest: Array) -> None:
-    """The newest floors, and the oldest."""
+    """The newest levels, and the oldest."""
     last = len(newest) - 1
     for k in range(len(newest)):
         row = k if k < last else len(lags) - 1
@@ -111,7 +111,7 @@ def summary(lags: Array, newest: Array) -> None:
 
 @shared
 def marginals(t: Any, L: int) -> float:
-    """lag_prob[k, e] = p(event e, k floors back), spec section 4; returns the probability of a change among the floors
+    """lag_prob[k, e] = p(event e, k levels back), spec section 4; returns the probability of a change among the levels
     of the histories.
 
     Leaves are blocks of the children of K parents, in their order. Two spare rows are overwritten.

@@ -123,12 +123,12 @@ def machine_enter(
     counters: int, n: int, L: int, l: int,
 ) -> None:  # fmt: skip
     """`enter_leaves` and `enter_mixture` for lane l of L, from the addresses of fields."""
-    told, x_l, g_l = floats(now, NOW, L)[:, l], floats(x, n, L)[:, l], floats(g, n, L)[:, l]
+    sample, x_l, g_l = floats(now, NOW, L)[:, l], floats(x, n, L)[:, l], floats(g, n, L)[:, l]
     noise = enter_leaves(
-        floats(memory, size, L)[:, l], wholes(table, 3 * ROWS, L)[:, l], wholes(many, counters, L)[:, l], x_l, told,
+        floats(memory, size, L)[:, l], wholes(table, 3 * ROWS, L)[:, l], wholes(many, counters, L)[:, l], x_l, sample,
         unknown > 0, g_l,
     )  # fmt: skip
-    enter_mixture(floats(z, n, L)[:, l], cubes(P, n, n, L)[:, :, l], x_l, told, noise, g_l)
+    enter_mixture(floats(z, n, L)[:, l], cubes(P, n, n, L)[:, :, l], x_l, sample, noise, g_l)
 
 
 FRAMED = (machine_walks, machine_enter)

@@ -1,4 +1,4 @@
-"""One floor of the tree: every leaf with every change, then the sample under every sensor.
+"""One level of the tree: every leaf with every change, then the sample under every sensor.
 
     C- = C / forget + Q_i,     s = factor_j r + z'C- z,     eps = y - b_j - z'm,     K = C- z / s
     m+ = m + K eps,            C+ = C- - K (C- z)'

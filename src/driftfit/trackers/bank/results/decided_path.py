@@ -57,7 +57,7 @@ class EventSmoothed:
 
     @property
     def std(self) -> Array:
-        """inf for what the record never told apart."""
+        """inf for parameters that the record never distinguished."""
         return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(np.einsum("tii->ti", self.covs)))
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:

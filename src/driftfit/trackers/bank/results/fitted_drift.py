@@ -82,7 +82,7 @@ class FittedDrift:
         Q[dates] = self._given.Q[dates]
         return self._given._replace(Q=Q)
 
-    def _told(self, tried: Problem) -> tuple[float, float]:
+    def _deviance(self, tried: Problem) -> tuple[float, float]:
         """-2 log L, but for a constant, and c."""
         phi, y, r, Q, m0, C0 = tried
         logs, squares = forward(phi, y, r, Q, m0, C0.copy(), self._m, self._C)
@@ -90,11 +90,11 @@ class FittedDrift:
         return float(logs + self._count * np.log(scale) + squares / scale), scale
 
     def _cost(self, logs: Array, without: int | None = None) -> float:
-        return self._told(self._at(logs, without))[0]
+        return self._deviance(self._at(logs, without))[0]
 
     def _scaled(self, logs: Array) -> Problem:
         tried = self._at(logs)
-        scale = self._told(tried)[1]
+        scale = self._deviance(tried)[1]
         return tried._replace(r=tried.r * scale, Q=tried.Q * scale, C0=tried.C0 * scale)
 
     def _fit(self, starts: list[Array]) -> None:

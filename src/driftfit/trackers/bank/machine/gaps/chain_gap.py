@@ -11,11 +11,11 @@ A sample that can be used after k others that could not finds each leaf, weight 
     one mode c       w kappa,         C + held[c],                                    stay[s, .] / kappa
     all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
 
-(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a floor as always, with the chain
+(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as always, with the chain
 from the events that they end in. So a jump in the gap, after which all is as before, is a leaf of its own, and so is a
 mode that lasted. That is exact in the probabilities of both courses and of what they end in, and in the first two
 moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
-interval of dt nominal samples is a gap of dt - 1 and a floor.
+interval of dt nominal samples is a gap of dt - 1 and a level.
 
 Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
 numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
@@ -90,7 +90,7 @@ def lengthen(t: Any, share: float) -> None:
 
 @shared
 def go_on(t: Any, dt: float, used: bool) -> None:
-    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
+    """The interval up to this sample, or to the level that ends the gap; Q becomes that of this level, if there is one.
 
     A sample that is refused after all comes here twice.
     """
@@ -162,7 +162,7 @@ def origins(t: Any, L: int, K: int) -> None:
 
 @shared
 def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
-    """The prior of the floor to come of a leaf whose last event has the probabilities p. Where no time passes
+    """The prior of the level to come of a leaf whose last event has the probabilities p. Where no time passes
     (``standing``) nothing changes.
     """
     prior, H, Hm = t.prior, len(t.row), len(t.sensors)
@@ -178,10 +178,10 @@ def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
 
 
 @shared
-def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> None:
-    """What the leaf of one mode remembers: that mode at every floor of the gap, and sensors as they were likely."""
+def remember_one(T: Array, k: int, levels: int, H: int, Hm: int, best: int) -> None:
+    """What the leaf of one mode remembers: that mode at every level of the gap, and sensors as they were likely."""
     block = H + 1
-    known = min(floors, T.shape[1] // block)
+    known = min(levels, T.shape[1] // block)
     quiet = T[k, (known - 1) * block + H] if known > 0 else 1.0
     for at in range(0, T.shape[1] - block + 1, block):
         if at < known * block:
@@ -199,11 +199,11 @@ def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> N
 
 
 @shared
-def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, kappa: float) -> None:
+def remember_other(T: Array, k: int, levels: int, H: int, Hm: int, best: int, kappa: float) -> None:
     """What the leaf of all other courses remembers: the mean without the course of one mode."""
     block = H + 1
     for at in range(0, T.shape[1] - block + 1, block):
-        if at < floors * block:
+        if at < levels * block:
             for j in range(Hm):
                 share = 0.0
                 for e in range(j, H, Hm):
@@ -215,7 +215,7 @@ def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, ka
                 total += T[k, at + e]
             for e in range(H):
                 T[k, at + e] /= total
-        if best == 0 and at >= (floors - 1) * block:
+        if best == 0 and at >= (levels - 1) * block:
             T[k, at + H] = 0.0  # something changed
 
 
@@ -294,10 +294,10 @@ def duplicate(t: Any, T: Array, k: int, to: int) -> None:
 def split(t: Any, K: int) -> int:
     """The parents twice; returns how many there are now.
 
-    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
+    `prior` has for every leaf the shares of the events before the gap, and takes those of the level to come.
     """
     A, T = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, floors, count = len(t.row), len(t.sensors), t.counters[OPEN], K
+    H, Hm, levels, count = len(t.row), len(t.sensors), t.counters[OPEN], K
     count_codes(t, K)
     for k in range(K):
         best, kappa = courses(t, k)
@@ -306,8 +306,8 @@ def split(t: Any, K: int) -> int:
             duplicate(t, T, k, count)
             A[LOG, count] += math.log(1.0 - kappa)
             A[LOG, k] += math.log(kappa)
-            remember_other(T, count, floors, H, Hm, best, kappa)
-            remember_one(T, k, floors, H, Hm, best)
+            remember_other(T, count, levels, H, Hm, best, kappa)
+            remember_one(T, k, levels, H, Hm, best)
             follow_others(t, k, count, best, kappa)
             count += 1
         if parts or kappa >= 1.0 - SURE:

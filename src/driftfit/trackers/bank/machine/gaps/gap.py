@@ -1,6 +1,6 @@
-"""Gaps: what may have happened since the last sample that was used, as one floor of the tree.
+"""Gaps: what may have happened since the last sample that was used, as one level of the tree.
 
-A tree that grew by a floor at every missing sample would fill up with histories that no data tell apart: for events
+A tree that grew by a level at every missing sample would fill up with histories that no data tell apart: for events
 that are independent of each other it does not matter when in the gap a jump was. So leaves take in the ordinary course
 only, sample by sample, and beside them stands what else there may have been: the probability a_0 that nothing but the
 ordinary course was, and for every other change i the probability a_i that it was the first, with the mean A_i of what
@@ -10,7 +10,7 @@ with r_0, and adds Q_i, makes of them
     a_i A_i <- a_i (A_i + D) + a_0 r_i (Q_i + M),    a_i <- a_i + a_0 r_i,    a_0 <- a_0 r_0
 
 where D is the mean of all changes of the interval and M that of those after its first. An interval of dt nominal
-samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one floor with the
+samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one level with the
 probabilities a and the covariances A. Its event stands for the whole gap.
 
 That is exact in the probability of any change, in the first two moments of the parameters after the gap given the
@@ -57,7 +57,7 @@ def odds(gap: Array, row: Array, Hm: int, dt: float, given: bool) -> None:
 
 @shared
 def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
-    """Q, of one change each, becomes that of the floor. A sample that is not ``used`` leaves it to the next one."""
+    """Q, of one change each, becomes that of the level. A sample that is not ``used`` leaves it to the next one."""
     at = gap.shape[1] - WIDTH
     before, more, chance = gap[0, at + SINCE], gap[0, at + MORE], 0.0
     for i in range(1, len(gap)):
@@ -125,13 +125,13 @@ def widen(gap: Array, unit: float, P: Array) -> None:
 
 
 @shared
-def take_back(T: Array, L: int, floors: int, gap: Array, H: int, Hm: int) -> None:
-    """The floors of a gap, whose changes the floor that ends it stands for: they changed nothing themselves."""
+def take_back(T: Array, L: int, levels: int, gap: Array, H: int, Hm: int) -> None:
+    """The levels of a gap, whose changes the level that ends it stands for: they changed nothing themselves."""
     block, width = H + 1, T.shape[1]
     quiet = gap[0, gap.shape[1] - WIDTH + SINCE]
     for l in range(L):
         for k in range(0, width - block + 1, block):
-            if k < floors * block:
+            if k < levels * block:
                 for e in range(Hm, H):
                     T[l, k + e % Hm] += T[l, k + e]
                     T[l, k + e] = 0.0

@@ -1,4 +1,4 @@
-"""Many: results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
+"""Results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
 
 What is common to `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
 copies, and their files.
@@ -26,7 +26,7 @@ from driftfit.run.result import Lane, Track, names_of
 from driftfit.trackers.base import Tracker
 
 
-class Many(Plain):
+class KeyedResults(Plain):
     """Results of many lanes, from key to `Track` like a dict; ``by`` names the parts of a key.
 
     ``programs``, ``lanes`` and ``starts`` have an entry for each output of each series of ``records``, in that order.

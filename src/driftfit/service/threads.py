@@ -18,7 +18,7 @@ READ = 0.5
 """Seconds for which a source may block."""
 
 
-class Runner(threading.Thread):
+class WorkerThread(threading.Thread):
     """A thread that works until it is stopped, and begins again after a pause when something fails."""
 
     what = ""
@@ -57,7 +57,7 @@ class Runner(threading.Thread):
         self.stopping.set()
 
 
-class SourceRunner(Runner):
+class SourceThread(WorkerThread):
     """Reads one source into the intake."""
 
     what = "source"
@@ -86,7 +86,7 @@ class SourceRunner(Runner):
             reader.close()
 
 
-class SinkRunner(Runner):
+class SinkThread(WorkerThread):
     """Hands stored results to one sink."""
 
     what = "sink"
