@@ -98,7 +98,7 @@ class Expressions:
         if owner.kind == "tile":
             return Value("record", "s")
         if owner.kind == "items":
-            item: Value = owner.constant[int(self.value(parts[0]).constant)]
+            item: Value = owner.constant[int(self.value(parts[-1]).constant)]
             return item
         if owner.kind == "table":
             return self._entry(owner, [self.value(one) for one in parts])

@@ -312,6 +312,8 @@ cubes = internals.cube_at("cubes", types.float64)
 """cubes(address, rows, columns, lanes): the array (rows, columns, lanes) of floats that begins at an address."""
 wholes = internals.matrix_at("wholes", types.int64)
 """wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
+packed = internals.named_intrinsic("packed", internals.in_a_row)
+"""packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine."""
 
 
 @kernel

@@ -74,20 +74,10 @@ from driftfit.trackers.parts.outlying_readings import (
     proportion,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+from driftfit.trackers.rls import learn_scale
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
-
-
-@kernel
-def learn_start(s: State, l: int) -> None:
-    """Count a residual of the least squares that the start runs; s.s and s.scale come in units of y."""
-    counted = s.ok[l] * s.fresh[l]
-    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
-    s.count[l] += counted
-    s.s[l] *= s.scale[l]
-    scale = s.squares[l] / s.count[l]
-    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
 
 
 @kernel
@@ -182,7 +172,7 @@ def begin(s: State, l: int) -> None:
         take_in(s, l)
         s.noise[l] = noise
         if s.s[l] < np.inf:
-            learn_start(s, l)
+            learn_scale(s, l)
             s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
         spanned_variance(s, l)
         settle(s, l)

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, shared
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
 from driftfit.trackers.parts.information import spread
 
 ROUNDING = 1e-13
@@ -53,6 +53,9 @@ Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
 """Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
 variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation,
 and the column by which a regressor enters."""
+
+AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = range(10)
+"""Addresses that `machine_learn` is given."""
 
 
 def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
@@ -110,18 +113,15 @@ def prediction(s: State, l: int) -> float:
 
 
 @kernel
-def measurement(s: State, l: int) -> None:
-    """One correction with noise variance s.r: theta, the lower triangle of P, and s.y_hat, s.e, s.s.
+def corrected(s: State, y_hat: float, v: float, l: int) -> None:
+    """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
 
     Only one triangle is updated: P - outer(k, P phi) rounds asymmetrically, and forgetting lets the antisymmetric part
     grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
     """
-    n = s.theta.shape[0]
-    y_hat = prediction(s, l)
-    v = symmetric_product(s, l) + s.r[l] * s.noise[l]
     e = s.y[l] - y_hat
     gain = s.ok[l] / v
-    for i in range(n):
+    for i in range(s.theta.shape[0]):
         k = gain * s.g[i, l]
         s.theta[i, l] += k * e
         for j in range(i):
@@ -130,6 +130,13 @@ def measurement(s: State, l: int) -> None:
     s.y_hat[l] = y_hat
     s.e[l] = e
     s.s[l] = v
+
+
+@kernel
+def measurement(s: State, l: int) -> None:
+    """One correction with noise variance s.r."""
+    y_hat = prediction(s, l)
+    corrected(s, y_hat, symmetric_product(s, l) + s.r[l] * s.noise[l], l)
 
 
 @shared
@@ -317,16 +324,15 @@ def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
 
 
 @machine
-def machine_learn(
-    S: int, d: int, R: int, P: int, theta: int, phi: int, work: int, now: int, var: int, n: int, m: int, L: int, l: int
-) -> None:  # fmt: skip
+def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
-    S_l, R_l, P_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], cubes(P, n, n, L)[:, :, l]
-    learn(
-        S_l, floats(d, n, L)[:, l], R_l, P_l, floats(theta, n, L)[:, l], floats(phi, n, L)[:, l],
-        cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l],
-    )  # fmt: skip
-    spanned(S_l, R_l, P_l, floats(var, m, L)[:, l])
+    at = wholes(fields, 1, ADDRESSES)
+    S, R, P = cubes(at[0, AT_S], n, n, L), cubes(at[0, AT_R], n, n, L), cubes(at[0, AT_P], n, n, L)
+    S_l, R_l, P_l = S[:, :, l], R[:, :, l], P[:, :, l]
+    d, theta, phi = floats(at[0, AT_D], n, L), floats(at[0, AT_THETA], n, L), floats(at[0, AT_PHI], n, L)
+    work, now = cubes(at[0, AT_WORK], WORK, n, L), floats(at[0, AT_NOW], NOW, L)
+    learn(S_l, d[:, l], R_l, P_l, theta[:, l], phi[:, l], work[:, :, l], now[:, l])
+    spanned(S_l, R_l, P_l, floats(at[0, AT_VAR], m, L)[:, l])
 
 
 @machine
@@ -347,12 +353,18 @@ def wander(s: State, size: float, l: int) -> None:
 
 
 @kernel
-def drifted(s: State, time: float, l: int) -> None:
-    """What a random walk of covariance ``time`` E G G' E does to the square root, E the roots of each one's factor."""
+def scale_drift(s: State, l: int) -> None:
+    """s.H = E G, with E the diagonal matrix of the roots of the drift factors."""
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i, n):
             s.H[i, j, l] = s.drift_root[i, l] * s.G[i, j, l]
+
+
+@kernel
+def drifted(s: State, time: float, l: int) -> None:
+    """The time update of the square root for a random walk of covariance ``time`` E G G' E."""
+    scale_drift(s, l)
     wander(s, np.sqrt(time), l)
 
 
@@ -361,10 +373,11 @@ def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
     """`learn` from parameters and regressors at these addresses, with the sample if ok is 1."""
     n, L = s.d.shape
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[AGE, l] = s.y[l], s.r[l] * s.noise[l], ok, age
-    machine_learn(
+    fields = packed((
         s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
-        s.at_start.ctypes.data, s.var.ctypes.data, n, s.var.shape[0], L, l,
-    )  # fmt: skip
+        s.at_start.ctypes.data, s.var.ctypes.data,
+    ))  # fmt: skip
+    machine_learn(fields, n, s.var.shape[0], L, l)
 
 
 @kernel

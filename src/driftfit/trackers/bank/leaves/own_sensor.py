@@ -46,7 +46,7 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
     B, expected, said = t.leaves, t.expected, t.said[0]
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
+    call(t.own_likelihoods, (which, y, expected[1, l], h * unit, r * unit, t.sample[LAST]), said.ctypes.data)
     most = LARGEST * (h + r)
     said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
     said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf

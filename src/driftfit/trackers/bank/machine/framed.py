@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
+from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
 from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
@@ -27,6 +27,10 @@ from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
 WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
 """Rows of the table."""
+(
+    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_G, AT_NOW, ADDRESSES,
+) = range(12)  # fmt: skip
+"""Addresses of fields that the routines here are given."""
 
 
 @shared
@@ -105,34 +109,41 @@ def enter_mixture(z: Array, P: Array, x: Array, now: Array, noise: float, g: Arr
 
 
 @machine
-def machine_walks(
-    memory: int, table: int, M: int, c: int, W: int, unit: float, size: int, n: int, L: int, l: int
-) -> None:
-    """Q of every change for lane l of L, from the addresses of fields."""
-    t, m = wholes(table, 3 * ROWS, L)[:, l], floats(memory, size, L)[:, l]
+def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -> None:
+    """Q of every change for lane l of L, from the addresses of fields; the memory has ``size`` numbers."""
+    at = wholes(fields, 1, ADDRESSES)
+    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
+    M, W = cubes(at[0, AT_S], n, n, L)[:, :, l], cubes(at[0, AT_W], n, n, L)[:, :, l]
+    c = floats(at[0, AT_C], n, L)[:, l]
     wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
     for i in range(t[3 * WALKS + 1]):
         of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
         places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
-        walk(m, places, cubes(M, n, n, L)[:, :, l], floats(c, n, L)[:, l], unit, cubes(W, n, n, L)[:, :, l])
+        walk(m, places, M, c, unit, W)
 
 
 @machine
-def machine_enter(
-    memory: int, table: int, many: int, x: int, z: int, P: int, g: int, now: int, unknown: int, size: int,
-    counters: int, n: int, L: int, l: int,
-) -> None:  # fmt: skip
+def machine_enter(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
     """`enter_leaves` and `enter_mixture` for lane l of L, from the addresses of fields."""
-    sample, x_l, g_l = floats(now, NOW, L)[:, l], floats(x, n, L)[:, l], floats(g, n, L)[:, l]
-    noise = enter_leaves(
-        floats(memory, size, L)[:, l], wholes(table, 3 * ROWS, L)[:, l], wholes(many, counters, L)[:, l], x_l, sample,
-        unknown > 0, g_l,
-    )  # fmt: skip
-    enter_mixture(floats(z, n, L)[:, l], cubes(P, n, n, L)[:, :, l], x_l, sample, noise, g_l)
+    at = wholes(fields, 1, ADDRESSES)
+    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
+    many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
+    x, g = floats(at[0, AT_X], n, L)[:, l], floats(at[0, AT_G], n, L)[:, l]
+    noise = enter_leaves(m, t, many, x, now, unknown > 0, g)
+    enter_mixture(floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], x, now, noise, g)
 
 
 FRAMED = (machine_walks, machine_enter)
-"""What the steps here call, beside those of the coordinates."""
+"""What the steps here call, apart from the routines of the coordinates."""
+
+
+@kernel
+def addresses(s: State) -> int:
+    """The address of those of the fields that these routines work on."""
+    return packed((  # type: ignore[no-any-return]
+        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+    ))  # fmt: skip
 
 
 @kernel
@@ -152,10 +163,7 @@ def write_walks(s: State, l: int) -> None:
     """What the changes of the next sample add, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
-    machine_walks(
-        s.memory.ctypes.data, s.table.ctypes.data, s.S.ctypes.data, s.c.ctypes.data, s.W.ctypes.data, unit,
-        s.memory.shape[0], n, L, l,
-    )  # fmt: skip
+    machine_walks(addresses(s), unit, s.memory.shape[0], n, L, l)
 
 
 @kernel
@@ -168,11 +176,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     s.root[l] = 1
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
-    machine_enter(
-        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
-        s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.memory.shape[0],
-        s.counters.shape[0], n, L, l,
-    )  # fmt: skip
+    machine_enter(addresses(s), s.unknown[l], s.memory.shape[0], s.counters.shape[0], n, L, l)
 
 
 @kernel

@@ -6,7 +6,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
-from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.adaptive_kalman import RESIDUALS
 from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
@@ -46,6 +46,7 @@ from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 
@@ -185,7 +186,7 @@ def alone(s: State, l: int, counts: bool) -> None:
     """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
     learn_scales(s, l)
     if counts:
-        learn_start(s, l)
+        learn_scale(s, l)
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
