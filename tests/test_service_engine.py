@@ -4,6 +4,7 @@ import shutil
 import sqlite3
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -204,26 +205,30 @@ def test_alarms_from_a_frozen_reference(tmp_path):
     engine.close()
 
 
-def test_a_full_disk_holds_back_and_loses_nothing(tmp_path):
+def test_a_full_disk_holds_back_and_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("driftfit.service.core.engine.RETRY", 0.2)
     y, u = record(100)
     engine = opened(configured(), tmp_path)
     feed(engine, message("plant/a", range(50), y[:50], u[:50]))
     settled(engine)
     pages = engine.journal.db.execute("pragma page_count").fetchone()[0]
     engine.journal.db.execute(f"pragma max_page_count = {pages}")
-    waits = []
+    problems = []
 
-    def waited(seconds):
-        waits.append(engine.problem)
+    def make_room():
+        while not engine.problem:
+            time.sleep(0.01)
+        problems.append(engine.problem)
         engine.journal.db.execute("pragma max_page_count = 1000000")
-        return False
 
-    engine._stop.wait = waited
+    helper = threading.Thread(target=make_room)
+    helper.start()
     wide = message("plant/a", range(50, 100), y[50:], u[50:], other=["x" * 200] * 50)
     for k in range(40):  # other units until the file is full
         engine.intake.put("web", message(f"plant/x{k}", range(50), y[:50], u[:50]))
     assert feed(engine, wide)
-    assert "full" in waits[0]
+    helper.join()
+    assert "full" in problems[0]
     assert engine.problem == ""
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
     engine.close()
@@ -296,11 +301,12 @@ def test_topics_that_no_unit_has(engine):
     assert engine.units.refused["too many units"] == 3
 
 
-def test_old_journals_become_parquet(tmp_path):
+def test_old_journals_become_parquet(tmp_path, monkeypatch):
     import polars as pl
 
     y, u = record(100)
-    engine = opened(configured(), tmp_path)
+    config = configured()
+    engine = opened(replace(config, service=replace(config.service, keep=-1.0)), tmp_path)
     for k in range(0, 100, 10):
         feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
     engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
@@ -308,11 +314,9 @@ def test_old_journals_become_parquet(tmp_path):
     assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
     engine._store_states(everything=True)
     engine._commit()
-    engine._archive.options = engine.config.service.__class__(keep=-1.0)
-    engine._archive._looked = -1e9
+    monkeypatch.setattr("driftfit.service.core.archive.EVERY", -1.0)
     for _ in range(100):
-        engine._archive.forget(engine._pending, engine.journal, engine.next)
-        engine._commit()
+        engine.step(0.0)
         if not engine.journal.rows_of(1)[0]:
             break
         time.sleep(0.05)

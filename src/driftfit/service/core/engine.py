@@ -33,6 +33,8 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it looks after other things."""
+RETRY = 1.0
+"""Seconds between two attempts to write the journal."""
 
 
 class Engine:
@@ -222,7 +224,7 @@ class Engine:
                 if not self.problem:
                     log.error("journal", extra={"detail": str(error)})
                 self.problem = f"the journal cannot be written: {error}; sources are held back."
-                if self._stop.wait(1.0):
+                if self._stop.wait(RETRY):
                     return False
                 continue
             break
