@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 from driftfit.data.record import Reading
 from driftfit.fleets import Fleet
@@ -18,6 +18,20 @@ Ranges = Mapping[Any, tuple[float | None, float | None]] | None
 """From signals to their valid ranges."""
 
 
+class Given(TypedDict, total=False):
+    """What every form of `track` takes by name."""
+
+    data: Any
+    time: Any
+    dt: Any
+    weights: Any
+    drift: Any
+    units: Mapping[str, str] | None
+    limits: Ranges
+    exclude: Any
+    keep: str
+
+
 @overload
 def track(
     model: Model,
@@ -25,18 +39,10 @@ def track(
     y: Any,
     u: Any = None,
     *,
-    data: Any = None,
-    time: Any = None,
     by: None = None,
-    dt: Any = None,
-    weights: Any = 1.0,
-    drift: Any = 1.0,
-    units: Mapping[str, str] | None = None,
-    limits: Ranges = None,
-    exclude: Any = None,
-    keep: str = "std",
     warm_start: Run | None = None,
     prob: Any = None,
+    **given: Unpack[Given],
 ) -> Track: ...
 
 
@@ -47,17 +53,9 @@ def track(
     y: Any,
     u: Any = None,
     *,
-    data: Any = None,
-    time: Any = None,
     by: str | Sequence[str] | None = None,
-    dt: Any = None,
-    weights: Any = 1.0,
-    drift: Any = 1.0,
-    units: Mapping[str, str] | None = None,
-    limits: Ranges = None,
-    exclude: Any = None,
-    keep: str = "std",
     warm_start: Fleet | None = None,
+    **given: Unpack[Given],
 ) -> Fleet: ...
 
 
