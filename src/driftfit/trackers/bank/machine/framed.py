@@ -1,17 +1,17 @@
-"""A bank in the coordinates of its start: for offsets that a covariance cannot hold, and directions not seen yet.
+"""A bank in the coordinates of its start: for offsets that a covariance cannot represent, and unknown directions.
 
-The compiled routine is given x and z in the place of phi and theta (`driftfit.trackers.parts.coordinates`), and needs
-to know no more: what it does to means and covariances is the same in all coordinates, as long as changes are walks and
-no leaf has output lags of its own. Change i then adds
+The compiled routine is given x and z in place of phi and theta (`driftfit.trackers.parts.coordinates`) and needs no
+other change: its updates of means and covariances hold in all coordinates, if all changes are random walks and no leaf
+has separate output lags. Change i then adds
 
     M (Q_i + diag(sizes_i r / c)) M'
 
-to a covariance. A regressor that leaves the span of those before it enters every leaf by column j, in what is left of
-its innovation; it moves no weight. What else may have happened since the last used sample, and the mixture, are the
-same linear map of what they were: C_j. = -C x and C_jj = x' C x + v.
+to a covariance. A regressor outside the span of the earlier ones determines column j of every leaf from its innovation;
+it changes no weight. The covariances of the gap and of the mixture are mapped in the same way: C_j. = -C x and C_jj =
+x' C x + v.
 
-A bank is run so where its start is not determined well enough for a covariance by the time there are residuals; the
-others are given phi and theta, at less cost. Cost per sample: O(n^3) for each change.
+A bank runs this way if its start is not determined well enough for a covariance when the first residuals are available;
+other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELD
 
 @shared
 def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float, W: Array) -> None:
-    """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are where it goes, where Q is and where sizes are, or
-    -1 where there are none."""
+    """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are the offsets of the result, of Q, and of the sizes
+    (-1: none).
+    """
     n = len(S)
     to, fixed, sizes = places
     for a in range(n):
@@ -58,7 +59,7 @@ def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float
 
 @shared
 def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, noise: float, g: Array) -> None:
-    """Row j of a covariance whose lower triangle lies from ``at`` on, ``step`` apart."""
+    """Fill row j of a covariance whose lower triangle begins at ``at`` with stride ``step``."""
     n, h = len(x), noise
     for a in range(n):
         g[a] = 0.0
@@ -73,7 +74,7 @@ def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, no
 
 @shared
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
-    """All leaves, and what may have happened since the last used sample; returns the mean noise variance."""
+    """Add the direction to all leaves and to the covariances of the gap; returns the mean noise variance."""
     n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
     B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
     for leaf in range(many[LEAVES]):
@@ -148,7 +149,7 @@ def addresses(s: State) -> int:
 
 @kernel
 def begin_framed(s: State, l: int) -> None:
-    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance if that is unknown."""
+    """The single leaf with which the bank begins: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
     s.framed[l] = 1
     frame(s, l)
@@ -160,7 +161,7 @@ def begin_framed(s: State, l: int) -> None:
 
 @kernel
 def write_walks(s: State, l: int) -> None:
-    """What the changes of the next sample add, in these coordinates."""
+    """Write the covariances that changes add at the next sample, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
     machine_walks(addresses(s), unit, s.memory.shape[0], n, L, l)
@@ -168,7 +169,7 @@ def write_walks(s: State, l: int) -> None:
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Take a regressor in by the column by which it leaves the span; the compiled routine has let time pass."""
+    """Process a regressor that leaves the span by a column; the compiled routine has made the time update."""
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
@@ -195,7 +196,7 @@ def read_framed(s: State, l: int) -> None:
 
 
 def in_theta(lane: dict[str, Array], means: Array, covs: Array) -> tuple[Array, Array]:
-    """means (L, n) and covs (L, n, n) of z as those of theta; they stay what they are where the bank is not framed."""
+    """Convert means (L, n) and covs (L, n, n) of z to theta; without these coordinates they are returned unchanged."""
     if not lane["framed"]:
         return means, covs
     R = lane["R"]

@@ -53,14 +53,14 @@ GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift
 
 @kernel
 def keep(o: State, s: State, l: int) -> None:
-    """Store what tells of events."""
+    """Store the report of events."""
     for k in range(s.report.shape[0]):
         o.report[k, l] = s.report[k, l]
 
 
 @kernel
 def only_drift(s: State, l: int) -> None:
-    """The first change, for the one filter before the bank starts."""
+    """The time update by the first change, for the single filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
     keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
     at = 0
@@ -93,7 +93,7 @@ def only_drifted(s: State, l: int) -> None:
 
 @kernel
 def point(s: State) -> None:
-    """Write where the arrays are into the table."""
+    """Write the addresses of the arrays into the table."""
     framed = s.framed[0] > 0
     s.table[MEMORY_AT, 0, 0] = s.memory.ctypes.data
     s.table[REPORT_AT, 0, 0] = s.report.ctypes.data
@@ -114,7 +114,7 @@ def report(s: State, l: int) -> None:
 
 @kernel
 def among(s: State, l: int) -> None:
-    """The same for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
+    """The same for one of several outputs: the numbers of one lane are not contiguous, so it works on copies."""
     n, N, size, framed = s.theta.shape[0], s.memory.shape[0], s.report.shape[0], s.framed[l] > 0
     memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
     vectors = report + 8 * size
@@ -160,7 +160,7 @@ def among(s: State, l: int) -> None:
 
 @kernel
 def run(s: State, l: int) -> None:
-    """The compiled routine; addresses are no part of the state."""
+    """Call the compiled routine; addresses are not part of the state."""
     if s.theta.shape[1] > 1:
         among(s, l)
     else:
@@ -173,7 +173,7 @@ def run(s: State, l: int) -> None:
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """The numbers of this sample, for the compiled routine."""
+    """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
@@ -183,7 +183,7 @@ def hand_over(s: State, l: int) -> None:
 
 @kernel
 def alone(s: State, l: int, counts: bool) -> None:
-    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     if counts:
         learn_scale(s, l)
@@ -218,7 +218,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def in_coordinates(s: State, l: int) -> None:
-    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
+    """Process one sample in the coordinates of the start; a sample outside the span changes no weight."""
     column, y_hat = whiten_within(s, l), prediction(s, l)
     write_walks(s, l)
     hand_over(s, l)
@@ -256,7 +256,7 @@ def begin(s: State, l: int) -> None:
 
 @kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
+    """Read the priors of the joint events of this sample, a chain of the changes, and the drift factors of the changes."""
     row, column = t if known.shape[0] > 1 else 0, 3
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):
         start = s.table[field, 0, l] // 8
