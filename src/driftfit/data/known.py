@@ -1,4 +1,4 @@
-"""What is known of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
+"""Known numbers of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from driftfit.trackers.base import Tracker
 
 @dataclass(frozen=True)
 class Labels:
-    """The names and units of the signals of a series, and what was left out of it.
+    """The names and units of the signals of a series, and counts of what was left out.
 
     ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
     counts rows that never became samples, and ``missing`` counts, by reason, numbers that were treated as missing.

@@ -1,7 +1,7 @@
-"""Functions that a compiled machine calls by their address, which a step finds by their symbol.
+"""Functions that a compiled machine calls by address; a step looks the address up by symbol.
 
-A machine is compiled once for all; a function of the user's that it calls is not known then. So the function becomes a
-machine of its own, a step asks for its address where it runs, and `call` goes there.
+A machine is compiled once; the user's function that it calls is not yet known then. So the function is
+compiled as a separate machine, a step looks up its address at run time, and `call` calls it.
 """
 
 from __future__ import annotations

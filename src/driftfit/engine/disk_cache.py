@@ -1,14 +1,14 @@
 """Compiled code on disk: one file for each function and signature, found by a name made of all that it depends on.
 
-Numba keeps the signatures of a function in one index and numbers its files by what the index held when it was read: two
-processes that compile different layouts at the same moment may store both under one number, and a third runs the wrong
-code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the processor,
-and the versions of everything that makes code, so that two processes can only ever write the same content; a file
-appears at once or not at all, and what was in a damaged file is compiled again.
+Numba keeps the signatures of a function in one index and numbers its files by the length of the index when it was read:
+two processes that compile different layouts at the same moment may store both under one number, and a third runs the
+wrong code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the
+processor, and the versions of everything that makes code, so that two processes can only ever write the same content; a
+file is written completely or not at all, and the contents of a damaged file are compiled again.
 
 The folder is ``NUMBA_CACHE_DIR`` where that is set, else ``__pycache__`` of the package, else the user's cache folder.
 Code is found in any of them, as in an image that was filled by ``driftfit warm`` and can only be read, and written to
-the first that can be written. Where none can, it is compiled in memory by every process, and a warning says so
+the first that can be written. If no folder can be written, every process compiles in memory, and a warning is issued
 once.
 """
 
@@ -61,7 +61,7 @@ def folder() -> Path | None:
 
 @cache
 def makers() -> str:
-    """What decides how code is made: versions, processor, and the files that emit code by hand."""
+    """Everything that determines the generated code: versions, processor, and the files that emit code by hand."""
     build = hashlib.sha256()
     for name in MAKERS:
         build.update((PACKAGE / name).read_bytes())
@@ -75,7 +75,7 @@ def name_of(function: str, identity: str, signature: Any) -> str:
 
 
 def read(name: str) -> Any:
-    """What was kept under a name, in any of the folders; None where there is nothing, or nothing whole."""
+    """The code stored under a name in any of the folders; None where there is nothing, or nothing whole."""
     for place in folders():
         try:
             data = (place / name).read_bytes()
@@ -148,7 +148,7 @@ def contents() -> Contents:
 
 
 def prune(days: float) -> int:
-    """Remove what other versions made, and what was not used for so many days; returns how many files."""
+    """Remove code that other versions made, and code that was not used for so many days; returns how many files."""
     oldest = time.time() - 86400.0 * days
     gone = [path for path in _files() if not _mine(path) or path.stat().st_mtime <= oldest]
     for path in gone:

@@ -31,7 +31,9 @@ WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
 LARGEST = 1e38
-"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+"""Signals at least this large are not used: about the largest number in single precision, and more than any
+measurement.
+"""
 
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
@@ -47,9 +49,9 @@ def no_preparation(L: int) -> None:
 
 
 class ModelSteps(NamedTuple):
-    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
+    """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` brings what they call by symbol within reach, before a tile of L lanes is driven for the first time.
+    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
     """
 
     regress: Step
@@ -59,7 +61,7 @@ class ModelSteps(NamedTuple):
 
 @kernel
 def clean(s: State, l: int) -> None:
-    """Decide what can be used, and make everything that trackers read finite.
+    """Decide which data can be used, and make everything that trackers read finite.
 
     Entries of phi and y are cleaned by themselves: zeroing all of phi when only y is missing would make an ARX model's
     own prediction zero and so bias its lags.
@@ -103,14 +105,14 @@ def nothing_extra(s: State, known: Array, t: int, l: int) -> None:
 
 
 class TrackerSteps(NamedTuple):
-    """What a tracker compiles.
+    """The steps of a tracker.
 
-    ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
-    happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
-    that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
-    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change), ``correct`` the
+    measurement update. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use ``s.ok`` (0 or 1)
+    as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that start from no
+    knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are the routines that it calls by symbol;
+    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
+    tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
     ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
@@ -277,7 +279,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     run = _run(driver, sample, tracker.read_extra, tracker.store, covariance if keep == "cov" else nothing_more)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
         inputs = {"y": y, "u": u, "known": known}
         inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
         _check_shapes(tile, len(out), **inputs)
@@ -402,4 +404,4 @@ def tile_type(tile: Array) -> types.Type:
 
 
 _TILE_TYPES: dict[Any, types.Type] = {}
-"""Types by what they depend on, one for each kind of tile that was compiled."""
+"""Record types by their fields, one for each kind of tile that was compiled."""

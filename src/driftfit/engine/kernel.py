@@ -1,4 +1,4 @@
-"""Lanes: the record that holds a state, and the decorators that compile what works on it.
+"""Lanes: the record that holds a state, and the decorators that compile functions of it.
 
 The state of one tile is one NumPy record. Every field has a fixed shape with a trailing lane axis of length L, so that
 for n parameters ``theta`` is (n, L) and ``P`` is (n, n, L). A *step* is a function ``step(s, l)`` that works on lane
@@ -78,8 +78,8 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     """Compile a step, or a function that steps call.
 
     Inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at n = 4).
-    With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
-    instead of raising, the GIL is released, and there is no fast-math.
+    With ``inline=False`` the compiler may choose; this is for functions that the lane loop is faster without. Division
+    follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
     made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
@@ -88,7 +88,7 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
 def shared(function: Callable[..., Any]) -> Any:
     """Compile a function of arrays once for all sizes, to be called.
 
-    A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
+    A step is recompiled for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
     or arrays at addresses, is compiled once and found on disk after that. By default Numba inlines
     what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
     times as long.
@@ -102,7 +102,7 @@ def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] =
 
     Passing a few dozen arrays may cost more than the work on them. With ``sizes`` the first argument is a number of
     parameters, and the work is compiled once for each of these sizes, which the compiler then knows, so that it unrolls
-    loops and keeps what they work on in registers; and once for all others.
+    loops and keeps their data in registers; and once for all others.
     """
     if function is None:
         return lambda source: _for_sizes(part(source), sizes)
@@ -127,8 +127,8 @@ def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
 class Machine(types.ExternalFunction):
     """A routine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
-    What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
-    compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
+    An ordinary function that a driver calls is linked into it and optimised again for every type of record. A machine
+    is compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
     """
 
     identity: str
@@ -144,7 +144,7 @@ class Machine(types.ExternalFunction):
         return self.dispatcher.py_func
 
     def __reduce__(self) -> Any:
-        """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
+        """By its name: Numba pickles the globals of a step into the key of its cache, and numbers types by process."""
         return _machine, (self.symbol,)
 
     def load(self) -> None:
@@ -243,11 +243,11 @@ class Driver:
 
 
 LAYOUT = 0x0001 | 0x0002 | 0x0100
-"""NumPy's flags of what the compiler's type of an array knows: rows contiguous, columns contiguous, aligned."""
+"""NumPy's flags that are part of the compiler's type of an array: rows contiguous, columns contiguous, aligned."""
 
 
 def _kind(value: Any) -> Any:
-    """What the type of an argument depends on."""
+    """The properties on which the type of an argument depends."""
     if not isinstance(value, np.ndarray):
         return type(value)
     return value.dtype, value.ndim, value.flags.num & LAYOUT
@@ -303,7 +303,7 @@ def _release_locks() -> None:
         lock.release()
 
 
-if hasattr(os, "register_at_fork"):  # a child has no thread that would release what another one held: fork between them
+if hasattr(os, "register_at_fork"):  # a child process has no thread that would release its parent's locks
     os.register_at_fork(before=_acquire_locks, after_in_parent=_release_locks, after_in_child=_release_locks)
 
 floats = internals.matrix_at("floats", types.float64)

@@ -1,7 +1,7 @@
 """All that leans on the private side of Numba and llvmlite. No other module imports `numba.core` or llvmlite.
 
-Each section says what it leans on and why. `tests/contract/test_numba_internals.py` has a canary for each, which says
-in a sentence what broke. Tried with the versions in `TRIED`.
+Each section names the private parts that it uses, and the reason. `tests/contract/test_numba_internals.py` has a canary
+for each, which names in one sentence what broke. Tried with the versions in `TRIED`.
 
     lock           numba.core.compiler_lock         one lock for all that compiles, so that threads cannot mix
     identity       Dispatcher._set_uuid             other processes find closures over compiled functions
@@ -19,7 +19,7 @@ in a sentence what broke. Tried with the versions in `TRIED`.
     fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
-What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,
+Public means are used instead for: types and typeof, intrinsics, data models, compile options (`numba.njit`,
 `numba.extending`).
 """
 
@@ -107,7 +107,7 @@ def processor() -> str:
 
 
 def versions() -> tuple[str, str]:
-    """Of what makes code."""
+    """Options of the code generator."""
     return numba.__version__, llvmlite.__version__
 
 
@@ -149,7 +149,7 @@ def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, 
 
 
 class Fragment(JITCodeLibrary):
-    """Code for others to take in: neither optimised nor emitted, which those who take it in do."""
+    """Code that other functions inline: neither optimised nor emitted, which those who take it in do."""
 
     def _optimize_final_module(self) -> None:
         """Left to those who take it in."""
@@ -167,7 +167,7 @@ class Fragment(JITCodeLibrary):
 
 
 class WholeFragment(Fragment):
-    """Code that is optimised with all that it takes in."""
+    """Code that is optimised together with everything that it inlines."""
 
     def _optimize_final_module(self) -> None:
         JITCodeLibrary._optimize_final_module(self)
@@ -179,9 +179,9 @@ class WholeFragment(Fragment):
 
 
 class StepFragment(WholeFragment):
-    """A step that takes in no other is optimised: what the compiler makes of a loop over lanes depends on it (5 %).
+    """A step that inlines no other step is optimised: what the compiler makes of a loop over lanes depends on it (5 %).
 
-    One that takes in others holds what is optimised in them, and is optimised with the driver that takes it in. Doing
+    A step that inlines others contains optimised code, and is optimised with the driver that inlines it. Doing
     it at every level took a quarter of the time of compiling an `AdaptiveKalman`, and gave no faster code.
     """
 
@@ -191,7 +191,7 @@ class StepFragment(WholeFragment):
 
 
 class PartDispatcher(CPUDispatcher):
-    """A function that Numba compiles for others to take in."""
+    """A function that Numba compiles so that others inline it."""
 
     library: type[Fragment] = Fragment
 
@@ -221,7 +221,7 @@ class StepDispatcher(PartDispatcher):
 
 
 class WholeDispatcher(PartDispatcher):
-    """A function that takes in all that it calls."""
+    """A function that inlines everything that it calls."""
 
     library = WholeFragment
 
@@ -273,7 +273,9 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 
 _builders: dict[Any, Any] = {}
-"""What makes LLVM's passes, by its options: Numba makes one for every function, and LLVM does not free all of it."""
+"""The builders of LLVM's passes, by their options: Numba makes one for every function, and LLVM does not free all of
+it.
+"""
 
 
 # ---- memory ---------------------------------------------------------------------------------------------------------
@@ -285,7 +287,8 @@ for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
         _manager._dispose = passes.NewPassManager._dispose
 
 _recent: OrderedDict[Any, None] = OrderedDict()
-"""(dispatcher, types of the arguments) of what was compiled only to be linked, those used last at the end."""
+"""(dispatcher, types of the arguments) of functions that were compiled only to be linked, the most recently used last.
+"""
 
 
 def _note_use(dispatcher: Any, signature: Any) -> None:
@@ -317,7 +320,7 @@ OWN_ADDRESSES = "numba.dynamic.globals"
 
 
 class Code(NamedTuple):
-    """A compiled function that Python calls, as it is kept on disk."""
+    """A compiled function that Python calls, as stored on disk."""
 
     data: bytes
     """Object code."""
@@ -403,7 +406,7 @@ def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
 def _array(dtype: Any, *shape: Any) -> Any:
     """The typed half of an intrinsic ``f(address, *shape)``: the C array of this shape that begins at an address.
 
-    `numba.carray` does the same by two functions of its own for every caller, and counts references.
+    `numba.carray` does the same with two additional functions for every caller, and counts references.
     """
     array = types.Array(dtype, len(shape), "C")
 

@@ -1,6 +1,6 @@
 """Results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
 
-What is common to `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
+The common part of `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
 copies, and their files.
 """
 
@@ -69,7 +69,7 @@ class KeyedResults(Plain):
 
     @property
     def by(self) -> tuple[str, ...]:
-        """Names of what identifies the results, one for each part of a key."""
+        """Names of the parts of a key."""
         raise NotImplementedError
 
     @property
@@ -89,7 +89,7 @@ class KeyedResults(Plain):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of what was written for all series."""
+        """Bytes of the results of all series."""
         return sum(lane.out.nbytes // lane.tile["theta"].shape[-1] for lane in self._lanes if lane)
 
     def __len__(self) -> int:

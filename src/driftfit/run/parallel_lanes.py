@@ -54,7 +54,7 @@ def run_lanes(
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
     ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
-    that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
     ny = records.ny
@@ -216,7 +216,8 @@ def _gather_signals(y: Array, u: Array, start: Array, column: Array, to_y: Array
 
 @Driver
 def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) -> None:
-    """The same for what is known of the samples (one row if it is the same for all); dt = 0 for a lane that has ended.
+    """The same for the known numbers of the samples (one row if they are equal for all); dt = 0 for a lane that has
+    ended.
 
     ``known`` is (T, k, ny).
     """

@@ -14,7 +14,7 @@ from driftfit.run.shared_outputs import Shared
 
 
 def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
-    """Warn of what `Tracker.unlearned` names."""
+    """Warn of the parameters that `Tracker.unlearned` marks."""
     one = run.rows if isinstance(run, Shared) else run
     ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())
     found, counts, owners = 0, Counter[str](), []

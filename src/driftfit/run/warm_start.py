@@ -33,7 +33,7 @@ class End(NamedTuple):
 
 
 class Run(Protocol):
-    """What a warm start can begin from: a `Track`, a `Live`, or one of several outputs."""
+    """Runs from which a warm start can begin: a `Track`, a `Live`, or one of several outputs."""
 
     def end(self) -> End:
         """The end of the run."""

@@ -8,11 +8,11 @@ are 1 for one half of the filters; for the others they are learned from the reco
 a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
 The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
-the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
-proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
-(`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
-(`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
-out too (`driftfit.trackers.parts.frozen`).
+the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
+outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
+due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
+of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
+last value are left out too (`driftfit.trackers.parts.frozen`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -191,7 +191,7 @@ class AdaptiveKalman(Tracker):
     ----------
     groups : sequence of sequences of indices, or None
         Parameters that drift together, such as ``[[0, 1], [2]]``: each group has filters in which it alone drifts.
-        None: only what is learned from the record.
+        None: only quantities that are learned from the record.
 
     Raises
     ------

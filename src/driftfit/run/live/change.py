@@ -1,4 +1,4 @@
-"""What changed, by how much and since when: what an alarm with a frozen reference model can tell."""
+"""A change that an alarm with a frozen reference model found: what changed, by how much and since when."""
 
 from __future__ import annotations
 

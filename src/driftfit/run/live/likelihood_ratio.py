@@ -40,7 +40,8 @@ LEVELS, BLOCKS, SHORT = 6, 12, 8
 GAP = 1.5
 """An interval longer than this breaks an autoregression."""
 SHIFT = 0.5
-"""What the score CUSUM waits for, in standard deviations of the noise per root mean square regressor."""
+"""The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
+"""
 FLAT = 1e-9
 WIDE = 30.0
 """x is limited to this for the size of a change."""
@@ -51,7 +52,7 @@ mean and variance of x^2, LONGEST is the longest window that judges the noise, N
 SINCE, LEVEL, COUNT = range(3)
 """Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
 ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
-"""Entries of what is written for a sample; the CUSUM of n parameters and of the noise come last."""
+"""Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
 
 
 class Frozen(NamedTuple):
@@ -261,7 +262,7 @@ def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
 
 @shared
 def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
-    """Take in the sample whose sums are in memory.sample, and write its statistics."""
+    """Add the sample whose sums are in memory.sample, and write its statistics."""
     n = frozen.theta.shape[0]
     sums, last = memory.sums, memory.last
     memory.counts[COUNT] += 1.0

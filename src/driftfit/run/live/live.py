@@ -198,7 +198,7 @@ class Live(Operated, Stream):
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
 
-        Row 0 is what `Track.smooth` would give for that sample of a record that ends now.
+        Row 0 equals the result of `Track.smooth` at that sample for a record that ends now.
         """
         ((_, window),) = self._windowed()
         return window.smooth(self._tile)

@@ -14,11 +14,11 @@ Jumps are visible only through the regressors: without excitation there is no de
 `Bank()` alone depends on no scale: see `driftfit.trackers.bank.change`. If the noise variance is unknown (r of the
 nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it is given.
 
-A sample that is not used changes no weight: the leaves become wider by what may have happened, and depth counts used
-samples. Until there are four residuals (with known noise: full rank, or four samples without a new direction) only the
-first change acts. The tree then grows in the directions that the regressors span, and a later direction enters as the
-exact limit of a wide prior. A bank with changes that forget, with leaves that have their own output lags, or with
-form="sqrt" waits for full rank.
+A sample that is not used changes no weight: the leaves are widened by the changes that may have happened, and depth
+counts used samples. Until there are four residuals (with known noise: full rank, or four samples without a new
+direction) only the first change acts. The tree then grows in the directions that the regressors span, and a later
+direction enters as the exact limit of a wide prior. A bank with changes that forget, with leaves that have their own
+output lags, or with form="sqrt" waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -86,7 +86,7 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        What may happen to theta between samples; the first is the normal course. None: a small drift, and a rare
+        Changes of theta between samples; the first is the normal course. None: a small drift, and a rare
         jump of any parameter, both scale-free.
     sensors : list of Sensor
         How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance.

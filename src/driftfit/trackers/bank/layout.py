@@ -1,4 +1,4 @@
-"""The table of a bank: where its arrays lie, and what its counters and the numbers of a sample are called.
+"""The table of a bank: the places of its arrays, and the names of its counters and of the numbers of a sample.
 
 Every part of the compiled routine is given the table alone (`driftfit.trackers.bank.table`) and reads from it by name.
 Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaf_matrix`.
@@ -53,7 +53,7 @@ it begins with the next sample. OPEN levels have passed since the last used samp
 (`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
 AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already. Of the
 present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its level
-is another than that of one nominal interval, PARTED that leaves go on as two (`machine.gaps.chain_gap`).
+is another than that of one nominal interval, PARTED that leaves are continued as two (`machine.gaps.chain_gap`).
 """
 WAITING, READY = 0, -1
 (
@@ -72,7 +72,7 @@ SAMPLE_HEAD = 3
 many nominal intervals had passed.
 """
 MOST_REPORTED = 8
-"""Levels that a report tells of: all, or where more are remembered the newest and the oldest."""
+"""Levels in a report: all, or where more are remembered the newest and the oldest."""
 
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
@@ -83,7 +83,7 @@ VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "base
 WHOLE = ("parent", "event", "start", "order", "group", "slots")
 """Arrays of whole numbers."""
 REPORTED = ("newest", "decided")
-"""Arrays that lie in the report."""
+"""Arrays that are part of the report."""
 WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "said")
 """Rows of the scratch that have names."""
 OUTSIDE = {
@@ -92,7 +92,7 @@ OUTSIDE = {
 }  # fmt: skip
 """Arrays that are fields of the state themselves."""
 NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods")
-"""n; how many output lags of their own leaves have; whether the noise is unknown, events are independent; whether all
+"""n; the number of separate output lags of leaves; whether the noise is unknown, events are independent; whether all
 leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all changes are
 walks; whether what may have happened since the last used sample is one level; and the address of the user's own
 likelihoods, while the compiled routine runs.

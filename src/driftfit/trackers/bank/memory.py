@@ -1,4 +1,4 @@
-"""The memory of a bank: its arrays before the first sample, and how they lie one after the other in one field."""
+"""The memory of a bank: its arrays before the first sample, and their places in one field."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
 
 
 def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
-    """Those that say what may happen to theta."""
+    """The arrays of the changes of theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
     scaled, forgets = any(sizes.any() for _, sizes in steps), any(one.forgets for one in changes)

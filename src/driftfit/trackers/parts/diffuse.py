@@ -40,14 +40,14 @@ WORST = 1e6
 """Largest variance inflation that is left to a covariance: of sixteen digits ten remain."""
 
 LEFT = 1e-14
-"""Least share of a variance that one sample leaves: below it what is left is rounding, which may be negative. It takes
+"""Smallest share of a variance that one sample leaves: below it the rest is rounding, which may be negative. It takes
 a regressor ten million times as large as those before it."""
 
 ALMOST_ANY = 1e13
 """The same for trackers whose work cannot wait: they are least squares without drift before the change of form."""
 
 SIZE, STD, LOOSE, ROW, WORK = range(5)
-"""Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
+"""Rows of ``work``: norms of the columns of S and of the rows of R, the scale of the error of R, a row to absorb."""
 
 Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
 """Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
@@ -141,7 +141,7 @@ def measurement(s: State, l: int) -> None:
 
 @shared
 def refresh(S: Array, R: Array, work: Array) -> None:
-    """R = S^-1 where S has rows, its free columns the vectors that no sample has seen; and the norms of both."""
+    """R = S^-1 on the rows of S; its free columns are orthogonal to all regressors so far; and the norms of both."""
     n = len(S)
     for j in range(n):
         R[j, j] = 1.0 / S[j, j] if S[j, j] > 0.0 else 1.0
@@ -213,7 +213,7 @@ def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
 
 @shared
 def sheared(x: Array, time: float) -> None:
-    """x = (level, slope) as it is ``time`` later."""
+    """x = (level, slope), moved by ``time``."""
     half = len(x) // 2
     for i in range(half if time != 0.0 else 0):
         x[i] += time * x[half + i]
@@ -221,9 +221,10 @@ def sheared(x: Array, time: float) -> None:
 
 @shared
 def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
-    """Q = an orthonormal basis, one column for each free column, of what no sample has seen; returns log det N' N.
+    """Q = an orthonormal basis of the directions without information, one column for each free column; returns log det
+    N' N.
 
-    Both are of the first sample, ``age`` ago, where theta is made of levels and slopes; otherwise the age is 0.
+    If theta consists of levels and slopes, both refer to the first sample, ``age`` ago; otherwise the age is 0.
     """
     n = len(S)
     volume = 0.0
@@ -232,7 +233,7 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
             for i in range(n):
                 Q[i, j] = R[i, j] if i <= j else 0.0
             sheared(Q[:, j], -age)
-            for _ in range(4):  # in units far apart these are nearly parallel, and what one pass leaves is rounding
+            for _ in range(4):  # in very different units these are nearly parallel, and one pass leaves rounding
                 for k in range(j):
                     if S[k, k] == 0.0:
                         dot = 0.0
@@ -253,7 +254,7 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
 
 @shared
 def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -> None:
-    """theta that solves S theta = d and keeps what it was in the directions of Q, those that no sample has seen."""
+    """theta that solves S theta = d and is unchanged in the directions of Q, those without information."""
     n = len(S)
     for i in range(n - 1, -1, -1):
         x[i] = theta[i]
@@ -280,7 +281,7 @@ def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -
 
 @shared
 def covariance(S: Array, R: Array, P: Array) -> None:
-    """The lower triangle of P = R R', given the parameters of free columns."""
+    """The lower triangle of P = R R', conditional on the parameters of free columns."""
     n = len(S)
     for i in range(n):
         for j in range(i + 1):
@@ -292,7 +293,7 @@ def covariance(S: Array, R: Array, P: Array) -> None:
 
 @shared
 def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
-    """Take in a sample, if there is one, after time has passed; ``now`` is ``at_start``."""
+    """Update by a sample, if there is one, after the time update; ``now`` is ``at_start``."""
     n = len(S)
     refresh(S, R, work)
     entering, u, now[BEFORE] = outside(phi, S, work)
@@ -342,7 +343,7 @@ def machine_wander(S: int, d: int, H: int, pivot: int, n: int, L: int, l: int, s
 
 
 MACHINES = (machine_learn, machine_wander)
-"""What the steps of a tracker that starts here call; see `TrackerSteps`."""
+"""The routines that the steps of a tracker with a diffuse start call; see `TrackerSteps`."""
 
 
 @kernel
@@ -401,19 +402,19 @@ def take_in(s: State, l: int) -> None:
 
 @kernel
 def reform(s: State, l: int) -> None:
-    """P as the square root has it, after something else than a sample."""
+    """Recompute P from the square root, after a change that is not a sample."""
     call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
 
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """Let the covariance be the state from now on, where it will do."""
+    """Make the covariance the state from now on, if it is accurate enough."""
     s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
 
 
 @kernel
 def enter(s: State, l: int) -> None:
-    """The correction while the state is in square-root form, and the change to a covariance where that will do."""
+    """The correction while the state is in square-root form, and the change to a covariance once it is accurate enough."""
     take_in(s, l)
     hand_over(s, l)
 

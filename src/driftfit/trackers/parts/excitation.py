@@ -48,7 +48,7 @@ def no_excitation(n: int) -> dict[str, Any]:
 
 @kernel
 def bounded(square: float, mean: float, count: float) -> float:
-    """A square as it counts in a mean square of ``count`` others: a fault code may not make a scale of its own."""
+    """A square as it counts in a mean square of ``count`` others: a fault code must not become the scale."""
     return min(square, LARGE * mean) if count >= FIRST else square
 
 
@@ -68,7 +68,9 @@ def learn_scales(s: State, l: int) -> None:
 
 @kernel
 def learn_information(s: State, l: int) -> None:
-    """Windowed Gram matrix of the regressors in units of their scale: what the guard against dull inputs looks at."""
+    """Windowed Gram matrix of the regressors in units of their scale: the samples that the guard against constant
+    inputs examines.
+    """
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i + 1):

@@ -59,7 +59,7 @@ def leave_out_frozen(s: State, l: int) -> None:
 
 
 def held_readings(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where no sensor was frozen."""
+    """Its remark in a summary: nothing where no sensor was frozen."""
     count = int(lane["held"])
     return (
         (("Frozen", f"{count} readings that repeat the one before where a change was expected: not used"),)

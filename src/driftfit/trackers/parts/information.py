@@ -75,7 +75,7 @@ def spread(S: Array, d: Array, G: Array, size: float, pivot: Array, l: int) -> N
 def shear(S: Array, time: float, l: int) -> None:
     """S <- S [[1, time], [0, 1]], which leaves a triangle a triangle.
 
-    With x = (level, slope): what S says of (level + time slope, slope) it then says of x.
+    With x = (level, slope): the information of S about (level + time slope, slope) is then about x.
     """
     half = S.shape[0] // 2
     for i in range(S.shape[0]):

@@ -32,7 +32,7 @@ REACH = 10.0
 LEVERAGE = 100.0
 """Largest weight of one regressor, in ordinary samples."""
 FIRST = 10.0
-"""Number of first readings that are accepted as they are, for comparison with later ones."""
+"""Number of first readings that are accepted without a check, for comparison with later ones."""
 MEMORY = 1000.0
 """Readings over which their mean and variance are remembered."""
 LONGEST = 1e12
@@ -67,7 +67,7 @@ def leave_out(s: State, l: int) -> None:
 def learn_proportion(s: State, l: int, outlier: float) -> None:
     """Mean and variance of the readings that were let in, and patience, given the probability of an outlier.
 
-    A reading that repeats the last one has nothing new: a plant that stands still keeps its scale.
+    A reading that repeats the last one has nothing new: a plant at standstill keeps its scale.
     """
     odd = max(s.strange[l], outlier)
     if s.seen[l] > 0.0 or odd > 0.0:
@@ -91,6 +91,6 @@ def bound_leverage(s: State, l: int) -> None:
 
 
 def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where all readings were let in."""
+    """Its remark in a summary: nothing where all readings were let in."""
     count = int(lane["left_out"])
     return (("Left out", f"{count} readings out of all proportion to those before"),) if count else ()

@@ -186,7 +186,7 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
 
 @shared
 def standstill(prior: Array, L: int, Hm: int) -> None:
-    """The prior when no time passes: sensors keep their shares, and all changes except the first have probability zero."""
+    """The prior when no time passes: sensors keep their shares; all changes except the first have probability 0."""
     for l in range(L):
         for j in range(Hm):
             share = 0.0

@@ -37,7 +37,7 @@ FLOOR = 1e-12
 
 @shared
 def develop_own(t: Any, K: int) -> int:
-    """The same where parent l stands for the joint event l."""
+    """The same, where parent l takes only joint event l."""
     A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
     for l in range(K):
         c = l // Hm

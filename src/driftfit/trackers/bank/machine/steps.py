@@ -256,7 +256,7 @@ def begin(s: State, l: int) -> None:
 
 @kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
-    """Read the priors of the joint events of this sample, a chain of the changes, and the drift factors of the changes."""
+    """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
     row, column = t if known.shape[0] > 1 else 0, 3
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):
         start = s.table[field, 0, l] // 8

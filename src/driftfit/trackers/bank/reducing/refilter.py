@@ -4,7 +4,7 @@
 
 The components of the first floor share their mean, so with prior weights this is one Kalman filter with
 Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered again and so count twice; merging leaves
-(GPB) uses each once and is better. It is here to show that. One sensor, independent events.
+(GPB) uses each once and is better. It is included for comparison. One sensor, independent events.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def grow_level(t: Any, K: int, sample: Array) -> int:
 
 @shared
 def refilter(t: Any, L: int) -> int:
-    """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
-    among the parents.
+    """Update the root by the oldest stored sample, and grow the tree of the others again; returns the number of its
+    leaves, which are parents.
     """
     A, B, Q, root, samples, prior, row = t.parents, t.leaves, t.Q, t.root, t.samples, t.prior, t.row
     H, D, weight = len(row), int(t.reduction[DEPTH]), t.scratch[0]
@@ -84,7 +84,7 @@ def refilter(t: Any, L: int) -> int:
 
 @shared
 def histories(t: Any, L: int) -> None:
-    """The histories of the new tree: what happened in the D - 1 levels that it has."""
+    """Write the histories of the new tree, which has D - 1 levels."""
     A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
     T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
     block, width = H + 1, T.shape[1]

@@ -52,7 +52,7 @@ class EventSmoothed:
 
     @cached_property
     def covs(self) -> Array:
-        """(T, n, n), with what is not known of a drift that was fitted."""
+        """(T, n, n), including the uncertainty of a fitted drift."""
         return self._given if self._fitted is None else self._given + self._fitted.spread()
 
     @property

@@ -18,7 +18,7 @@ from driftfit.engine.kernel import Array
 
 
 class Shifts(Protocol):
-    """What says how far parameters moved: a smoothed path."""
+    """Anything that states how far parameters moved: a smoothed path."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -175,7 +175,7 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
 
 
 def back_to(first: int, start: int, used: Array) -> int:
-    """The first of the unused samples before this one: what happened at them is visible here."""
+    """The first of the unused samples before this one: changes at them become visible here."""
     while first > start and not used[first - 1]:
         first -= 1
     return first

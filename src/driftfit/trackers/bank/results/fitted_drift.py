@@ -3,14 +3,14 @@
     max_f sum_t log N(y_t; phi_t' m_t, c s_t),   Q_t = D Q_0 D,   D = diag(f_i)^(1/2)   between events,   f_i >= 1
 
 The drift of `Bank()` is a guess, too small where parameters walk all the time: between events a path would be taken for
-certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: what the bank estimated has the drift in
-it that its own hypotheses do not explain. All covariances are multiplied by c.
+certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: the bank's estimate contains drift that
+its own hypotheses do not explain. All covariances are multiplied by c.
 
-A bank whose drift is too small finds changes in a walk, and these take from it what it needs to be recognised. So a
+A bank whose drift is too small explains a random walk by changes, and the fit then underestimates the drift. So a
 change of prior probability p is kept if, with the drift fitted to those that are left, it multiplies the likelihood by
 more than (1 - p) / p; the weaker half of the others goes, until all that are left are kept.
 
-Bands also contain what is not known of the factors: for each of them in turn, the paths at other values, weighted by
+Bands also contain the uncertainty of the factors: for each of them in turn, the paths at other values, weighted by
 their likelihood,
 
     C_s + sum_i sum_g w_ig (C_ig - C_s + (m_ig - m_s)(m_ig - m_s)')
@@ -106,7 +106,7 @@ class FittedDrift:
         self._logs = found.x if found.fun < self._cost(start) else start
 
     def spread(self) -> Array:
-        """What the uncertainty of the factors adds to the covariances of the path, (T, n, n)."""
+        """Covariances that the uncertainty of the factors adds to the path, (T, n, n)."""
         m, C, _ = solve(self.problem)
         more = np.zeros_like(C)
         for i in range(len(self._logs)):

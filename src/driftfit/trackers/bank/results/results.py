@@ -1,6 +1,6 @@
 """Results of a bank of hypotheses besides parameters: probabilities, evidence, alarms, events, the mixture.
 
-Everything is causal unless stated otherwise: row t contains what was known after sample t. Once events were decided,
+Everything is causal unless stated otherwise: row t contains the probabilities after sample t. Once events were decided,
 probabilities are conditional on the decisions.
 """
 
@@ -165,7 +165,7 @@ class Hypotheses:
         ]
 
     def finish(self) -> list[Decision]:
-        """What `Decide` would decide about the open events, the oldest first, each given those before it.
+        """The decisions that `Decide` would make about the open events, the oldest first, each given the earlier ones.
 
         It also works if the record is shorter than the depth; empty for reductions that do not decide.
         """

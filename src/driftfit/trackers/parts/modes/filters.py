@@ -110,7 +110,7 @@ def likelihoods(s: State, l: int) -> float:
 
 @kernel
 def predictive_density(s: State, nearest: float, l: int) -> None:
-    """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
+    """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
@@ -155,7 +155,7 @@ def weigh(s: State, l: int) -> None:
     for k in range(K):
         s.mu[k, l] = max(s.mu[k, l], LEAST)  # at 0 a mode that only such modes lead to would have no mixture at all
     s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
-    # an outlier says nothing about the level: the chain keeps what it was
+    # an outlier says nothing about the level: the chain keeps its state
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
 
@@ -190,7 +190,7 @@ def update_filters(s: State, l: int) -> None:
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The first coordinate of which this sample tells `OUTGROWN` times as much as all before it, or -1."""
+    """The first coordinate about which this sample carries `OUTGROWN` times the information of all earlier ones, or -1."""
     others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
     for j in range(s.theta.shape[0]):
         own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
@@ -202,7 +202,7 @@ def outgrown(s: State, l: int) -> int:
 
 @kernel
 def enter_filters(s: State, j: int, l: int) -> None:
-    """Row j of M becomes what is left of phi; all filters take in z_j from what is left of the innovation."""
+    """Row j of M becomes the rest of phi; all filters are updated in z_j by the rest of the innovation."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     y_hat, e, v = s.y_hat[l], s.e[l], s.s[l]
     for i in range(j, n):

@@ -5,8 +5,8 @@
     C_j = sum_i (mu_i T_ij / c_j) (C_i + (m_i - m_j)(m_i - m_j)')
 
 T moves one rung up or down, and from every rung directly to the top, which is how a jump is detected. The top is the
-rung of ratio 1: those above it are for noise that is little beside the drift. A second ladder has learned weights of
-the parameters (`driftfit.trackers.parts.modes.weights`), and the first, without them, makes it safe while they are
+rung of ratio 1: those above it are for noise that is small compared with the drift. A second ladder has learned weights
+of the parameters (`driftfit.trackers.parts.modes.weights`), and the first, without them, makes it safe while they are
 unknown or wrong: T leads across to it, and back through the bottom and by a jump. T never leads from the top directly
 to the bottom: mixing the wide covariance of the top filter into the filter without drift costs more than anything else
 when nothing changes (measured: 1.8 times the error of least squares instead of 1.15).
@@ -36,7 +36,7 @@ UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.002, 0.0015, 0.1, 0.0001
 rung that all parameters climb to the same one with learned weights."""
 
 TOP = LADDER.index(1.0)
-"""The mode that detects jumps, and may leap; the rungs above it are for noise that is little beside the drift."""
+"""The mode that detects jumps, and may leap; the rungs above it are for noise that is small compared with the drift."""
 START = 0.25
 """Probability of no drift before the first sample."""
 LEAP, RARE = 3.0, 0.02

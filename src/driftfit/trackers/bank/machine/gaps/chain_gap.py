@@ -13,19 +13,19 @@ A sample that can be used after k others that could not finds each leaf, weight 
     all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
 
 (c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as always, with the chain
-from the events that they end in. So a jump in the gap, after which all is as before, is a leaf of its own, and so is a
+from the events that they end in. So a jump in the gap after which all is as before has a separate leaf, and so has a
 mode that lasted. That is exact in the probabilities of both courses and of what they end in, and in the first two
-moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
+moments of the parameters given either; the information of the sample about courses within the second is lost. An
 interval of dt nominal samples is a gap of dt - 1 and a level.
 
 Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
 numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
-whose twin is still there, one leaf goes on with the moments of both courses. Without that rule a `Decide` whose leaves
-came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
+whose twin is still there, one leaf continues with the moments of both courses. Without that rule a `Decide` whose
+leaves came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
 
-Only random walks, and not under `IMM`, which has one leaf for every event and mixes it anew from all of them, nor
-under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H n^2) for each
-sample that is not used, and twice the leaves for the one that ends the gap.
+Only random walks, and not under `IMM`, which has one leaf for every event and mixes it from all of them at every
+sample, nor under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H
+n^2) for each sample that is not used, and twice the leaves for the one that ends the gap.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
 
 @shared
 def remember_one(T: Array, k: int, levels: int, H: int, Hm: int, best: int) -> None:
-    """The history of the leaf of one mode: that mode at every level of the gap, and the sensors by their probabilities."""
+    """The history of the leaf of one mode: that mode at every level of the gap, and the probabilities of sensors."""
     block = H + 1
     known = min(levels, T.shape[1] // block)
     quiet = T[k, (known - 1) * block + H] if known > 0 else 1.0

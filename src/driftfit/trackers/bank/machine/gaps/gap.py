@@ -15,8 +15,8 @@ probabilities a and the covariances A. Its event stands for the whole gap.
 
 That is exact in the probability of any change, in the first two moments of the parameters after the gap given the
 first change, and wholly where at most one change falls into a gap; the ordinary course, a drift, is not taken back for
-the samples at which another change was in its place. Priors that follow a Markov chain of changes are about what lasts:
-there the chain goes on and leaves take in the mean of all changes.
+the samples at which another change was in its place. Priors that follow a Markov chain describe changes that last:
+there the chain continues and leaves receive the mean of all changes.
 
 Cost: O(H n^2) for each sample that is not used.
 """
