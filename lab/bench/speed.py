@@ -1,4 +1,4 @@
-"""Speed contests, one function each: what is timed, and against which packages. ``python -m lab bench speed``.
+"""Speed contests, one function each: the contests, and the packages in each. ``python -m lab bench speed``.
 
 Every contest is a regression of four parameters unless it says otherwise, from the same start P0 = 10, with the same
 numbers. Times are medians of runs that take turns.
@@ -104,7 +104,7 @@ def live_nlms(T: int) -> Contest:
 
 
 def live_free(T: int) -> Contest:
-    """The tracker without settings, beside what it holds: a bank of filters."""
+    """The tracker without settings, compared with its parts: a bank of filters."""
     data = signals(T)
     others = (lambda: stream("driftfit Live, Kalman", kalman(), data),)
     return Contest(

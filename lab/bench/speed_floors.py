@@ -1,7 +1,7 @@
 """Two floors for the record filter: a loop in C with fixed n, and streaming the same bytes.
 
 Both come from ``benchmarks/`` (`kernel.py`, `filter.c`).
-What is timed is the driver alone, without what `track` does once per call.
+Only the driver is timed, without the work that `track` does once per call.
 """
 
 from __future__ import annotations

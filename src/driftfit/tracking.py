@@ -19,7 +19,7 @@ Ranges = Mapping[Any, tuple[float | None, float | None]] | None
 
 
 class Given(TypedDict, total=False):
-    """What every form of `track` takes by name."""
+    """Arguments that every form of `track` takes by name."""
 
     data: Any
     time: Any

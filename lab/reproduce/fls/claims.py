@@ -1,4 +1,4 @@
-"""What the claims of the paper come to when they are measured."""
+"""The claims of the paper, measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made of each claim of the paper: functions of numbers, each with its rule.
+"""The verdict on each claim of the paper: functions of numbers, each with its rule.
 
 Arrivals are (samples until the error is small for good, median over the runs that arrive; share of runs that do).
 """

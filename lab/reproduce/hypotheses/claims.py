@@ -1,4 +1,4 @@
-"""What the claims made for banks of hypotheses come to when they are measured."""
+"""The claims made for banks of hypotheses, measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is run on what: the settings of every row of the tables."""
+"""The trackers and the records: the settings of every row of the tables."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Alarm = Callable[[Hypotheses], Array]
 
 
 def likeliest(lag: int) -> Alarm:
-    """While a change is likelier than none, seen from ``lag`` floors later."""
+    """Samples at which a change is likelier than none, given ``lag`` more levels."""
 
     def on(told: Hypotheses) -> Array:
         p = np.nan_to_num(told.lag_prob[:, lag]).reshape(len(told.run), -1, told.sensors).sum(axis=2)
@@ -66,7 +66,7 @@ def window(threshold: float) -> Alarm:
 
 
 class Entry(NamedTuple):
-    """A row of a table: a tracker, when it calls a change, and how it sees the record."""
+    """A row of a table: a tracker, when it reports a change, and its view of the record."""
 
     tracker: Tracker
     alarm: Alarm | None = None

@@ -1,6 +1,6 @@
 """The promises of a tracker: `check_tracker`.
 
-Every check runs the tracker on a small simulated record. If a promise is broken, it returns a sentence that says which
+Every check runs the tracker on a small simulated record. For each broken promise it returns a sentence that names it
 and where to look. This takes about as long as compiling the tracker three times. A tracker that keeps all promises is
 not necessarily good: compare its one-step errors with those of others (`Track.summary`).
 """

@@ -85,7 +85,7 @@ class Expressions:
         return self.refuse(node)  # type: ignore[no-any-return]
 
     def owner(self, node: ast.expr) -> tuple[Value, str]:
-        """What a bracket or ``.shape`` is applied to, and the name of the field if it is one."""
+        """The owner of a subscript or of ``.shape``, and the name of the field if it is one."""
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             record = self.value(node.value)
             if record.kind == "record":

@@ -2,9 +2,10 @@
 
 The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
 Known integers, tables and functions become constants of the text, branches that a constant excludes are left out, and a
-function is written once for each set of shapes with which it is called. A step may use what `driftfit.engine.kernel`
-allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so the double-precision build
-gives the same bits as the compiled steps if the C compiler neither contracts nor reorders them.
+function is written once for each set of shapes with which it is called. A step may use everything that
+`driftfit.engine.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so
+the double-precision build gives the same bits as the compiled steps if the C compiler neither contracts nor reorders
+them.
 
 The number of operations is counted along the way: loops at their longest, and the more expensive of two branches.
 """

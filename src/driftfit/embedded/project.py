@@ -237,7 +237,7 @@ def _face(made: Translation, memory: set[str]) -> str:
 
 
 def _after_the_start(made: Translation) -> str:
-    """What a sample takes after the start, if the start takes more."""
+    """The operations of a sample after the start, if the start takes more."""
     ordinary = _said(_ordinary(made.unit))
     differs = ordinary != _said(made.entry.operations)
     return f" After the start a sample takes at most\n  {ordinary}." if differs else ""

@@ -91,7 +91,7 @@ def narrow(value: Value) -> str:
 
 
 def plain(value: Value) -> Value:
-    """A flag as the floating-point number that it is; other values as they are."""
+    """A flag as the floating-point number that it is; other values unchanged."""
     return Value("real", f"({value.text} ? R(1.0) : R(0.0))") if value.kind == "flag" else value
 
 

@@ -1,4 +1,4 @@
-"""The comparison in every summary: what simpler predictors would have achieved on the same samples.
+"""The comparison in every summary: the errors of simpler predictors on the same samples.
 
 *persistence*   the last known output
 *constant LS*   recursive least squares without forgetting on the same regressors (fitted only to the past)

@@ -123,7 +123,7 @@ def constant_errors(phi: Array, y: Array, weight: Array) -> Array:
 
 
 def constant_outputs(model: Model, y: Any, u: Any, reading: Reading, data: Any) -> dict[str, Track]:
-    """Each output of a record as a regression of its own, by name, tracked with constant parameters.
+    """Each output of a record as a separate regression, by name, tracked with constant parameters.
 
     Their predictions fill missing lags. Outputs that share one theta are one regression, on all rows.
     """

@@ -1,4 +1,4 @@
-"""The service as a process: engine, sources, sinks, the control socket, and the page in a process of its own."""
+"""The service as a process: engine, sources, sinks, the control socket, and the page in a separate process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger("driftfit.service")
 LOOK = 1.0
 """Seconds between two looks at the page's process."""
 STOP = 10.0
-"""Seconds that sinks have to write what is stored when the service stops."""
+"""Seconds that sinks have to write stored results when the service stops."""
 
 
 class JsonLines(logging.Formatter):

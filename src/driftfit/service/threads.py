@@ -68,7 +68,7 @@ class SourceThread(WorkerThread):
         self.position = engine.positions.get(f"source:{source.name}")
 
     def work(self) -> None:
-        """Read until the source ends; after a failure go on from what was handed over."""
+        """Read until the source ends; after a failure continue after the last batch that was passed on."""
         reader: Reader = self.source.open(self.position)
         self.state = "running"
         try:
@@ -117,7 +117,7 @@ class SinkThread(WorkerThread):
             journal.close()
 
     def _next(self, journal: Journal, names: Names) -> tuple[Outcome, int] | None:
-        """What the sink is to write next, and the last group in it; None when the thread is to end."""
+        """The next batch for the sink, and the last group in it; None when the thread is to end."""
         begun = time.monotonic()
         results: list[Any] = []
         events: list[Any] = []

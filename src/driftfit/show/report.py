@@ -1,9 +1,9 @@
 """Report: one self-contained page about a run, for a reader who does not know this library.
 
-The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and what was
-skipped. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and turn
-light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which keeps
-the page small.
+The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and counts of
+skipped samples. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and
+turn light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which
+keeps the page small.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from driftfit.trackers.base import RandomWalk
 
 @lru_cache
 def attentive(steps: TrackerSteps) -> TrackerSteps:
-    """Steps that store the factor of the noise variance when the tracker runs, and what the tracker notes itself.
+    """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """

@@ -33,7 +33,7 @@ BLOCK = 1024
 
 
 class Task(NamedTuple):
-    """What settings are scored on: a bound model and a checked record."""
+    """The task on which settings are scored: a bound model and a checked record."""
 
     model: Model
     record: Record

@@ -30,7 +30,7 @@ def warm(
     inputs: Annotated[int, typer.Option(help="Number of inputs of the record.")] = 1,
     fleet: Annotated[bool, typer.Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
-    """Compile what models and a tracker need (record, stream, summary, verdict), and store it on disk for later."""
+    """Compile everything that models and a tracker need (record, stream, summary, verdict), and store it on disk."""
     from driftfit.streams import Live
     from driftfit.tracking import track
 

@@ -1,10 +1,10 @@
 """Limits of the "glr" and "cusum" alarms by a bootstrap of the reference.
 
 Every simulated record has its own reference. The residuals x of the reference are drawn in blocks, with random signs
-(sums of fitted residuals as they are vary too little), they get the variances h of the model, and scale and variances
-are estimated from them again; so is the error of theta, from its covariance. A record of regressors and residuals drawn
-together follows, whose scores are those of the model that was estimated from its own reference. The limits so allow for
-everything that is estimated: a stream carries these errors for ever.
+(sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
+variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
+residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
+limits so allow for everything that is estimated: a stream carries these errors for ever.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.

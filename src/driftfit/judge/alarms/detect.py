@@ -22,10 +22,10 @@
   inputs, its parameters at ``at``, its innovations redrawn) and tracked; onsets exceed the limit at the given rate. Any
   kind can be calibrated in this way, with ``calibrate=True``: it is slower, and does not rely on the std.
 
-What was found stands in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
+The result is in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
 watches a stream by it, and ``other.detect(said.rule)`` another record.
 
-docs/alarms.md says which kind to use. A tracker that estimates its own drift mistakes a fault for drift and follows it:
+docs/alarms.md compares the kinds. A tracker that estimates its own drift mistakes a fault for drift and follows it:
 its innovations are soon normal again, so "innovation" gives an alarm, if at all, in the first samples of the fault.
 
 ``p`` is the probability that a record without a fault is as extreme as this one: from the same rates (the smallest of
@@ -96,7 +96,7 @@ class Alarms(Printed):
     p : number
         Probability of an extreme like the largest here without a fault; NaN if nothing was judged.
     findings : (T, k)
-        For "glr" and "cusum": what `change` reads; otherwise without columns.
+        For "glr" and "cusum": the numbers that `change` reads; otherwise without columns.
     """
 
     rule: AlarmRule

@@ -165,7 +165,7 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
 
 
 def findings_of(run: Track, rule: AlarmRule, start: int) -> Array:
-    """What the compiled routine of "glr" and "cusum" writes for every sample, (T, k), NaN before ``start``."""
+    """The findings of "glr" and "cusum" for every sample, (T, k), NaN before ``start``."""
     n, (phi, rest), model = len(rule.parameters), samples_of(run), rule.reference
     findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])

@@ -109,7 +109,7 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
 
 
 def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
-    """The interval of the date of a step, by the likelihood of every date between the steps beside it."""
+    """The interval of the date of a step, by the likelihood of every date between the neighbouring steps."""
     N, n = phi.shape
     others = [other.at for other in steps if abs(other.at - step.at) > NEAR * N]
     a, b = max((at for at in others if at < step.at), default=0), min((at for at in others if at > step.at), default=N)

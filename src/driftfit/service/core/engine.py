@@ -1,4 +1,4 @@
-"""The engine: one thread that journals what arrives, and then lets the trackers see it.
+"""The engine: one thread that journals the samples that arrive, and then passes them to the trackers.
 
     gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
 
@@ -81,7 +81,7 @@ class Engine:
         return again
 
     def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> bool:
-        """Let a unit see an entry of the log, unless its stored state already contains it."""
+        """Pass an entry of the log to its unit, unless the unit's stored state already contains it."""
         unit = self.units.get(item.unit)
         if replay and number < self.units.since[item.unit]:
             return False
@@ -96,14 +96,14 @@ class Engine:
         """Work until `stop`."""
         while not self._stop.is_set():
             self.step(IDLE)
-        if not self.problem:  # otherwise nothing more may be written: what was not acknowledged comes again
+        if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
             self._commit()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def stop(self) -> None:
-        """Let `run` return after what has arrived is stored."""
+        """Let `run` return after the samples that have arrived are stored."""
         self._stop.set()
         self.intake.close()
 
@@ -114,7 +114,7 @@ class Engine:
         self.journal.close()
 
     def step(self, wait: float) -> int:
-        """Take, journal and process what has arrived; the number of samples."""
+        """Take, journal and process the batches that have arrived; the number of samples."""
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
         first, items = self.next, self._admit(arrived)
         now = time.time()

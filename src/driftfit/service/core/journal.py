@@ -8,9 +8,9 @@
     event      alarms, failures, operator's actions
     position   where sources continue, and how far sinks have come
 
-Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker sees it, and acknowledged
-after that. The next transaction contains the results of the group. After a crash the results that are missing are
-computed again from snapshots and log, bit for bit.
+Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker processes it, and
+acknowledged after that. The next transaction contains the results of the group. After a crash the results that are
+missing are computed again from snapshots and log, bit for bit.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Item(NamedTuple):
     rows: list[list[float]]
     """y, u_1 .. u_m of each sample, NaN where missing."""
     action: dict[str, Any] | None = None
-    """What an operator, or the service itself, did; then there are no rows."""
+    """An action of an operator, or of the service itself; then there are no rows."""
 
     @property
     def length(self) -> int:
@@ -146,7 +146,7 @@ class Journal:
 
 
 class Pending:
-    """What the next transaction will contain."""
+    """The contents of the next transaction."""
 
     def __init__(self) -> None:
         self.units: list[tuple[int, str, int, str, int, str]] = []

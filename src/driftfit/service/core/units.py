@@ -116,7 +116,7 @@ class Units:
         return unit
 
     def admitted(self, unit: Unit, samples: Samples) -> tuple[list[float] | None, list[list[float]]]:
-        """The rows of a message that a unit takes; what it does not take is counted."""
+        """The rows of a message that a unit takes; samples that it does not accept are counted."""
         if not self._paid(unit, samples.length):
             unit.counts["flood"] += samples.length
             return None, []

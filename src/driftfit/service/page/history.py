@@ -1,6 +1,6 @@
 """The past of a unit, reduced on the server: least, largest and mean of every column in at most ``points`` parts.
 
-A range of up to as many samples as points is sent as it is. Beyond that, whole blocks are represented by their
+A range with no more samples than points is sent unchanged. Beyond that, whole blocks are represented by their
 extremes, so a million samples cost the reading of 16,000 short rows.
 """
 
@@ -64,7 +64,7 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
 
 
 def latest(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
-    """All columns (T, c) of the last blocks, and of what came after them."""
+    """All columns (T, c) of the last blocks, and of the samples after them."""
     query = "select last, count, rows from block where unit = ? order by first desc limit ?"
     found = journal.db.execute(query, (unit, blocks)).fetchall()[::-1]
     end = max((last for last, _, _ in found), default=-1)

@@ -33,7 +33,7 @@ Made = TypeVar("Made")
 
 
 class ProblemsError(ValueError):
-    """What is wrong with a configuration, one message per problem."""
+    """The problems of a configuration, one message for each."""
 
     def __init__(self, messages: list[str]) -> None:
         super().__init__("\n".join(messages))

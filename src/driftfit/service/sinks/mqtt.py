@@ -72,7 +72,7 @@ class _Mqtt(Writer):
                 raise ConnectionError(f"{self.options.url} does not acknowledge")
 
     def close(self) -> None:
-        """Say goodbye."""
+        """Publish the status and disconnect."""
         self.client.publish(self.options.status, "offline", qos=1, retain=True)
         self.client.disconnect()
         self.client.loop_stop()

@@ -1,7 +1,7 @@
 """MQTT, by paho-mqtt: a persistent session, acknowledged by hand after the samples are in the journal.
 
 With ``qos = 1`` (the default) and ``time`` in the units, nothing is lost while the service or the broker is away, and
-what the broker sends again is recognised by its time. A retained message is a sample like any other.
+samples that the broker sends again are recognised by their time. A retained message is a sample like any other.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Mqtt(Reader):
             client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
 
     def read(self, wait: float) -> Batch | None:
-        """What has arrived."""
+        """The messages that have arrived."""
         if self.client.is_connected():
             self.lost = time.monotonic()
         elif time.monotonic() - self.lost > AWAY:

@@ -87,5 +87,5 @@ class _Replay(Reader):
 
 
 def _plain(cell: Any) -> Any:
-    """A date as text; anything else as it is."""
+    """A date as text; anything else unchanged."""
     return cell.isoformat() if hasattr(cell, "isoformat") else cell

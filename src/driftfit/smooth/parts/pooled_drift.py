@@ -13,8 +13,8 @@ by the likelihood L of the record, which integrates theta out (`driftfit.smooth.
     q = sum_k p_k q_k,    p_k proportional to L_k exp(-penalty_k)
 
 q_t as estimated was fitted to the record, and its likelihood is too large by an amount that grows with the record; the
-penalty, PRICE + T / SHARE, is what that came to in simulations of constant drift. A record with jumps of several
-standard deviations exceeds it many times.
+penalty, PRICE + T / SHARE, was found in simulations of constant drift. A record with jumps of several standard
+deviations exceeds it many times.
 
 Source: averaging over models by their likelihood, Hoeting, Madigan, Raftery and Volinsky (1999); the two shapes are
 ours. Cost: eight smoothers.
@@ -54,7 +54,7 @@ def pooled(rate: Array) -> Array:
 def average_drift(walk: Walk, time: Array) -> Walk:
     """The walk with the average of the drifts, where ``time`` (T,) are the intervals of drift before each sample.
 
-    It is returned as it was if the likelihood cannot be computed accurately.
+    It is returned unchanged if the likelihood cannot be computed accurately.
     """
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)

@@ -414,7 +414,7 @@ def hand_over(s: State, l: int) -> None:
 
 @kernel
 def enter(s: State, l: int) -> None:
-    """The correction while the state is in square-root form, and the change to a covariance once it is accurate enough."""
+    """The correction while the state is in square-root form, and the change to a covariance once that is accurate."""
     take_in(s, l)
     hand_over(s, l)
 

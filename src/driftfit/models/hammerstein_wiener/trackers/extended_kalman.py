@@ -95,7 +95,7 @@ class ExtendedKalman(Minimal):
     q : number, (n_x,), or (n_x, n_x)
         Drift covariance of xi per nominal sample. A number is that number times the identity.
     r : number
-        Variance of the equation error; with ``output_noise`` in the model, a factor of what that gives: 1.
+        Variance of the equation error; with ``output_noise`` in the model, a factor of its variance: 1.
     p0 : number, (n_x,) or (n_x, n_x)
         Covariance of xi before the first sample.
     theta0 : number or (n_x,)

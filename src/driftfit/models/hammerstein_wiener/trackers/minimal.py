@@ -1,4 +1,4 @@
-"""What the trackers of minimal parameters xi have in common: their model, its structure, and their settings."""
+"""The common part of the trackers of minimal parameters xi: their model, its structure, and their settings."""
 
 from __future__ import annotations
 

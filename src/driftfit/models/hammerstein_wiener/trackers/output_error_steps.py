@@ -2,8 +2,8 @@
 once for all orders.
 
 S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
-outputs of the linear block. ``own`` holds the numbers named below. What the model says of the present input and output
-stands in its memory (`driftfit.models.hammerstein_wiener.step_memory`).
+outputs of the linear block. ``own`` holds the numbers named below. The model's values for the present input and output
+are in its memory (`driftfit.models.hammerstein_wiener.step_memory`).
 """
 
 from __future__ import annotations
@@ -52,13 +52,14 @@ FLATTEST = 0.05
 REACH = 3.0
 """Times the largest w of the outputs seen: w is held within that."""
 TINY = 1e-300
-"""Least variance of what is missing: a sample without an input is marked, also where b is 0."""
+"""Smallest variance of a missing input: a sample without an input is marked, also if b is 0."""
 WIDEST = 1e3
-"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without end in an outage.
+"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without bound in an outage.
 The cross-covariances shrink along."""
 SHARE, LARGE = 0.01, 25.0
-"""What a sample counts in the usual power of v, and the multiple of it that its square counts as at most: a fault code
-may not make a scale of its own."""
+"""The weight of a sample in the usual power of v, and the largest multiple of that power that its square counts as, so
+that a fault code cannot become the scale.
+"""
 
 TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, R_NOW, SLOPE, V_POWER = range(13)
 """Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, the results, the noise
@@ -199,7 +200,7 @@ def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
 
 @shared
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
-    """The usual power of v, which stands for inputs that are missing."""
+    """Update the usual power of v, which is used for missing inputs."""
     c = p[NA] + p[NB]
     for i in range(p[INPUTS]):
         f, more_in = p[OWN + EACH * i + OWN_F], p[OWN + EACH * i + OWN_N_IN] - 1
@@ -214,7 +215,7 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
 
 @shared
 def reach_of(m: Array, p: Places) -> float:
-    """How large w may be, by the outputs seen."""
+    """The largest |w| that the outputs observed so far allow."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
     if p[IDENTITY] == 0:
         rising, last = rises(m, p), GRID - 1
@@ -277,7 +278,7 @@ def _work(out: Kind) -> Any:
 
 @lru_cache
 def output_error(out: Kind, p: tuple[int, ...]) -> Any:
-    """The machine for the functions of an output basis and the places of a model."""
+    """The compiled routine for the functions of an output basis and the places of a model."""
     work, orders = _work(out), np.array(p)
 
     def machine_output_error(fields: int, n_x: int, n: int) -> None:

@@ -190,7 +190,7 @@ def update_filters(s: State, l: int) -> None:
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The first coordinate about which this sample carries `OUTGROWN` times the information of all earlier ones, or -1."""
+    """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1."""
     others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
     for j in range(s.theta.shape[0]):
         own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
