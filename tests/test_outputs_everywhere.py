@@ -311,7 +311,7 @@ def test_summaries_are_objects():
     errors = np.sqrt(np.nanmean(late**2, axis=0))
     assert ", ".join(f"{name} {one:.5g}" for name, one in zip(run.outputs, errors, strict=True)) in str(said)
     last = np.stack([persistence(one) for one in run.y.T], axis=1)  # of the same output, not of the row before
-    assert said.comparison.persistence == pytest.approx(np.sqrt(np.nanmean((run.y - last)[50:] ** 2)), rel=0.05)
+    assert said.comparison.persistence == pytest.approx(np.sqrt(np.nanmean((run.y - last)[25:] ** 2)), rel=0.02)
 
 
 def test_frontier_and_select_give_a_result_for_each_output():

@@ -61,7 +61,7 @@ def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") 
 
 
 def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
-    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return their information."""
+    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return their blocks."""
     T, n = walk.phi.shape
     blocks = np.zeros(-(-T // WIDTH), block_type(n))
     pair = workspace(n, 2).copy()
