@@ -155,8 +155,8 @@ def test_units_with_one_row_nothing_usable_or_no_time():
     fleet.plot()
     with pytest.raises(KeyError, match="'timeless' has no result: no row has a time"):
         fleet["timeless"]
-    assert "there is nothing to track: the 40 rows have no unit or no time" in message(
-        ValueError, "flow", "u", data=timeless, time="t", by="unit"
+    assert "there is nothing to track: none of the 40 rows has a time" in message(
+        ValueError, "flow", "u", data=timeless, time="t"
     )
 
 

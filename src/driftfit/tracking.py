@@ -40,7 +40,7 @@ def track(
     u: Any = None,
     *,
     by: None = None,
-    warm_start: Run | None = None,
+    warm_start: Run | bytes | None = None,
     prob: Any = None,
     **given: Unpack[Given],
 ) -> Track: ...
@@ -54,7 +54,7 @@ def track(
     u: Any = None,
     *,
     by: str | Sequence[str] | None = None,
-    warm_start: Fleet | None = None,
+    warm_start: Fleet | Mapping[Any, Run | bytes] | None = None,
     **given: Unpack[Given],
 ) -> Fleet: ...
 
@@ -123,8 +123,10 @@ def track(
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
     keep : "std" or "cov"
         "cov" also stores the covariance of every sample, n * n numbers each.
-    warm_start : Track, Live, Fleet or None
-        Continue where that run ended, for a fleet series by series (new series start from the beginning).
+    warm_start : Track, Live, Fleet, bytes, mapping or None
+        Continue where that run ended, given itself or as bytes (``live.to_bytes()``, ``run.end().to_bytes()``); for a
+        fleet series by series, from a fleet or a mapping from key to any of these (new series start from the
+        beginning).
     prob : (T, changes), (T, joint events) or None
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
 

@@ -21,6 +21,7 @@ from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
+from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
@@ -122,13 +123,19 @@ def constant_errors(phi: Array, y: Array, weight: Array) -> Array:
     return e / root
 
 
-def constant_outputs(model: Model, y: Any, u: Any, reading: Reading, data: Any) -> dict[str, Track]:
-    """Each output of a record as a separate regression, by name, tracked with constant parameters.
+def constant_outputs(
+    model: Model, y: Any, u: Any, reading: Reading, data: Any, by: Any = None
+) -> dict[str, list[Track]]:
+    """Each output as a separate regression, tracked with constant parameters: by name, one run for every record.
 
     Their predictions fill missing lags. Outputs that share one theta are one regression, on all rows.
     """
-    run = track(model, STILL, y, u, reading, data=data)
+    run = track(model, STILL, y, u, reading, data=data, by=by)
     if isinstance(run, Shared):
-        return {"rows": run.rows}
-    assert isinstance(run, Outputs)
-    return {name: run[name] for name in run.outputs}
+        return {"rows": [run.rows]}
+    assert isinstance(run, Outputs | Fleet)
+    lanes = list(run.values())
+    if model.shared:
+        return {"rows": lanes}
+    names = run.outputs if isinstance(run, Outputs) else run.records.outputs
+    return {name: lanes[k :: len(names)] for k, name in enumerate(names)}

@@ -198,7 +198,8 @@ class Outputs(KeyedResults):
         """The end of the run, from which another one can continue (`warm_start`)."""
         lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
-        return End(self._programs, states, self.time[-1] if self.timed else None)
+        labels = self.labels
+        return End(self._programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)
 
 
 def missing(name: str, output: str) -> str:

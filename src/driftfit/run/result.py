@@ -20,6 +20,7 @@ from driftfit.run.program import Program, State, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.student import log_student, residuals_before
 
 
 class Lane(NamedTuple):
@@ -204,15 +205,21 @@ class Track(Plain):
     def log_density(self) -> Array:
         """(T,): log density of each used sample given earlier ones, NaN where there is none.
 
-        It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses it
-        is that of their mixture. A model whose innovation is not that of y adds its log Jacobian.
+        It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s), or Student's if the tracker estimates
+        the noise variance (`driftfit.trackers.parts.student`); for a tracker that weighs hypotheses it is that of their
+        mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
-        s = self.innovation_var
+        s, e = self.innovation_var, self.innovation
         counted = self.ok & np.isfinite(s) & (s > 0.0)
         own = self.tracker.log_density(self._lane.out)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
-        terms = np.where(counted, gaussian if own is None else own[:, self._lane.lane], np.nan)
+        if own is not None:
+            terms = own[:, self._lane.lane]
+        elif self.tracker.learns_noise:
+            terms = log_student(e, s, residuals_before(self.ok, s, float((self.start or {}).get("count", 0.0))))
+        else:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                terms = -0.5 * (np.log(2.0 * np.pi * s) + e**2 / s)
+        terms = np.where(counted, terms, np.nan)
         if self.model.implicit and not self.tracker.output_error:
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
@@ -259,7 +266,8 @@ class Track(Plain):
 
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        return End((self.program,), ({name: value.copy() for name, value in self.state.items()},), self.last)
+        state = {name: value.copy() for name, value in self.state.items()}
+        return End((self.program,), (state,), self.last, dt=self.labels.dt, zone=self.labels.zone)
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""

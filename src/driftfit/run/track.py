@@ -40,11 +40,15 @@ def track(
     many = by is not None or _is_grid(tracker, records)
     if prob is not None and (many or len(model.outputs) > 1):
         raise ValueError("track: prob= is for one series and one tracker.")
-    if many and warm_start is not None and not isinstance(warm_start, Fleet):
-        raise ValueError(f"warm_start: with by= or a grid pass the result of such a run; got {warm_start!r}.")
+    if many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
+        raise ValueError(
+            "warm_start: with by= or a grid pass the result of such a run, or a mapping from key to its end or bytes; "
+            f"got {warm_start!r}."
+        )
     if by is None and many:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
-    programs, records = _prepared(model, _per_series(tracker, records), records, keep, prob)
+    trackers = _per_series(tracker, records) or _any_of(tracker)
+    programs, records = _prepared(model, trackers, records, keep, prob)
     if many:
         fleet = run_fleet(programs, records, keep, failed, warm_start)
         warn_unlearned(fleet)
@@ -61,16 +65,21 @@ def _prepared(
     inputs = records.labels.u or records.u.shape[-1]
     made = {id(one): programs_of(model, one, inputs) for one in {id(one): one for one in trackers}.values()}
     programs = [program for one in trackers for program in made[id(one)]]
-    distinct = list(dict.fromkeys(programs for programs in made.values()))
-    for tracker in {program.tracker for some in distinct for program in some}:
-        if keep == "cov" and not tracker.covariance:
-            raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
-    for lane, one in enumerate(distinct[0]):
+    for one in programs if keep == "cov" else ():
+        if not one.tracker.covariance:
+            raise ValueError(f"track: {type(one.tracker).__name__} carries no covariance to keep; use keep='std'.")
+    for lane, one in enumerate(programs[: records.ny]):
         if one.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
             (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
     records = records.for_trackers(programs[0].model, [one.tracker for one in programs], prob)
     return programs, records.in_rows() if model.shared else records
+
+
+def _any_of(tracker: Any) -> list[Any]:
+    """A tracker by which a fleet without a series knows its parameters."""
+    some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
+    return [next(iter(some))]
 
 
 def _is_grid(tracker: Trackers, records: Records) -> bool:

@@ -59,9 +59,15 @@ class Tracker(Settings, ABC):
     adapts: ClassVar[bool] = False
     """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""
-    """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the Gaussian
-    density of the forecast.
+    """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the density
+    of the forecast, Gaussian or Student's.
     """
+    learns_noise: ClassVar[bool] = False
+    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before: their
+    number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    """
+    scratch: ClassVar[tuple[str, ...]] = ()
+    """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 

@@ -42,11 +42,12 @@ class TunedOutputs(ByOutput[Tuned]):
 
 
 def tune_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
-) -> Tuned | TunedOutputs:
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, by: Any,
+    one: Callable[[Task], Tuned],
+) -> Tuned | TunedOutputs:  # fmt: skip
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    runs = constant_outputs(model, y, u, Reading(**known), data)
-    tuned = {name: one(Task(run.model, run.record)) for name, run in runs.items()}
+    runs = constant_outputs(model, y, u, Reading(**known), data, by)
+    tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
     return tuned["rows"] if model.shared else TunedOutputs(tuned)

@@ -177,6 +177,11 @@ class Live(Operated, Stream):
             window.push(self._tile, known)
         return step
 
+    def _settle(self, held: bool, told: bool) -> None:
+        self._rest(HELD if held else ORDINARY)
+        if told:
+            self.tracker.set_extra(self.lane(), self.model, None, None)
+
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()

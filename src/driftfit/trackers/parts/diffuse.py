@@ -58,6 +58,10 @@ AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = r
 """Addresses that `machine_learn` is given."""
 
 
+SCRATCH = ("H", "pivot", "work", "at_start")
+"""Fields of the start that carry nothing from one sample to the next."""
+
+
 def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))

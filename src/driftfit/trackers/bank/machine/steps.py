@@ -11,6 +11,7 @@ from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
     COV_AT,
+    FREEDOM,
     IN_DT,
     IN_NOISE,
     IN_OK,
@@ -185,6 +186,7 @@ def hand_over(s: State, l: int) -> None:
 def alone(s: State, l: int, counts: bool) -> None:
     """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
+    s.sample[FREEDOM, l] = s.count[l] if s.unknown[l] > 0 else np.inf
     if counts:
         learn_scale(s, l)
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0

@@ -5,7 +5,7 @@
     a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
+with v_j the noise of level j (`driftfit.trackers.parts.modes.noise_levels`), c and nu the probabilities of filters and
 levels. An outlier's level is as wide as the innovation if that is larger than the level itself: its influence does not
 grow with its distance. The filters use the coordinates z = M theta of their start, in which the regressor is x
 (`driftfit.trackers.parts.coordinates`): any units, any offset, and directions without information. A regressor
@@ -27,7 +27,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
-from driftfit.trackers.parts.noise_levels import OUTLIER
+from driftfit.trackers.parts.modes.noise_levels import OUTLIER
 from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
@@ -71,6 +71,7 @@ def innovate(s: State, l: int) -> None:
             s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
     mean = 0.0
     for k in range(K):
+        s.e_k[k, l] += s.explained[l]
         mean += s.prior[k, l] * s.e_k[k, l]
     level = 0.0
     for j in range(J - 1):

@@ -140,7 +140,7 @@ def leap(s: State, l: int, noise: float) -> None:
     square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):
         own = s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
-        unit += own * s.phi[i, l] * s.phi[i, l]
+        unit += own * s.white[i, l] * s.white[i, l]
     # a regressor near 0 says nothing about a move: none that would exceed the reach where regressors are as usual
     wide = max(v, min(square, most * most * s.spread[l] * min(1.0, unit)))
     better = 0.5 * square * (1.0 / v - 1.0 / wide) > 0.5 * log(wide / v) - log(RARE)
@@ -150,7 +150,7 @@ def leap(s: State, l: int, noise: float) -> None:
         for i in range(s.theta.shape[0]):
             own = s.leapt[l] * s.ratio[i, TOP, l] / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
             for a in range(i + 1):
-                s.gain[a, TOP, l] += own * s.S[a, i, l] * s.phi[i, l]
+                s.gain[a, TOP, l] += own * s.S[a, i, l] * s.white[i, l]
                 for b in range(a + 1):
                     s.C[a, b, TOP, l] += own * s.S[a, i, l] * s.S[b, i, l]
         s.h[TOP, l] += s.gained[l]

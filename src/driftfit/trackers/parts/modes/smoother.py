@@ -20,7 +20,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.modes.ladder import TOP
-from driftfit.trackers.parts.noise_levels import level_chain
+from driftfit.trackers.parts.modes.noise_levels import level_chain
 
 SMOOTHER_FIELDS = (
     "joint",
