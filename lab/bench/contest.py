@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from lab.bench.machine import times
+from lab.bench.computer import times
 from lab.bench.peers import silence
 
 Answer = Callable[[], Array]

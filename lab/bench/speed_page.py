@@ -11,8 +11,8 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, GREY, new_figure
 from lab.bench.causes import SPEED_CAUSES
+from lab.bench.computer import computer, markdown, versions
 from lab.bench.contest import SAME, Finish, Line
-from lab.bench.machine import machine, markdown, versions
 from lab.bench.speed import SEED, slope
 from lab.bench.speed_process import Start
 
@@ -91,7 +91,7 @@ def growth_table(slopes: Slopes) -> str:
 def page(finishes: Sequence[Finish], slopes: Slopes, starts: tuple[Sequence[Start], Sequence[str]], quick: bool) -> str:
     """The whole page as markdown."""
     lost = losses(finishes)
-    parts = ["# Scoreboard: speed", INTRODUCTION, f"{machine()}. {versions()}. Seed {SEED}."]
+    parts = ["# Scoreboard: speed", INTRODUCTION, f"{computer()}. {versions()}. Seed {SEED}."]
     if quick:
         parts.append("**Quick form: small sizes, few repeats; not to be quoted.**")
     parts += ["## Where we lose", "\n".join(lost) or "In no contest was a peer faster.", SPEED_CAUSES]

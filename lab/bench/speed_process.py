@@ -16,8 +16,8 @@ from importlib.metadata import PackageNotFoundError, distribution
 from statistics import median
 from typing import NamedTuple
 
+from lab.bench.computer import installed
 from lab.bench.contest import need
-from lab.bench.machine import installed
 
 HEAD = """
 import numpy as np, time

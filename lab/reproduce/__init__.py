@@ -18,7 +18,7 @@ class Claim(NamedTuple):
     rule: str
     measured: str
 
-    def told(self, width: int, by: str) -> str:
+    def text(self, width: int, by: str) -> str:
         """Numbers and rule, indented."""
         return "\n".join(indent(fill(text, width), by) for text in (self.measured, f"Rule: {self.rule}"))
 

@@ -27,9 +27,9 @@ def main(
     found = tables.measure(count, quick)
     out.print(tables.table(found))
     ratio, where = tables.worst_ratio(found)
-    told = "1 seed" if count == 1 else f"{count} seeds"
+    text = "1 seed" if count == 1 else f"{count} seeds"
     out.print(
-        f"{told}; largest deviation of a median from its reference, beyond rounding, {100 * ratio:.0f} % ({where})\n"
+        f"{text}; largest deviation of a median from its reference, beyond rounding, {100 * ratio:.0f} % ({where})\n"
     )
     times = cost.measure(500, cost.ORDERS[:1]) if quick else cost.measure()
     out.print(cost.table(times))

@@ -38,7 +38,7 @@ class Score(NamedTuple):
 
 def run(entry: Entry, record: Jumping) -> Track:
     """Track a record."""
-    prob = None if entry.told is None else entry.told(record)
+    prob = None if entry.prior is None else entry.prior(record)
     if not entry.literal:
         return track(MODEL, entry.tracker, record.y, record.u, prob=prob, keep="cov")
     past = np.r_[0.0, 0.0, record.y]

@@ -7,8 +7,8 @@ are 1 for one half of the filters; for the others they are learned from the reco
 (`driftfit.trackers.parts.modes.weights`), so that parameters may drift at different rates. The filters are the modes of
 a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
-The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each filter
-the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
+The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
+filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
 outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
 due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
 of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its

@@ -18,8 +18,8 @@ their likelihood and a prior that is flat in the standard deviation of the drift
 The likelihood of a short record is flat towards small drifts, all of which a prior flat in log f would count as
 evidence that nothing moves.
 
-Source: the likelihood is Schweppe's (1965), the prior Gelman's (2006), section 7.1; the rest is ours. Cost: O(T n^2) for each of some hundred likelihoods, and
-O(T n^3) for each value of a factor that is likely enough.
+Source: the likelihood is by Schweppe (1965), the prior by Gelman (2006), section 7.1; the rest is ours. Cost: O(T n^2)
+for each of some hundred likelihoods, and O(T n^3) for each value of a factor that is likely enough.
 """
 
 from __future__ import annotations

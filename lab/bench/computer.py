@@ -26,7 +26,7 @@ def installed(package: str) -> str | None:
         return None
 
 
-def machine() -> str:
+def computer() -> str:
     """Processor, cores and Python."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
