@@ -165,8 +165,9 @@ def report(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
-    """Least squares until the filters start; then, while there are directions that nothing is known of, those there
-    are."""
+    """Least squares until the filters start; afterwards the running filters, while there are directions without
+    information.
+    """
     if s.settled[l] > 0:
         predict(s, l)
         whiten_noise(s, l)

@@ -62,7 +62,7 @@ from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, learn_scale, no_scale
 
 FOLLOWING = 0.05
-"""Share of the distance to theta that the auxiliary model goes at a sample: twenty samples behind."""
+"""Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
 
 LEAST_SQUARES = 10.0
 """Samples for each parameter, at the start, that are used as in least squares."""

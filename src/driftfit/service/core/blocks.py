@@ -57,7 +57,7 @@ def columns_of(rows: list[list[Any]]) -> Array:
 
 
 def extremes_of(values: Array) -> Array:
-    """Least, largest and mean (3, c) of columns, over finite numbers; NaN if nothing is."""
+    """Least, largest and mean (3, c) of columns, over finite numbers; NaN if there are none."""
     fine = np.isfinite(values)
     count = fine.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -32,7 +32,7 @@ log = logging.getLogger("driftfit.service")
 BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
-"""Seconds that the engine waits for samples before it looks after other things."""
+"""Seconds that the engine waits for samples before it does other work."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -108,7 +108,7 @@ class Engine:
         self.intake.close()
 
     def close(self) -> None:
-        """Store how far the sinks have come, and close the journal."""
+        """Store the positions of the sinks, and close the journal."""
         if not self.problem:
             self._commit()
         self.journal.close()
@@ -239,7 +239,7 @@ class Engine:
         return True
 
     def _sinks_at(self) -> int:
-        """The group up to which all sinks have come."""
+        """The last group that all sinks have written."""
         found = [self.positions.get(f"sink:{sink.name}", 0) for sink in self.config.sinks]
         return min(found, default=self.next)
 

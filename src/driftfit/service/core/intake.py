@@ -20,7 +20,7 @@ class Action(NamedTuple):
     unit: str
     what: dict[str, Any]
     done: Callable[[], None] = lambda: None
-    """Called once it is in the journal."""
+    """Called when it is in the journal."""
 
 
 class Arrived(NamedTuple):

@@ -56,7 +56,7 @@ class Item(NamedTuple):
 
     @property
     def length(self) -> int:
-        """How many numbers of the journal the entry takes."""
+        """How many sample numbers of the journal the entry uses."""
         return 1 if self.action is not None else len(self.rows)
 
 
@@ -106,7 +106,7 @@ class Journal:
         return int(self.meta(NEEDED_FROM) or 1)
 
     def positions(self) -> dict[str, Any]:
-        """Where sources and sinks have come to."""
+        """The positions of sources and sinks."""
         return {name: msgspec.json.decode(value) for name, value in self.db.execute("select * from position")}
 
     def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
@@ -204,7 +204,7 @@ def _json(value: Any) -> str:
 
 
 class Names:
-    """Units by number, as the database knows them; new ones are read when they are asked for."""
+    """Units by number, as the database knows them; new ones are read when they are needed."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal

@@ -38,7 +38,7 @@ HEADERS = [
 
 @dataclass(frozen=True)
 class User:
-    """Who asks."""
+    """The user of a request."""
 
     name: str
     role: str

@@ -19,7 +19,7 @@ from driftfit.service.control import packed
 from driftfit.service.core.journal import Journal, Names
 
 TICK = 0.25
-"""Seconds between two looks."""
+"""Seconds between two reads."""
 CHECK = 60.0
 """Seconds after which the parameters to which drift refers are renewed: drift is that of one to two minutes."""
 RECENT = 512

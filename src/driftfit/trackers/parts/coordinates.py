@@ -88,7 +88,7 @@ FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
 
 @kernel
 def whiten(s: State, l: int) -> None:
-    """x = M^-T phi, where no column is free."""
+    """x = M^-T phi, if no column is free."""
     for j in range(s.theta.shape[0]):
         u = s.white[j, l]
         for i in range(j):
@@ -98,7 +98,7 @@ def whiten(s: State, l: int) -> None:
 
 @kernel
 def whiten_within(s: State, l: int) -> int:
-    """x where columns are free; returns the column along which phi leaves the span of earlier regressors, or -1."""
+    """x if columns are free; returns the column along which phi leaves the span of earlier regressors, or -1."""
     n, L = s.d.shape
     machine_place(s.S.ctypes.data, s.white.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
     for i in range(n):
@@ -118,7 +118,7 @@ def frame(s: State, l: int) -> None:
 
 @kernel
 def new_row(s: State, j: int, l: int) -> float:
-    """Let the rest of phi be row j of M; returns its sign there, which the row does not have."""
+    """Make the rest of phi row j of M; returns the sign by which that row was multiplied."""
     n = s.theta.shape[0]
     rest = s.white[j, l]
     for i in range(j):
@@ -142,7 +142,7 @@ def new_row(s: State, j: int, l: int) -> float:
 
 @kernel
 def located(s: State, l: int) -> None:
-    """theta = M^-1 d, where no column is free."""
+    """theta = M^-1 d, if no column is free."""
     n = s.theta.shape[0]
     for i in range(n - 1, -1, -1):
         t = s.d[i, l]

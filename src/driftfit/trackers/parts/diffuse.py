@@ -34,25 +34,26 @@ from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log
 from driftfit.trackers.parts.information import spread
 
 ROUNDING = 1e-13
-"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, and to spare."""
+"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, with a margin."""
 
 WORST = 1e6
-"""Largest variance inflation that is left to a covariance: of sixteen digits ten remain."""
+"""Largest variance inflation for which a covariance is used: ten of sixteen digits remain."""
 
 LEFT = 1e-14
 """Smallest share of a variance that one sample leaves: below it the rest is rounding, which may be negative. It takes
 a regressor ten million times as large as those before it."""
 
 ALMOST_ANY = 1e13
-"""The same for trackers whose work cannot wait: they are least squares without drift before the change of form."""
+"""The same for trackers that cannot wait longer: they are least squares without drift before the change of form."""
 
 SIZE, STD, LOOSE, ROW, WORK = range(5)
 """Rows of ``work``: norms of the columns of S and of the rows of R, the scale of the error of R, a row to absorb."""
 
 Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
-"""Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
-variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation,
-and the column by which a regressor enters."""
+"""Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; results: the
+variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation, and
+the column by which a regressor enters.
+"""
 
 AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = range(10)
 """Addresses that `machine_learn` is given."""
@@ -195,7 +196,9 @@ def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
 
 @shared
 def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
-    """Rotate ``row' theta = y`` into (S, d), past free columns, where it holds rounding, up to the one it enters by."""
+    """Rotate ``row' theta = y`` into (S, d), skipping free columns, where it contains rounding, up to the column by
+    which it enters.
+    """
     n = len(S)
     for i in range(n):
         a, b = S[i, i], row[i]
@@ -352,7 +355,7 @@ MACHINES = (machine_learn, machine_wander)
 
 @kernel
 def wander(s: State, size: float, l: int) -> None:
-    """Let theta move by ``size`` s.H w with w ~ N(0, I), in square-root form."""
+    """Move theta by ``size`` s.H w with w ~ N(0, I), in square-root form."""
     n, L = s.d.shape
     machine_wander(s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.pivot.ctypes.data, n, L, l, size)
 

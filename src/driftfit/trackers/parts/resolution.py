@@ -35,7 +35,7 @@ ROUNDING = 1e-12
 """A step below this share of the reading is rounding, and the reading a repeated one."""
 
 LONGEST = 4.0
-"""More repeated readings in a row count as so many."""
+"""At most so many repeated readings in a row count."""
 
 
 def unresolved() -> dict[str, Any]:
@@ -75,7 +75,7 @@ def lasting(s: State, l: int) -> float:
 
 
 def resolution(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """Its remark in a summary: nothing where readings are fine."""
+    """Its remark in a summary: nothing if the resolution is fine."""
     if not lane["coarse"] > 0.0:
         return ()
     share = float(lane["repeats"] / (lane["repeats"] + lane["steps"]))

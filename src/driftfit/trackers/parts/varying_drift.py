@@ -25,7 +25,7 @@ def read_drift(s: State, known: Array, t: int, l: int) -> None:
 
 
 def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:
-    """The columns (T, n); ValueError where ``drift`` has another shape or cannot be a factor."""
+    """The columns (T, n); ValueError if ``drift`` has another shape or cannot be a factor."""
     factors, n = as_numbers("drift", drift), len(names)
     if factors.shape != (T, n):
         raise ValueError(

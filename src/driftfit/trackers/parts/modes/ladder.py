@@ -28,7 +28,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, kernel, log
 
 LADDER = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 10.0, 100.0)
-"""Ratios that all parameters climb."""
+"""Drift ratios of the modes in which all parameters drift."""
 LEARNED = LADDER[2:8]
 """Ratios of the ladder whose parameters have learned weights, and of groups."""
 UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.002, 0.0015, 0.1, 0.0001
@@ -135,7 +135,7 @@ def mix(s: State, l: int) -> None:
 
 @kernel
 def leap(s: State, l: int, noise: float) -> None:
-    """Let the top filter explain the innovation by a move of any necessary size, if that is more likely."""
+    """Let the top filter explain the innovation by a jump of any size, if that is more likely."""
     most = LEAP * s.patience[l]
     square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):

@@ -24,11 +24,11 @@ STAY = 0.99
 OUTLIER = 0.02
 """Probability of an outlier."""
 MEMORY = 100.0
-"""Samples over which r is remembered."""
+"""Memory of r, in samples."""
 IN_A_ROW, RISE = 4.0, 0.3
 """From the third outlier in a row on (`driftfit.trackers.parts.outlying_readings`), log r rises by this with each."""
 FINEST = 1e-12
-"""r is never below this share of the mean square of y: the data's own rounding."""
+"""r is never below this share of the mean square of y: the rounding of the data."""
 
 
 def any_level() -> dict[str, Any]:

@@ -36,12 +36,12 @@ SMOOTHER_FIELDS = (
     "settled",
     "weight",
 )
-"""Fields that a run notes at every sample."""
+"""Fields that are stored at every sample."""
 
 
 @kernel
 def store_for_smoother(o: State, s: State, l: int) -> None:
-    """Store them."""
+    """Store the fields of the smoother."""
     for k in range(s.prior.shape[0]):
         o.prior[k, l] = s.prior[k, l]
         for j in range(s.joint.shape[0]):

@@ -33,7 +33,7 @@ FADE = 0.97
 SWEEPS = 20
 """Sweeps over the parameters for the solution."""
 FLOOR = 0.01
-"""Least weight."""
+"""Smallest weight."""
 TINY = 1e-300
 
 E, PRECISION, SPAN, MORE = 0, 1, 2, 3
@@ -55,7 +55,7 @@ def no_weights(n: int) -> dict[str, Any]:
 
 @shared
 def step_back(past: Array, at: int, t: Array) -> None:
-    """One step back of r and N."""
+    """One backward step of r and N."""
     n = t.shape[1]
     N = CURVATURE + n
     move, more = past[at, 2 * n + E], past[at, 2 * n + PRECISION]
@@ -100,7 +100,7 @@ def look_back(past: Array, newest: int, t: Array) -> None:
 
 @shared
 def solve(t: Array) -> None:
-    """Weights, from the sums."""
+    """Compute the weights from the sums."""
     n, A = t.shape[1], CURVATURE
     for i in range(n):
         t[WEIGHT, i] = max(t[SLOPE, i], 0.0) / (t[A + i, i] + TINY)
@@ -127,7 +127,7 @@ def machine_weights(past: int, newest: int, scores: int, n: int, L: int, l: int)
 
 @kernel
 def remember(s: State, at: int, l: int) -> None:
-    """A sample that the filters took, in units of r and c; s.d is scratch here."""
+    """Store a sample that the filters used, in units of r and c; s.d is scratch here."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     e, precision = 0.0, 0.0
     for k in range(K):
