@@ -1,5 +1,5 @@
 """A notice that the compiler is working, shown when a user has to wait for it: one line on stderr after two seconds,
-once a process.
+once per process.
 
 Only where somebody looks: on a terminal, or in a notebook. Output to a file or a program is not changed.
 """

@@ -1,4 +1,5 @@
-"""Compiled code on disk: one file for each function and signature, found by a name made of all that it depends on.
+"""Compiled code on disk: one file for each function and signature, found by a name that is a digest of everything on
+which it depends.
 
 Numba keeps the signatures of a function in one index and numbers its files by the length of the index when it was read:
 two processes that compile different layouts at the same moment may store both under one number, and a third runs the
@@ -37,7 +38,7 @@ MAKERS = ("kernel.py", "numba_internals.py", "simd.py")
 
 @cache
 def folders() -> tuple[Path, ...]:
-    """Where compiled code may be kept, the first choice first."""
+    """Folders in which compiled code may be stored, the first choice first."""
     given = numba.config.CACHE_DIR
     if given:
         return (Path(given) / "driftfit",)
@@ -48,7 +49,7 @@ def folders() -> tuple[Path, ...]:
 
 @cache
 def folder() -> Path | None:
-    """Where compiled code goes: the first folder that can be written, or None."""
+    """The folder in which compiled code is stored: the first that can be written, or None."""
     for place in folders():
         try:
             place.mkdir(parents=True, exist_ok=True)
@@ -75,7 +76,7 @@ def name_of(function: str, identity: str, signature: Any) -> str:
 
 
 def read(name: str) -> Any:
-    """The code stored under a name in any of the folders; None where there is nothing, or nothing whole."""
+    """The code stored under a name in any of the folders; None if there is none, or if it is damaged."""
     for place in folders():
         try:
             data = (place / name).read_bytes()
@@ -90,7 +91,7 @@ def read(name: str) -> Any:
 
 
 def _touch(path: Path) -> None:
-    """Note that a file was used, for `prune`; once a day is enough."""
+    """Record that a file was used, for `prune`; once a day is enough."""
     try:
         if time.time() - path.stat().st_mtime > 86400.0:
             os.utime(path)
@@ -99,7 +100,7 @@ def _touch(path: Path) -> None:
 
 
 def write(name: str, content: Any) -> None:
-    """Keep something under a name, if there is a place for it."""
+    """Store data under a name, if a folder can be written."""
     place = folder()
     if place is None:
         _say_nothing_is_kept()
@@ -157,7 +158,7 @@ def prune(days: float) -> int:
 
 
 def _place() -> Path | None:
-    """The folder that is written, or that can be read at least."""
+    """The folder that is written, or else one that can be read."""
     return folder() or next((place for place in folders() if place.is_dir()), None)
 
 

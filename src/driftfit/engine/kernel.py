@@ -47,7 +47,7 @@ Step = Callable[[State, int], None]
 
 
 def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
-    """Compile under IEEE rules and without the GIL; the cache on disk and `identity` know it by what it does."""
+    """Compile under IEEE rules and without the GIL; its identity names it in the cache on disk."""
     assert isinstance(function, FunctionType)
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
     if cache:
@@ -69,7 +69,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
 
 
 def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
-    """Note how a function like this one is made of another source; see `driftfit.engine.substitute`."""
+    """Store how a function like this one is made from another source; see `driftfit.engine.substitute`."""
     dispatcher.again = again
     return dispatcher
 
@@ -110,7 +110,7 @@ def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] =
 
 
 def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
-    """``work`` with a constant for its first argument where that is one of the sizes."""
+    """``work`` with a constant for its first argument if that is one of the sizes."""
     if not sizes:
         return work
     size, others = sizes[0], _for_sizes(work, sizes[1:])
@@ -161,7 +161,7 @@ register_model(Machine)(models.OpaqueModel)
 _MACHINES: dict[str, Machine] = {}
 _DISPATCHERS: dict[str, Any] = {}
 _LOADED: dict[str, Any] = {}
-"""The owner of the code, which would go with it."""
+"""The owners of the code, without which it would be freed."""
 
 
 def _machine(symbol: str) -> Machine:
@@ -238,7 +238,7 @@ class Driver:
         return internals.load(internals.Code(*code), self._instead)
 
     def let_go(self, found: Any) -> None:
-        """Forget an entry point; who holds it may go on using it."""
+        """Forget an entry point; whoever holds it may continue to use it."""
         self._entries = {key: one for key, one in self._entries.items() if one is not found}
 
 
@@ -262,8 +262,8 @@ MOST_ENTRIES = 256
 """Entry points of drivers that a process keeps, of some 0.3 MB each."""
 
 KEPT = 300
-"""Parts whose code is kept for drivers to come, of some 0.2 MB each; a driver takes in some twenty to sixty, and the
-same for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
+"""Parts whose code is kept for later drivers, of some 0.2 MB each; a driver inlines some twenty to sixty, and the
+same ones for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
 turn.
 """
 
@@ -276,7 +276,7 @@ class _Entries:
         self.lock = Lock()
 
     def used(self, entry: Any, owner: Driver) -> None:
-        """Note that an entry point is in use, and let go of those that were not for longest."""
+        """Mark an entry point as used, and release the least recently used ones."""
         with self.lock:
             self._owners.setdefault(entry, ref(owner))
             self._owners.move_to_end(entry)
@@ -318,7 +318,7 @@ packed = internals.named_intrinsic("packed", internals.in_a_row)
 
 @kernel
 def nothing(s: State, l: int) -> None:
-    """The step that leaves the record alone."""
+    """The step that changes nothing."""
 
 
 LOG2 = 0.6931471805599453

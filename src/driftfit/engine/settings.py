@@ -17,7 +17,7 @@ import numpy as np
 
 
 class DataWarning(UserWarning):
-    """Something in the data that makes a result less than it seems; what was found, and the way out."""
+    """A property of the data that makes a result less reliable than it seems; the message names it and the remedy."""
 
 
 def warn(message: str, kind: type[Warning] = DataWarning) -> None:

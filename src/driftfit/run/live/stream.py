@@ -119,7 +119,7 @@ class Stream(Batched, Plain, storage.Kept):
         return self._place
 
     def _expect(self, what: int) -> None:
-        """Note whether an input is outstanding."""
+        """Record whether an input is outstanding."""
         self._awaits = what
 
     def apply(self, u: Any) -> None:

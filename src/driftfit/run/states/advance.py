@@ -17,7 +17,7 @@ from driftfit.run.program import Program
 
 
 class Advanced:
-    """What a driver wrote for all series of ``records``, and where they ended."""
+    """The results of a driver for all series of ``records``, and their final states."""
 
     def __init__(self, programs: Sequence[Program], records: Records, jobs: Sequence[Job]) -> None:
         self.programs, self.records, self.jobs = programs, records, jobs

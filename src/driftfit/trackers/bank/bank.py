@@ -221,7 +221,7 @@ class Bank(Tracker):
 
     @property
     def chained(self) -> bool:
-        """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
+        """Whether a gap is a chain of changes, all of them walks, of which leaves distinguish two courses."""
         merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
         walks = not any(one.forgets for one in self.all_changes)
         return len(self.all_changes) > 1 and not self._apart and not merging and walks

@@ -24,7 +24,7 @@ from driftfit.trackers.bank.sensor import Sensor, table_of
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
 SAID = 3
-"""Numbers that a likelihood of the user's own says of each leaf."""
+"""Numbers that a likelihood of the user's own returns for each leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -150,7 +150,7 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty where there is none."""
+    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty if there is none."""
     return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
 
 

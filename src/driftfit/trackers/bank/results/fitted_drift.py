@@ -1,4 +1,4 @@
-"""The drift between events, of a bank that was given none: for each parameter the factor of greatest likelihood.
+"""The drift between events of a bank without a given drift: for each parameter the factor of greatest likelihood.
 
     max_f sum_t log N(y_t; phi_t' m_t, c s_t),   Q_t = D Q_0 D,   D = diag(f_i)^(1/2)   between events,   f_i >= 1
 
@@ -36,7 +36,7 @@ WIDER = 1e7
 STARTS = (1.0, 1e2, 1e4)
 """Factors at which the search begins: the likelihood may be flat where a drift is too small to be seen."""
 AWAY = np.arange(-7.0, 8.0)
-"""Where the likelihood of a factor is looked at, in its natural logarithm."""
+"""Values at which the likelihood of a factor is computed, as natural logarithms."""
 LIKELY = 0.01
 """Values of a factor that are less likely than this share of the best are left out."""
 
@@ -79,7 +79,7 @@ class FittedDrift:
         return self._scaled(self._logs)
 
     def _at(self, logs: Array, without: int | None = None) -> Problem:
-        """The regression with these factors, and one change less."""
+        """The regression with these factors, and without one change."""
         root, dates = np.exp(0.5 * logs), [date for date in self.dates if date != without]
         Q = self._base * (root[:, None] * root)
         Q[dates] = self._given.Q[dates]

@@ -206,7 +206,7 @@ class Hypotheses:
         return self._timed(dates.dated(found, measured, jumps))
 
     def found(self, threshold: float = 0.5) -> list[Event]:
-        """`events` as they were known when they were found: with the dates of the leaves, and without shifts."""
+        """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
         bank = self.tracker
         given = Probabilities(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
