@@ -31,7 +31,7 @@ def identity(function: FunctionType) -> str:
 
 
 def used_globals(function: FunctionType) -> dict[str, Any]:
-    """The globals that a function reads; TypeError if one is not defined yet, because an edit of it would go unnoticed."""
+    """The globals that a function reads; TypeError if one is not yet defined, because its edits would go unnoticed."""
     names = _globals(function.__code__)
     later = sorted(names - function.__globals__.keys() - vars(builtins).keys())
     if later:

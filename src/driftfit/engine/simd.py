@@ -34,7 +34,7 @@ class Vector8(types.Type):
 
 
 class Vector4(types.Type):
-    """A vector of four floats: between scalar operations of a filter, a few vectors of eight cost more than they saved."""
+    """A vector of four floats: between scalar operations of a filter, vectors of eight cost more than they saved."""
 
     def __init__(self) -> None:
         super().__init__(name="driftfit.Vector4")
