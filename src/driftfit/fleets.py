@@ -11,6 +11,7 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
 from driftfit.run import fleet, keyed_results, outputs, result, shared_outputs
@@ -29,6 +30,7 @@ from driftfit.use.forecast import Forecast, forecast_outputs
 
 if TYPE_CHECKING:
     import polars
+    import xarray
     from matplotlib.figure import Figure
 
 
@@ -97,6 +99,12 @@ class Judged(keyed_results.KeyedResults):
 
         return to_table(self, kind, arrays)
 
+    def to_xarray(self) -> xarray.Dataset:
+        """All results as one xarray dataset, with one dimension more than a `Track`; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
+
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""
         return self.to_table().__arrow_c_stream__(requested_schema)
@@ -149,6 +157,10 @@ class Outputs(outputs.Outputs, Judged, public=True):
         """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
         return forecast_outputs(self, h, u)
 
+    def joint_noise(self, memory: float | None = None) -> JointNoise:
+        """One noise covariance for all outputs, and their joint density; see `driftfit.judge.joint_noise`."""
+        return JointNoise(self, memory)
+
     def summary(self) -> ByOutput[Summary]:
         """The summaries of all outputs, by name; print it."""
         return summarise_outputs(self)
@@ -195,6 +207,12 @@ class Shared(shared_outputs.Shared, public=True):
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands, predictions and innovations of the rows. ``ax`` as for `Track.plot`."""
         return plot_track(self.rows, level, ax)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The results as an xarray dataset, predictions by time and output; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
         """The results as one table, one row per sample; see `driftfit.show.export`.

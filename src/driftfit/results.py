@@ -31,6 +31,7 @@ from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
 
 if TYPE_CHECKING:
+    import xarray
     from matplotlib.figure import Figure
 
 
@@ -87,6 +88,12 @@ class Track(result.Track, public=True):
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
         return to_table(self, kind, arrays)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The result as an xarray dataset with the dimensions time and parameter; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""

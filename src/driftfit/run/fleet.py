@@ -8,6 +8,8 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from driftfit.data.record import Records
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
@@ -109,6 +111,7 @@ def run_fleet(
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
     before: Mapping[Hashable, Run | bytes] | None = None,
+    dtype: Any = np.float64,
 ) -> Fleet:
     """Run every series by its programs (one for each output) and return the results; all have one bound model.
 
@@ -118,7 +121,7 @@ def run_fleet(
     if not records.keys:
         return Fleet(programs, records, [], failed or {}, {})
     starts, records = _begun(programs, records, before or {})
-    lanes = run_lanes(programs, records, keep, starts)
+    lanes = run_lanes(programs, records, keep, starts, dtype)
     series = lanes[:: records.ny]
     absent = {key: "interrupted before it was run" for key, lane in zip(records.keys, series, strict=True) if not lane}
     if absent:

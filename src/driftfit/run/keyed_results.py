@@ -20,7 +20,7 @@ from driftfit.data.record import Labels, Records
 from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.program import Program, State, programs_of, state_of
+from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.trackers.base import Tracker
@@ -219,7 +219,9 @@ def _restored(
     tiles = repeat_tile(program.tile(), len(some))
     into = {name: tiles[name][..., 0] for name in storage.fields(tiles)}
     storage.restore(path, program.tracker, arrays, f"state{g}_", into)
-    out = program.written(tiles[:1], sum(length), "cov" if f"out{g}_P" in arrays else "std")
+    stored = [name.removeprefix(f"out{g}_") for name in arrays if name.startswith(f"out{g}_")]
+    keep, _ = kept(np.dtype([(name, float) for name in stored]))
+    out = program.written(tiles[:1], sum(length), keep, arrays[f"out{g}_theta"].dtype)
     storage.restore(path, program.tracker, arrays, f"out{g}_", {name: out[name][..., 0] for name in names_of(out)})
     ends = np.cumsum(length).tolist()
     for k, j in enumerate(some):

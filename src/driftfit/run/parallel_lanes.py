@@ -48,7 +48,7 @@ _thread = threading.local()
 
 
 def run_lanes(
-    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State]
+    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State], dtype: Any = np.float64
 ) -> list[Lane | None]:
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
@@ -56,7 +56,7 @@ def run_lanes(
     that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
-    jobs = prepare(programs, records, keep)
+    jobs = prepare(programs, records, keep, dtype)
     for job in jobs:
         for lane, k in enumerate(job.lanes.tolist()):
             for name, value in starts.get(k, {}).items():
@@ -69,9 +69,9 @@ def run_lanes(
     return lanes
 
 
-def prepare(programs: Sequence[Program], records: Records, keep: str) -> list[Job]:
+def prepare(programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64) -> list[Job]:
     """Tiles at their start for all series, the longest first."""
-    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep)]
+    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep, dtype)]
     return sorted(jobs, key=lambda job: -len(job.out))
 
 
@@ -104,7 +104,7 @@ def width_of(program: Program, count: int, ny: int = 1) -> int:
     return ny if wide < 2 * ny else wide
 
 
-def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str) -> Iterator[Job]:
+def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str, dtype: Any) -> Iterator[Job]:
     """Tiles for the series of one group, longest first."""
     ny, program = records.ny, programs[group[0] * records.ny]
     L = width_of(program, len(group), ny)
@@ -117,11 +117,10 @@ def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], k
     longest = records.length[padded[:, 0]]
     ends = np.cumsum(longest)
     # one allocation for all tiles, so that it is large enough for huge pages
-    out = program.written(tiles[:1], int(ends[-1]), keep)
-    run = program.drivers(keep).run
+    out = program.written(tiles[:1], int(ends[-1]), keep, dtype)
     for k, some in enumerate(lanes):
         live = (np.arange(L) < ny * G) & (place < len(order) - k * G)
-        yield Job(run, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
+        yield Job(program.fill, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
 
 
 def _tiles(programs: Sequence[Program], lanes: Array) -> Array:

@@ -6,6 +6,8 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Records, one_series, rows
@@ -29,11 +31,15 @@ Result = Track | Fleet | Outputs | Shared
 
 def track(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
-    by: str | Sequence[str] | None = None, keep: str = "std", warm_start: Any = None, prob: Any = None,
+    by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64", warm_start: Any = None,
+    prob: Any = None,
 ) -> Result:  # fmt: skip
     """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
     check_roles("track", model, tracker, several=True)
-    one_of("track", "keep", keep, ("std", "cov"))
+    one_of("track", "keep", keep, ("std", "cov", "theta"))
+    one_of("track", "dtype", np.dtype(dtype).name, ("float64", "float32"))
+    if keep == "theta" and len(model.outputs) > 1:
+        raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading
     model, records, failed = records_of(model, y, u, reading, data, by)
     records = records.for_model(model, reading)
@@ -50,10 +56,10 @@ def track(
     trackers = _per_series(tracker, records) or _any_of(tracker)
     programs, records = _prepared(model, trackers, records, keep, prob)
     if many:
-        fleet = run_fleet(programs, records, keep, failed, warm_start)
+        fleet = run_fleet(programs, records, keep, failed, warm_start, dtype)
         warn_unlearned(fleet)
         return fleet
-    run = _one(programs, records, keep, warm_start)
+    run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     return run
 
@@ -141,7 +147,9 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
     return list(tracker)
 
 
-def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None) -> Track | Outputs | Shared:
+def _one(
+    programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any
+) -> Track | Outputs | Shared:
     """Run one series."""
     program, record = programs[0], records.part(0)
     starts = carried(before, programs)
@@ -149,7 +157,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
     tile = tile_of(programs, starts)
-    out = program.run(tile, record, keep)
+    out = program.run(tile, record, keep, dtype)
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))

@@ -16,7 +16,7 @@ from driftfit.run.shared_outputs import Shared
 def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
     """Warn of the parameters that `Tracker.unlearned` marks."""
     one = run.rows if isinstance(run, Shared) else run
-    if isinstance(one, Track) and not np.isinf(one.var[-1]).any():
+    if isinstance(one, Track) and not one.undetermined.any():
         return
     ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())
     found, counts, owners = 0, Counter[str](), []

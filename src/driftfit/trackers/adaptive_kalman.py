@@ -12,7 +12,8 @@ filter the levels are merged at once, by a rank-one update (`driftfit.trackers.p
 outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
 due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
 of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
-last value are left out too (`driftfit.trackers.parts.frozen`).
+last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
+additional regressor (`driftfit.trackers.parts.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -42,7 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coloured import learn_colour, white, whiten_noise
+from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -284,6 +285,10 @@ class AdaptiveKalman(Tracker):
             doubts=True,
         )
 
+    def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        running = fields["settled"] > 0
+        return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
+
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
     ) -> tuple[Array, Array]:
@@ -317,7 +322,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

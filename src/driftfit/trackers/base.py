@@ -50,6 +50,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()
@@ -63,8 +65,8 @@ class Tracker(Settings, ABC):
     of the forecast, Gaussian or Student's.
     """
     learns_noise: ClassVar[bool] = False
-    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before: their
-    number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
+    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
     """
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""
@@ -117,6 +119,10 @@ class Tracker(Settings, ABC):
             f"{type(self).__name__} does not describe a random walk in Gaussian noise, so there is nothing to smooth; "
             "track with FLS or Kalman."
         )
+
+    def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
+        return phi, y
 
     def estimated_variances(
         self, model: Model, fields: Mapping[str, Array], e: Array, time: Array

@@ -78,7 +78,8 @@ class Tuned(Printed):
         )
         ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
         table = table_of("Settings", "", "estimate", *ends)
-        for name, value in self.chosen.items():
+        found = self.chosen | ({"r": self.noise} if "r" in self.interval else {})
+        for name, value in found.items():
             table.add_row(Text(name), *(f"{number:.4g}" for number in (value, *self.interval[name])))
         yield table
         if self.at_bound:

@@ -59,7 +59,8 @@ class LiveSelection(Kept):
             raise ValueError("LiveSelection: takes at least one model, each with one output.")
         if not tracker.covariance or tracker.density:
             raise ValueError(
-                f"LiveSelection: {type(tracker).__name__} has no prediction with one variance to weigh; use Kalman, RLS or FLS."
+                f"LiveSelection: {type(tracker).__name__} has no prediction with one variance to weigh; use "
+                "Kalman, RLS or FLS."
             )
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")

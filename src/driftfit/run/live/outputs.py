@@ -221,8 +221,9 @@ class LiveOutputs(Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations."""
-        std: Array = np.sqrt(np.einsum("...ii->...i", self.cov))
-        return std
+        var: Array = self._tile["var"][0].T
+        std = np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
+        return std[0] if self.model.shared else std
 
     @property
     def names(self) -> tuple[Any, ...]:

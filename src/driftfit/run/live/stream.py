@@ -11,6 +11,7 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.limits import Gate
+from driftfit.engine.drivers import as_compiled
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
@@ -146,7 +147,7 @@ class Stream(Batched, Plain, storage.Kept):
     def _put(self, tile: Array, inputs: Array) -> None:
         """Store the outstanding input in a tile."""
         if self._awaits == INPUT:
-            self._placing()(tile, inputs)
+            self._placing()(as_compiled(tile), inputs)
 
     def _within(self, inputs: Array) -> Array:
         """Inputs with NaN outside their limits, which are counted."""

@@ -89,6 +89,15 @@ class Layout:
         """Set lanes of a tile to states, (W,) or (lanes, W)."""
         words_of(tile)[self.held[:, None], lanes] = words.reshape(-1, len(self.held)).T
 
+    def field(self, words: Array, name: str) -> Array:
+        """A field of numbers of states (.., W), as (.., k)."""
+        at = 0
+        for one, (_, shape) in self.shapes.items():
+            if one == name:
+                return np.ascontiguousarray(words[..., at : at + prod(shape)]).view(np.float64)
+            at += prod(shape)
+        raise KeyError(name)
+
     def pack(self, words: Array) -> bytes:
         """A state (W,) as bytes."""
         return packed(self.tag, words)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
-from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
+from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
@@ -142,7 +142,7 @@ FRAMED = (machine_walks, machine_enter)
 def addresses(s: State) -> int:
     """The address of those of the fields that these routines work on."""
     return packed((  # type: ignore[no-any-return]
-        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
         s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
     ))  # fmt: skip
 
@@ -164,7 +164,7 @@ def write_walks(s: State, l: int) -> None:
     """Write the covariances that changes add at the next sample, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
-    machine_walks(addresses(s), unit, s.memory.shape[0], n, L, l)
+    machine_walks(addresses(s), unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
 
 @kernel
@@ -177,7 +177,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     s.root[l] = 1
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
-    machine_enter(addresses(s), s.unknown[l], s.memory.shape[0], s.counters.shape[0], n, L, l)
+    machine_enter(addresses(s), s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
 
 
 @kernel

@@ -27,11 +27,11 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
 
-LADDER = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 10.0, 100.0)
+LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
 """Drift ratios of the modes in which all parameters drift."""
-LEARNED = LADDER[2:8]
+LEARNED = LADDER[3:9]
 """Ratios of the ladder whose parameters have learned weights, and of groups."""
-UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.002, 0.0015, 0.1, 0.0001
+UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.001, 0.0015, 0.1, 0.0005
 """Probabilities: to the rung above, to the one below, to the top, from a rung of its ratio to the one below, and from a
 rung that all parameters climb to the same one with learned weights."""
 
