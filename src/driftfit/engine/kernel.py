@@ -312,7 +312,24 @@ cubes = internals.cube_at("cubes", types.float64)
 """cubes(address, rows, columns, lanes): the array (rows, columns, lanes) of floats that begins at an address."""
 wholes = internals.matrix_at("wholes", types.int64)
 """wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
-packed = internals.named_intrinsic("packed", internals.in_a_row)
+
+
+def _in_a_row(context: Any, numbers: Any) -> Any:
+    """The typed half of `packed`."""
+    word, index = internals.ir.IntType(64), internals.ir.IntType(32)
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        with builder.goto_entry_block():
+            place = builder.alloca(internals.ir.ArrayType(word, len(numbers)))
+        for k, kind in enumerate(numbers):
+            value = context.cast(builder, builder.extract_value(given[0], k), kind, types.intp)
+            builder.store(value, builder.gep(place, [index(0), index(k)], inbounds=True))
+        return builder.ptrtoint(place, word)
+
+    return types.intp(numbers), build
+
+
+packed = internals.named_intrinsic("packed", _in_a_row)
 """packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine."""
 
 

@@ -44,7 +44,6 @@ import numba
 from llvmlite import ir
 from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
-from numba.core import cgutils
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder, Flags
@@ -495,20 +494,6 @@ def cube_at(name: str, dtype: Any) -> Any:
         return _array(dtype, rows, columns, lanes)
 
     return named_intrinsic(name, cube)
-
-
-def in_a_row(context: Any, numbers: Any) -> Any:
-    """The typed half of an intrinsic ``f((a, b, ..))``: whole numbers in a row on the stack, and their address."""
-    word = ir.IntType(64)
-
-    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        place = cgutils.alloca_once(builder, ir.ArrayType(word, len(numbers)))
-        for k, kind in enumerate(numbers):
-            value = context.cast(builder, builder.extract_value(given[0], k), kind, types.intp)
-            builder.store(value, cgutils.gep_inbounds(builder, place, 0, k))
-        return builder.ptrtoint(place, word)
-
-    return types.intp(numbers), build
 
 
 def named_intrinsic(name: str, typed: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,14 +12,14 @@ import numpy as np
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Records, one_series, rows
-from driftfit.engine.settings import one_of
+from driftfit.engine.settings import one_of, warn
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
-from driftfit.run.program import Program, programs_of, tile_of
+from driftfit.run.program import Program, State, programs_of, tile_of
 from driftfit.run.result import Lane, Track
 from driftfit.run.shared_outputs import Shared
-from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -163,3 +164,35 @@ def _one(
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
     run = Track(program, record, Lane(out, tile), *starts)
     return run if program.shared is None else Shared(run)
+
+
+def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
+    """Warn of the parameters that `Tracker.unlearned` marks."""
+    one = run.rows if isinstance(run, Shared) else run
+    if isinstance(one, Track) and not one.undetermined.any():
+        return
+    ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())
+    found, counts, owners = 0, Counter[str](), []
+    for program, state in ends:
+        missed = _missed(program, state)
+        found += bool(missed)
+        counts.update(missed)
+        owners += [type(program.tracker).__name__] if missed else []
+    if not found:
+        return
+    named = ", ".join(counts)
+    if not isinstance(one, Track):
+        named = f"in {found} of {len(ends)} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
+    warn(
+        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
+        "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
+        "constant or repeat another.",
+        UserWarning,
+    )
+
+
+def _missed(program: Program, state: State) -> list[str]:
+    """Names of the parameters that a record did not determine."""
+    if not np.isinf(state["var"]).any():
+        return []
+    return [name for name, missed in zip(program.names, program.tracker.unlearned(state), strict=True) if missed]
