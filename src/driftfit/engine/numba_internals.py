@@ -21,8 +21,7 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
     fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
-Public means are used instead for: types and typeof, intrinsics, data models, compile options and the sequence of
-passes (`numba.njit`, `numba.extending`).
+Public means (`numba.njit`, `numba.extending`) serve for types, intrinsics, data models, options and the passes.
 """
 
 from __future__ import annotations
@@ -291,9 +290,7 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 
 _builders: dict[Any, Any] = {}
-"""The builders of LLVM's passes, by their options: Numba makes one for every function, and LLVM does not free all of
-it.
-"""
+"""The builders of LLVM's passes, by their options: Numba makes one per function, of which LLVM frees only a part."""
 
 
 # ---- typing ---------------------------------------------------------------------------------------------------------
