@@ -60,7 +60,8 @@ def main() -> None:
                       f"{time.perf_counter() - began:.0f} s", *what[:6], sep="\n    ", flush=True)  # fmt: skip
     print(f"{'':25} trackers and forms   records   neither finite nor marked, or not recovered")
     for name, (cases, count, wrong) in totals.items():
-        print(f"{name:25} {cases:18} {count:9} {wrong:9}")
+        if cases:
+            print(f"{name:25} {cases:18} {count:9} {wrong:9}")
 
 
 if __name__ == "__main__":

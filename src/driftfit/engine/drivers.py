@@ -17,6 +17,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -36,6 +37,12 @@ LARGEST = 1e38
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
 regressor, a covariance that earlier regressors left, and an innovation overflows."""
+
+
+OPEN = ("report", "memory", "flat")
+"""Fields at the end of a record whose lengths are no part of its type for compiled code, which is the same for all
+lengths: it finds them by their addresses, one after the other from that of the first.
+"""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -151,41 +158,82 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     for name, value in starts[0].items():
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
+    opened = [field for name in OPEN for field in fields if field[0] == name]
+    fields = [field for field in fields if field not in opened]
     size = np.dtype(fields).itemsize
     # whole cache lines, so that no vector load of a lane block straddles two
     fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
-    tile = _aligned(np.dtype(fields, align=True), 1)
+    tile = _aligned(_followed_by(np.dtype(fields, align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
     return tile
 
 
+def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
+    """A record type with further fields of numbers behind it, in whole cache lines."""
+    names, offsets, end = list(dtype.names or ()), [at for _, at, *_ in (dtype.fields or {}).values()], dtype.itemsize
+    formats: list[Any] = [dtype[name] for name in names]
+    for name, kind, shape in fields:
+        names.append(name)
+        formats.append((kind, shape))
+        offsets.append(end)
+        end += 8 * math.prod(shape)
+    size = -(-end // 64) * 64
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size}, align=True)
+
+
+def as_compiled(tile: Array) -> Array:
+    """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
+    if OPEN[0] not in (tile.dtype.names or ()):
+        return tile
+    return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
+
+
+@lru_cache(maxsize=256)
+def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of a record up to the first entry of its open fields."""
+    fields = dtype.fields or {}
+    (first, at, *_), names = fields[OPEN[0]], [name for name in fields if name not in OPEN]
+    beginning = np.dtype(
+        {"names": names, "formats": [dtype[name] for name in names],
+         "offsets": [fields[name][1] for name in names], "itemsize": at}, align=True,
+    )  # fmt: skip
+    return _followed_by(beginning, [(OPEN[0], first.base, (1, first.shape[-1]))])
+
+
 def repeat_tile(tile: Array, count: int) -> Array:
     """``count`` copies of a tile, aligned like it: ``tiles[k : k + 1]`` is a tile."""
     tiles = _aligned(tile.dtype, count)
-    tiles[...] = tile
+    # as bytes: copying records field by field takes ten times as long
+    tiles.view(np.uint8).reshape(count, -1)[...] = tile.view(np.uint8)
     return tiles
 
 
 def _aligned(dtype: np.dtype[Any], count: int) -> Array:
     """``count`` records, all zero, the first at the start of a cache line."""
     raw = np.zeros(dtype.itemsize * count + 64, np.uint8)
-    offset = -raw.ctypes.data % 64
-    records: Array = raw[offset : offset + dtype.itemsize * count].view(dtype)
-    return records
+    return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
 
 
-def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std") -> np.dtype[Any]:
-    """The record that a driver writes for one sample of a tile.
+def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dtype: Any = np.float64) -> np.dtype[Any]:
+    """The record that is kept of one sample of a tile; in double precision, and not of theta alone, a driver writes it.
 
-    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok. What is
-    not common comes first: Numba takes a record that continues another one for the same type, with a warning.
+    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok; of
+    "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
+    type, with a warning.
     """
-    n, L = tile["theta"].shape[1:]
-    names = (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
-    fields: list[Any] = [("P", np.float64, (n, n, L))] if keep == "cov" else []
-    fields += [(name, tile[name].dtype, tile[name].shape[1:]) for name in names]
+    return _output_type(tile.dtype, tuple(outputs), keep, np.dtype(dtype))
+
+
+@lru_cache(maxsize=256)
+def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
+    n, L = tile["theta"].shape
+    names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []
+    for name in names:
+        own = tile[name].base
+        fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
     return np.dtype(fields, align=True)
 
 
@@ -207,7 +255,8 @@ class Drivers(NamedTuple):
     update_one: Any
 
     def updater(self, tile: Array, m: int) -> Any:
-        """The entry point for one sample of tiles of this type: ``f(tile, y, u)``, u as `one_or_all` gives it.
+        """The entry point for one sample of tiles of this type: ``f(as_compiled(tile), y, u)``, u as `one_or_all`
+        gives it.
 
         A number is read faster than an array, and a model of one input needs no second routine for arrays.
         """
@@ -278,11 +327,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
-        inputs = {"y": y, "u": u, "known": known}
-        inputs = {name: np.ascontiguousarray(array, dtype=np.float64) for name, array in inputs.items()}
-        _check_shapes(tile, len(out), **inputs)
+        y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
+        _check_shapes(tile, len(out), y, u, known)
         ready(tile["theta"].shape[2])
-        run(tile, *inputs.values(), out)
+        run(as_compiled(tile), y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
 
@@ -397,7 +445,7 @@ def tile_type(tile: Array) -> types.Type:
         flags.aligned,
     )
     if key not in _TILE_TYPES:
-        _TILE_TYPES[key] = numba.typeof(tile)
+        _TILE_TYPES[key] = numba.typeof(as_compiled(tile))
     return _TILE_TYPES[key]
 
 

@@ -12,7 +12,8 @@ the levels are merged at once, which is a rank-one update (`driftfit.trackers.pa
 proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
 (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
-out too (`driftfit.trackers.parts.frozen`).
+out too (`driftfit.trackers.parts.frozen`). Where innovations are correlated, the previous one is one more regressor
+(`driftfit.trackers.parts.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -42,6 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -51,7 +53,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.filters import (
@@ -145,12 +147,14 @@ def follow(s: State, entering: int, l: int) -> None:
         update_filters(s, l)
         learn_weights(s, l)
         learn_noise(s, l)
+    learn_colour(s, l)
     learn_scales(s, l)
     learn(s, l, s.odd[l])
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    whiten_noise(s, l)
     whiten(s, l)
     follow(s, -1, l)
 
@@ -176,6 +180,7 @@ def begin(s: State, l: int) -> None:
     are."""
     if s.settled[l] > 0:
         predict(s, l)
+        whiten_noise(s, l)
         follow(s, whiten_within(s, l), l)
         mixture(s, l)
         if s.ok[l] > 0.0:
@@ -227,6 +232,9 @@ class AdaptiveKalman(Tracker):
     density: ClassVar[str] = "density"
     noted: ClassVar[tuple[str, ...]] = NOTED
     adapts: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = (
+        *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -268,6 +276,7 @@ class AdaptiveKalman(Tracker):
             **unresolved(),
             **not_frozen(),
             **no_weights(n),
+            **white(n),
             **modes,
             **levels,
         }
@@ -277,6 +286,10 @@ class AdaptiveKalman(Tracker):
         return TrackerSteps(
             predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
         )
+
+    def regression(self, noted: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        running = noted["settled"] > 0
+        return np.where(running[:, None], noted["white"], phi), np.where(running, y - noted["explained"], y)
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
@@ -309,7 +322,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

@@ -99,8 +99,8 @@ walks; whether what may have happened since the last used sample is one floor; a
 likelihoods, while the compiled routine runs.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
-"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of many
-shapes have one type of record and one driver; and of the other arrays.
+"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all
+shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
 PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
 TABLE = Table(
@@ -116,6 +116,18 @@ ROW, ROWS = TABLE.row, len(TABLE.row)
 MEMORY_AT, REPORT_AT, PHI_AT, POWERS_AT, THETA_AT, COV_AT, COUNTERS_AT, SAMPLE_AT = (ROW[name] for name in BASES)
 table_at = TABLE.at
 """The table at an address, for compiled code."""
+
+
+@kernel
+def report_at(s: Any) -> int:
+    """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
+    return s.report.ctypes.data  # type: ignore[no-any-return]
+
+
+@kernel
+def memory_at(s: Any) -> int:
+    """Where the field `memory` begins, behind the report."""
+    return s.report.ctypes.data + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
 
 
 @kernel

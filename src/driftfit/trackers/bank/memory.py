@@ -10,7 +10,19 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
+from driftfit.trackers.bank.layout import (
+    BESIDE,
+    COUNT,
+    HEAD,
+    MEMORY_AT,
+    PACKED,
+    REPORT_AT,
+    REPORTED,
+    ROW,
+    ROWS,
+    SIZE,
+    TOLD,
+)
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
@@ -119,7 +131,7 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
 
 
 def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str, Any]:
-    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
+    """The fields memory, report and table; sizes are rounded up, so that records of many banks have one type.
 
     ``numbers`` are those of the table (`layout.NUMBERS`) but for two that the arrays say.
     """
@@ -142,10 +154,11 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))
+    table[MEMORY_AT], table[REPORT_AT] = (0, 1, len(memory)), (0, 1, len(report))
     for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
         table[ROW[name], 0] = value
-    memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+    return {"memory": memory, "report": report, "table": table, "flat": np.zeros(1)}
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:
