@@ -25,7 +25,8 @@ from driftfit.judge.statistics.robust import cholesky
 def _row(X: Array, y: Array, ar: Array, t: int, d: int, row: Array) -> None:
     """Whiten row t of [left, right, y] for a break at d; rows before the first are not used."""
     n = X.shape[1]
-    row[:] = 0.0
+    for i in range(2 * n + 1):
+        row[i] = 0.0
     for k in range(ar.shape[0] + 1):
         a = 1.0 if k == 0 else -ar[k - 1]
         side = 0 if t - k < d else n
@@ -42,16 +43,19 @@ def _add(M: Array, row: Array, sign: float) -> None:
                 M[i, j] += sign * row[i] * row[j]
 
 
-def _dates(X: Array, y: Array, ar: Array, first: Array, loglik: Array) -> None:
-    """log L of the dates first .. first + len(loglik) - 1, rows of X (N, n) from p on."""
+def _dates(X: Array, y: Array, ar: Array, first: int, loglik: Array, M: Array, L: Array, row: Array) -> None:
+    """log L of the dates first .. first + len(loglik) - 1, rows of X (N, n) from p on; room for two matrices, M zero,
+    and a row of 2 n + 1.
+    """
     N, n, p = X.shape[0], X.shape[1], ar.shape[0]
-    M, L, row = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1)), np.zeros(2 * n + 1)
     for t in range(p, N):
-        _row(X, y, ar, t, first[0], row)
+        _row(X, y, ar, t, first, row)
         _add(M, row, 1.0)
     for place in range(loglik.shape[0]):
-        d = first[0] + place
-        L[:] = M
+        d = first + place
+        for i in range(2 * n + 1):
+            for j in range(i + 1):
+                L[i, j] = M[i, j]
         rss = cholesky(L, 2 * n)
         loglik[place] = -0.5 * rss
         for i in range(2 * n):
@@ -69,8 +73,9 @@ _run = Driver(_dates)
 
 def date_loglik(X: Array, y: Array, ar: Array, first: int, last: int) -> Array:
     """log L of the dates first .. last, X (N, n) and y (N,) in units of the white noise."""
-    loglik = np.empty(last - first + 1)
-    _run(np.ascontiguousarray(X), np.ascontiguousarray(y), np.ascontiguousarray(ar), np.array([first]), loglik)
+    loglik, k = np.empty(last - first + 1), 2 * X.shape[1] + 1
+    room = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    _run(np.ascontiguousarray(X), np.ascontiguousarray(y), np.ascontiguousarray(ar), int(first), loglik, *room)
     return loglik
 
 
