@@ -132,7 +132,8 @@ def test_one_unit_fails_and_the_others_go_on(engine, monkeypatch):
     def fails(*args, **kwargs):
         raise ArithmeticError("a fault")
 
-    monkeypatch.setattr(broken, "update", fails, raising=False)
+    for one in ("update", "update_many"):
+        monkeypatch.setattr(broken, one, fails, raising=False)
     for pump in "ab":
         assert feed(engine, message(f"plant/{pump}", range(50, 100), y[50:], u[50:]))
     assert "a fault" in engine.units.get(1).failure

@@ -35,7 +35,8 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
-    warm_start: Run | None = None,
+    dtype: Any = "float64",
+    warm_start: Run | bytes | None = None,
     prob: Any = None,
 ) -> Track: ...
 
@@ -57,7 +58,8 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
-    warm_start: Fleet | None = None,
+    dtype: Any = "float64",
+    warm_start: Fleet | Mapping[Any, Run | bytes] | None = None,
 ) -> Fleet: ...
 
 
@@ -77,6 +79,7 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
+    dtype: Any = "float64",
     warm_start: Any = None,
     prob: Any = None,
 ) -> Any:
@@ -123,10 +126,16 @@ def track(
     exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
         Intervals to leave out, both ends included, in times or, without time, in sample numbers: nothing in them is
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
-    keep : "std" or "cov"
-        "cov" also stores the covariance of every sample, n * n numbers each.
-    warm_start : Track, Live, Fleet or None
-        Continue where that run ended, for a fleet series by series (new series start from the beginning).
+    keep : "std", "cov" or "theta"
+        What is stored of every sample. "std": theta, std, prediction, innovation and its standard deviation, ok:
+        2 n + 4 numbers. "cov": also the covariance, n * n numbers. "theta": that alone, n numbers, for models of one
+        output; whatever else is asked for replays the record.
+    dtype : "float64" or "float32"
+        Precision in which results are stored: "float32" halves their memory. The filter works in double precision.
+    warm_start : Track, Live, Fleet, bytes, mapping or None
+        Continue where that run ended, given itself or as bytes (``live.to_bytes()``, ``run.end().to_bytes()``); for a
+        fleet series by series, from a fleet or a mapping from key to any of these (new series start from the
+        beginning).
     prob : (T, changes), (T, joint events) or None
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
 
@@ -149,4 +158,6 @@ def track(
         If most samples cannot be used because of ``dt``.
     """
     reading = Reading(time, dt, weights, drift, units, limits, exclude)
-    return plain.track(model, tracker, y, u, reading, data=data, by=by, keep=keep, warm_start=warm_start, prob=prob)
+    return plain.track(
+        model, tracker, y, u, reading, data=data, by=by, keep=keep, dtype=dtype, warm_start=warm_start, prob=prob
+    )

@@ -29,8 +29,10 @@ class Known:
     @classmethod
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
         """From numbers or arrays (T,)."""
-        parts = (np.atleast_1d(np.asarray(part, float)) for part in (interval, noise, drift))
-        return cls(np.stack(np.broadcast_arrays(*parts), axis=1))
+        parts = (interval, noise, drift)
+        if not any(map(np.ndim, parts)):
+            return cls(np.array([parts], float))  # a row for all samples
+        return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -80,7 +82,7 @@ class Known:
         columns = self.over(T).columns.copy()
         for place, values in given.items():
             if values is not None:
-                columns[:, place] = values
+                columns[:, place] = values if columns.ndim == 2 else np.reshape(values, (-1, 1))
         return Known(columns)
 
     def begun(self, factors: Mapping[int, float]) -> Known:
@@ -111,6 +113,6 @@ class Known:
     def in_rows(self, T: int) -> Known:
         """(T ny, k): every output as a sample; between those of one instant no time passes."""
         ny = self.columns.shape[2]
-        columns = np.moveaxis(self.over(T).columns, 1, 2).reshape(T * ny, -1)
+        columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
         columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
         return Known(columns)

@@ -84,6 +84,8 @@ class Reading:
     units: Mapping[str, str] | None = None
     limits: Mapping[Any, Any] | None = None
     exclude: Any = None
+    indexed: bool = True
+    """Whether an index of dates labels the samples if no time is given."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,8 @@ class Records:
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
         rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
-        return Record(self.y, self.u, self.known, self.time, self.labels_of(k)).part(rows)
+        time = None if self.time is None else self.time[rows]
+        return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
 
     def only(self, k: int) -> Records:
         """Series k alone; its arrays are views."""
@@ -196,7 +199,8 @@ class Records:
         """The labels of series k."""
         key = self.keys[k]
         counted = {"dropped": self.dropped.get(key), "missing": self.missing.get(key)}
-        return replace(self.labels, **{name: counts for name, counts in counted.items() if counts})  # type: ignore[arg-type]
+        found: Any = {name: counts for name, counts in counted.items() if counts}
+        return replace(self.labels, **found) if found else self.labels
 
     def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
         """Sort the inputs for a model with named inputs, and apply valid ranges and excluded intervals.
@@ -204,7 +208,7 @@ class Records:
         Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
-        found = replace(self, u=u, labels=replace(self.labels, u=names))
+        found = self if u is self.u else replace(self, u=u, labels=replace(self.labels, u=names))
         found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
@@ -234,11 +238,11 @@ class Records:
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
     signals = {"y": held("y", y), "u": held("u", u)}
-    factors = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    factors = {"weights": held("weights", reading.weights), "drift": held("drift", reading.drift)}
     together(**signals, **factors)
     output = as_output(signals["y"].values)
     T = len(output)
-    times = times_of(reading.time, list(signals.values()))
+    times = times_of(reading.time, list(signals.values()) if reading.indexed else ())
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     drift = factors["drift"].values

@@ -173,6 +173,8 @@ def input_names(owner: str, name: str, given: Sequence[str]) -> tuple[str, ...]:
 
 def output_names(owner: str, ny: Any) -> tuple[str, ...]:
     """Names of the outputs, given their number or the names themselves: ("y",), or ("y1", "y2", ..)."""
+    if type(ny) is int and ny == 1:
+        return ("y",)
     if isinstance(ny, int | np.integer):
         count = whole(owner, "ny", ny, 1)
         return ("y",) if count == 1 else tuple(f"y{i + 1}" for i in range(count))

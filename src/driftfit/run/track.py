@@ -6,6 +6,8 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Records, one_series, rows
@@ -29,27 +31,35 @@ Result = Track | Fleet | Outputs | Shared
 
 def track(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
-    by: str | Sequence[str] | None = None, keep: str = "std", warm_start: Any = None, prob: Any = None,
+    by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64", warm_start: Any = None,
+    prob: Any = None,
 ) -> Result:  # fmt: skip
     """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
     check_roles("track", model, tracker, several=True)
-    one_of("track", "keep", keep, ("std", "cov"))
+    one_of("track", "keep", keep, ("std", "cov", "theta"))
+    one_of("track", "dtype", np.dtype(dtype).name, ("float64", "float32"))
+    if keep == "theta" and len(model.outputs) > 1:
+        raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading
     model, records, failed = records_of(model, y, u, reading, data, by)
     records = records.for_model(model, reading)
     many = by is not None or _is_grid(tracker, records)
     if prob is not None and (many or len(model.outputs) > 1):
         raise ValueError("track: prob= is for one series and one tracker.")
-    if many and warm_start is not None and not isinstance(warm_start, Fleet):
-        raise ValueError(f"warm_start: with by= or a grid pass the result of such a run; got {warm_start!r}.")
+    if many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
+        raise ValueError(
+            "warm_start: with by= or a grid pass the result of such a run, or a mapping from key to its end or bytes; "
+            f"got {warm_start!r}."
+        )
     if by is None and many:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
-    programs, records = _prepared(model, _per_series(tracker, records), records, keep, prob)
+    trackers = _per_series(tracker, records) or _any_of(tracker)
+    programs, records = _prepared(model, trackers, records, keep, prob)
     if many:
-        fleet = run_fleet(programs, records, keep, failed, warm_start)
+        fleet = run_fleet(programs, records, keep, failed, warm_start, dtype)
         warn_unlearned(fleet)
         return fleet
-    run = _one(programs, records, keep, warm_start)
+    run = _one(programs, records, keep, warm_start, dtype)
     warn_unlearned(run)
     return run
 
@@ -61,16 +71,21 @@ def _prepared(
     inputs = records.labels.u or records.u.shape[-1]
     made = {id(one): programs_of(model, one, inputs) for one in {id(one): one for one in trackers}.values()}
     programs = [program for one in trackers for program in made[id(one)]]
-    distinct = list(dict.fromkeys(programs for programs in made.values()))
-    for tracker in {program.tracker for some in distinct for program in some}:
-        if keep == "cov" and not tracker.covariance:
-            raise ValueError(f"track: {type(tracker).__name__} carries no covariance to keep; use keep='std'.")
-    for lane, one in enumerate(distinct[0]):
+    for one in programs if keep == "cov" else ():
+        if not one.tracker.covariance:
+            raise ValueError(f"track: {type(one.tracker).__name__} carries no covariance to keep; use keep='std'.")
+    for lane, one in enumerate(programs[: records.ny]):
         if one.shared is None:
             y = records.y[:, lane] if records.outputs else records.y
             (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
     records = records.for_trackers(programs[0].model, [one.tracker for one in programs], prob)
     return programs, records.in_rows() if model.shared else records
+
+
+def _any_of(tracker: Any) -> list[Any]:
+    """A tracker by which a fleet without a series knows its parameters."""
+    some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
+    return [next(iter(some))]
 
 
 def _is_grid(tracker: Trackers, records: Records) -> bool:
@@ -132,7 +147,9 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
     return list(tracker)
 
 
-def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None) -> Track | Outputs | Shared:
+def _one(
+    programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any
+) -> Track | Outputs | Shared:
     """Run one series."""
     program, record = programs[0], records.part(0)
     starts = carried(before, programs)
@@ -140,7 +157,7 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
     tile = tile_of(programs, starts)
-    out = program.run(tile, record, keep)
+    out = program.run(tile, record, keep, dtype)
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))

@@ -16,6 +16,8 @@ from driftfit.run.shared_outputs import Shared
 def warn_unlearned(run: Track | Shared | Many) -> None:
     """Warn of what `Tracker.unlearned` names."""
     one = run.rows if isinstance(run, Shared) else run
+    if isinstance(one, Track) and not one.undetermined.any():
+        return
     ends = [(one.program, one.state)] if isinstance(one, Track) else list(one.ends())
     found, counts, owners = 0, Counter[str](), []
     for program, state in ends:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.clock import instant
 from driftfit.data.labels import by_name
 from driftfit.data.signals import noise_of
 from driftfit.data.storage import Kept
@@ -93,6 +94,8 @@ class Live(Operated, Stream):
         self._m = self.model.m
         self._unknown = np.full(self._m, np.nan)
         self._shape = (self._m,)
+        self._interval = tile["interval"][0]
+        self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         self._update = self.program.drivers().updater(tile, self._m)
         self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
@@ -128,19 +131,48 @@ class Live(Operated, Stream):
         """
         if prob is not None or type(drift) is not float:
             return self._update_told(y, u, time, weight, drift, prob)
-        if time is not None or weight != 1.0 or drift != 1.0 or self._careful:
+        if weight != 1.0 or drift != 1.0 or self._careful:
             return self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
-        if type(u) is float and self._m == 1:
+        if type(u) is not float or self._m != 1:
+            if u is LATER and self._m:
+                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
+            u = self._floats(u)
+        if time is None:
             return self._update(self._seen, y, u)  # type: ignore[no-any-return]
-        if u is LATER and self._m:
-            return self._update_later(y)
-        # the compiled step reads m floats from any address, so they must exist
-        if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
-            u = self._inputs(u)
-        # as `one_or_all`, whose call would take 30 ns
-        return self._update(self._seen, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
+        return self._update_at(y, u, time)
+
+    def _floats(self, u: Any) -> Any:
+        """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
+        if type(u) is np.ndarray:
+            if self._m == 1 and u.size == 1:
+                u = u.item()
+                return u if type(u) is float else self._inputs(u).item()
+            if u.dtype is _FLOAT and u.shape == self._shape:
+                return u if self._m != 1 else u.item()
+        return one_or_all(self._inputs(u))
+
+    def _update_at(self, y: float, u: Any, time: Any) -> Step:
+        """A sample whose only known factor is its time: the interval is written for this step alone."""
+        last = self._last
+        if type(time) is float and type(last) is float and self._unit:  # `Clock.since` for the commonest case
+            interval = (time - last) / self._unit if last < time < np.inf else np.nan
+        else:
+            clock, time = self._clock.at(time), instant(time)
+            interval = clock.since(last, time)
+            self._clock = clock
+        if not interval >= 0.0:
+            self._ignored += 1
+            return self._nothing()
+        self._last = time
+        self._pace.see(interval)
+        resting = self._interval[0]
+        if resting:  # 0 while the stream is held: no time passes
+            self._interval[0] = interval
+        step: Step = self._update(self._seen, y, u)
+        self._interval[0] = resting
+        return step
 
     def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
@@ -177,6 +209,11 @@ class Live(Operated, Stream):
         for window in self._windows:
             window.push(self._tile, known)
         return step
+
+    def _settle(self, held: bool, told: bool) -> None:
+        self._rest(HELD if held else ORDINARY)
+        if told:
+            self.tracker.tell(self.lane(), self.model, None, None)
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
@@ -272,8 +309,8 @@ class Live(Operated, Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations, (n,): inf for parameters that are not determined yet, NaN without a covariance."""
-        std: Array = np.sqrt(np.diag(self.cov))
-        return std
+        var: Array = self._tile["var"][0, :, 0]
+        return np.sqrt(var) if self.tracker.covariance else np.full(len(var), np.nan)
 
     @property
     def cov(self) -> Array:

@@ -45,7 +45,6 @@ class LiveOutputs(Stream):
     ) -> None:  # fmt: skip
         self._begin(model, tracker, dt, lag, warm_start, limits)
         self._out = self.programs[0].written(self._tile, 1)
-        self._run = self.programs[0].drivers().run
         rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
         self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
 
@@ -142,7 +141,7 @@ class LiveOutputs(Stream):
         self._driven(self._tile, y, self._inputs(u), self._factors(weight=0.0))
 
     def _step(self, y: Array, u: Array, known: Array, time: Any) -> Steps:
-        return self._driven(self._tile, y, u, known, lambda known: self._keep(known, time))
+        return self._driven(self._tile, y, u, known, lambda known: self._keep(self._out[0], known, time))
 
     def _driven(
         self, tile: Array, y: Array, u: Array, known: Array, after: Callable[[Array], None] | None = None
@@ -154,12 +153,12 @@ class LiveOutputs(Stream):
             for j, row in enumerate(u):
                 same = known[None, :, j : j + 1].copy()
                 same[0, 0] *= j == 0
-                self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
+                self._loop(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
                 results.append(self._result())
                 if after is not None:
                     after(same[0])
         else:
-            self._run(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
+            self._loop(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
             results.append(self._result())
             if after is not None:
                 after(known)
@@ -167,17 +166,13 @@ class LiveOutputs(Stream):
         y_hat, e, s, ok = (np.concatenate(values) for values in zip(*results, strict=True))
         return y_hat, e, s, ok
 
-    def _keep(self, known: Array, time: Any) -> None:
-        """Give what the driver has just processed to alarms and windows."""
-        for lane, alarm in self._watching:
-            alarm.take(self._tile, lane, self._out[0]["e"][lane], self._out[0]["s"][lane], time)
-        for lane, window in enumerate(self._windows):
-            window.push(self._tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
-
     def _rest(self, tile: Array) -> None:
         """Reset what was known of one sample, because it does not hold for the next."""
         if "each" in storage.fields(tile):
             tile["each"] = 1.0
+
+    def _settle(self, held: bool, told: bool) -> None:
+        self._rest(self._tile)
 
     def _result(self) -> Steps:
         """What the driver wrote, one number per lane."""
@@ -226,8 +221,9 @@ class LiveOutputs(Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations."""
-        std: Array = np.sqrt(np.einsum("...ii->...i", self.cov))
-        return std
+        var: Array = self._tile["var"][0].T
+        std = np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
+        return std[0] if self.model.shared else std
 
     @property
     def names(self) -> tuple[Any, ...]:

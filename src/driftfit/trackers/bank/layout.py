@@ -33,7 +33,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     expected                their z'C z and z'm
     scores                  their unit of covariance or log density; then two rows to spare
     scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
-    said                    what a likelihood of the user's own says (`leaves.own_sensor`)
+    said                    what a likelihood of the user's own says of each leaf (`leaves.own_sensor`)
     spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
@@ -58,10 +58,11 @@ is another than that of one nominal interval, PARTED that leaves go on as two (`
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
-) = range(21)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
+) = range(22)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`).
+prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
+variance before the tree grows: the residuals until then; inf for a variance that is given.
 """
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""

@@ -35,6 +35,8 @@ from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
+SAID = 3
+"""Numbers that a likelihood of the user's own says of each leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -69,6 +71,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
+    more += SAID if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
@@ -123,7 +126,7 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     return {
         "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
         "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3), "said": (rows - 1, 1),
+        "narrow": (scores + 3, rows - scores - 3), "said": (rows - na - SAID, SAID),
     }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
     COV_AT,
+    FREEDOM,
     IN_DT,
     IN_NOISE,
     IN_OK,
@@ -191,6 +192,7 @@ def hand_over(s: State, l: int) -> None:
 def alone(s: State, l: int, counts: bool) -> None:
     """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
     learn_scales(s, l)
+    s.sample[FREEDOM, l] = s.count[l] if s.unknown[l] > 0 else np.inf
     if counts:
         learn_start(s, l)
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
