@@ -62,7 +62,7 @@ def track(
     exclude: Any = None,
     keep: str = "std",
     dtype: Any = "float64",
-    warm_start: Run | None = None,
+    warm_start: Run | bytes | None = None,
     prob: Any = None,
 ) -> Track: ...
 
@@ -85,7 +85,7 @@ def track(
     exclude: Any = None,
     keep: str = "std",
     dtype: Any = "float64",
-    warm_start: Fleet | None = None,
+    warm_start: Fleet | Mapping[Any, Run | bytes] | None = None,
 ) -> Fleet: ...
 
 
@@ -159,8 +159,10 @@ def track(
         output; whatever else is asked for replays the record.
     dtype : "float64" or "float32"
         Precision in which results are stored: "float32" halves their memory. The filter works in double precision.
-    warm_start : Track, Live, Fleet or None
-        Continue where that run ended, for a fleet series by series (new series start from the beginning).
+    warm_start : Track, Live, Fleet, bytes, mapping or None
+        Continue where that run ended, given itself or as bytes (``live.to_bytes()``, ``run.end().to_bytes()``); for a
+        fleet series by series, from a fleet or a mapping from key to any of these (new series start from the
+        beginning).
     prob : (T, changes), (T, joint events) or None
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
     to : path or None

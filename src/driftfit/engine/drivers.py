@@ -17,6 +17,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -36,6 +37,12 @@ LARGEST = 1e38
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
 regressor, a covariance that earlier regressors left, and an innovation overflows."""
+
+
+OPEN = ("report", "memory", "flat")
+"""Fields at the end of a record whose lengths are no part of its type for compiled code, which is the same for all
+lengths: it finds them by their addresses, one after the other from that of the first.
+"""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -151,14 +158,48 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     for name, value in starts[0].items():
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
+    opened = [field for name in OPEN for field in fields if field[0] == name]
+    fields = [field for field in fields if field not in opened]
     size = np.dtype(fields).itemsize
     # whole cache lines, so that no vector load of a lane block straddles two
     fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
-    tile = _aligned(np.dtype(fields, align=True), 1)
+    tile = _aligned(_followed_by(np.dtype(fields, align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
     return tile
+
+
+def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
+    """A record type with further fields of numbers behind it, in whole cache lines."""
+    names, offsets, end = list(dtype.names or ()), [at for _, at, *_ in (dtype.fields or {}).values()], dtype.itemsize
+    formats: list[Any] = [dtype[name] for name in names]
+    for name, kind, shape in fields:
+        names.append(name)
+        formats.append((kind, shape))
+        offsets.append(end)
+        end += 8 * math.prod(shape)
+    size = -(-end // 64) * 64
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size}, align=True)
+
+
+def as_compiled(tile: Array) -> Array:
+    """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
+    if OPEN[0] not in (tile.dtype.names or ()):
+        return tile
+    return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
+
+
+@lru_cache(maxsize=256)
+def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of a record up to the first entry of its open fields."""
+    fields = dtype.fields or {}
+    (first, at, *_), names = fields[OPEN[0]], [name for name in fields if name not in OPEN]
+    beginning = np.dtype(
+        {"names": names, "formats": [dtype[name] for name in names],
+         "offsets": [fields[name][1] for name in names], "itemsize": at}, align=True,
+    )  # fmt: skip
+    return _followed_by(beginning, [(OPEN[0], first.base, (1, first.shape[-1]))])
 
 
 def repeat_tile(tile: Array, count: int) -> Array:
@@ -214,7 +255,8 @@ class Drivers(NamedTuple):
     update_one: Any
 
     def updater(self, tile: Array, m: int) -> Any:
-        """The entry point for one sample of tiles of this type: ``f(tile, y, u)``, u as `one_or_all` gives it.
+        """The entry point for one sample of tiles of this type: ``f(as_compiled(tile), y, u)``, u as `one_or_all`
+        gives it.
 
         A number is read faster than an array, and a model of one input needs no second routine for arrays.
         """
@@ -288,7 +330,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
         _check_shapes(tile, len(out), y, u, known)
         ready(tile["theta"].shape[2])
-        run(tile, y, u, known, out)
+        run(as_compiled(tile), y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
 
@@ -403,7 +445,7 @@ def tile_type(tile: Array) -> types.Type:
         flags.aligned,
     )
     if key not in _TILE_TYPES:
-        _TILE_TYPES[key] = numba.typeof(tile)
+        _TILE_TYPES[key] = numba.typeof(as_compiled(tile))
     return _TILE_TYPES[key]
 
 

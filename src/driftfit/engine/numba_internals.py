@@ -9,6 +9,8 @@ in a sentence what broke. Tried with the versions in `TRIED`.
                    CompileResult._reduce, _rebuild
     code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted
                    codegen's factories
+    typing         Function.get_call_type, _impl_keys,  the types of Numba's own operations are found once
+                   Flags._values, Record.__repr__
     memory         _reset_overloads,                what the compiler made of a part is let go
                    remove_user_function, _dispose
     object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
@@ -19,8 +21,8 @@ in a sentence what broke. Tried with the versions in `TRIED`.
     fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
-What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,
-`numba.extending`).
+What is had by public means instead: types and typeof, intrinsics, data models, compile options and the sequence of
+passes (`numba.njit`, `numba.extending`).
 """
 
 from __future__ import annotations
@@ -44,12 +46,13 @@ from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompileResult
+from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.core.targetconfig import ConfigStack
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
@@ -92,9 +95,25 @@ LINKED = {**STEP, "_nrt": False}
 tenths of the time of compiling a bank."""
 
 
+UNUSED = {
+    "LiteralPropagation", "annotate_types", "dump_parfor_diagnostics", "inline_closure_likes", "inline_inlinables",
+    "inline_overloads", "literal_unroll", "make_function_op_code_to_jit_function", "nopython_rewrites", "with_lifting",
+}  # fmt: skip
+"""Passes for comprehensions, inner functions, expressions of whole arrays and ``with``, which nothing here has."""
+
+
+class Pipeline(CompilerBase):
+    """Numba's passes without those, which take 6 per cent of the time of compiling."""
+
+    def define_pipelines(self) -> list[Any]:
+        made = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        made.passes = [one for one in made.passes if one[0].name() not in UNUSED]
+        return [made]
+
+
 def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
     """Compile as everything here is: division as in IEEE 754, no fast-math, without the GIL."""
-    return njit(error_model="numpy", nogil=True, **options)(function)
+    return njit(error_model="numpy", nogil=True, pipeline_class=Pipeline, **options)(function)
 
 
 # ---- stored ---------------------------------------------------------------------------------------------------------
@@ -273,6 +292,38 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 _builders: dict[Any, Any] = {}
 """What makes LLVM's passes, by its options: Numba makes one for every function, and LLVM does not free all of it."""
+
+
+# ---- typing ---------------------------------------------------------------------------------------------------------
+
+# Numba tries dozens of templates for every sum, product and index of every function, and compares compile options one
+# by one for each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
+
+
+def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:
+    """The types of a call of one of Numba's own operations, as ``find`` gives them."""
+    known: dict[Any, tuple[Any, Any]] = {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or not all(isinstance(one, _PLAIN) for one in args):
+            return find(self, context, args, kws)
+        key = self, context, tuple(args), ConfigStack.top_or_none()
+        if key not in known:
+            found = find(self, context, args, kws)
+            known[key] = found, self._impl_keys[found.args]
+        found, self._impl_keys[found.args] = known[key]  # options of another function may have changed the latter
+        return found
+
+    return get_call_type
+
+
+_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.Literal, int  # no code, which must be let go
+_equal = Flags.__eq__
+_NAMES = hash(tuple(sorted(Flags.options)))  # what Numba's own hash amounts to: it sorts names, not values
+types.Function.get_call_type = _remembered(types.Function.get_call_type)
+Flags.__eq__ = lambda one, other: (type(one) is type(other) and one._values == other._values) or _equal(one, other)
+Flags.__hash__ = lambda self: _NAMES
+types.Record.__repr__ = lambda self: self.name  # written out for every pass over a function, and read by nobody
 
 
 # ---- memory ---------------------------------------------------------------------------------------------------------

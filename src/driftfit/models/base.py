@@ -160,6 +160,11 @@ class Model(Settings, ABC):
         """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
         return 0
 
+    @property
+    def recursive(self) -> bool:
+        """Whether regressors hold earlier results of the model itself, so that a sample acts on all after it."""
+        return False
+
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.
 

@@ -22,14 +22,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from driftfit.data.record import Records
 from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.program import Program, State, tile_of
+from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
+from driftfit.run.states.layout import words_of
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
@@ -56,19 +55,23 @@ def run_lanes(
     that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
-    ny = records.ny
-    jobs = [job for group in _groups(programs[::ny]) for job in _jobs(programs, records, group, keep, dtype)]
+    jobs = prepare(programs, records, keep, dtype)
     for job in jobs:
         for lane, k in enumerate(job.lanes.tolist()):
             for name, value in starts.get(k, {}).items():
                 job.tile[name][0, ..., lane] = value
-    jobs.sort(key=lambda job: -len(job.out))
-    _run_jobs(jobs, records)
+    run_jobs(jobs, records)
     for job in jobs:
         if job.done:
             for lane in np.flatnonzero(job.live).tolist():
                 lanes[job.lanes[lane]] = Lane(job.out, job.tile, lane)
     return lanes
+
+
+def prepare(programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64) -> list[Job]:
+    """Tiles at their start for all series, the longest first."""
+    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep, dtype)]
+    return sorted(jobs, key=lambda job: -len(job.out))
 
 
 class Job:
@@ -133,22 +136,26 @@ def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
     return tiles
 
 
-def _run_jobs(jobs: Sequence[Job], records: Records) -> None:
-    """Run all jobs on a pool of threads and mark those that are done."""
+def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) -> None:
+    """Run all jobs on a pool of threads, one for each core unless their number is given, and mark those that are done.
+
+    On a single thread they run in the calling one.
+    """
     for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
         _drive(job, records, 0)  # compiles, so that threads do not wait for each other
+    if threads == 1:
+        for job in jobs:
+            _drive(job, records, len(job.out))
+            job.done = True
+        return
     total = sum(len(job.out) * int(job.live.sum()) for job in jobs)
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=total <= SHOWN) as progress,
-        ThreadPoolExecutor(cores()) as pool,
-    ):
-        task = progress.add_task("tracking", total=total)
+    with progress("tracking", total, total > SHOWN) as advance, ThreadPoolExecutor(threads or cores()) as pool:
         waiting = {pool.submit(_drive, job, records, len(job.out)): job for job in jobs}
         try:
             for future in as_completed(waiting):
                 future.result()
                 waiting[future].done = True
-                progress.advance(task, len(waiting[future].out) * int(waiting[future].live.sum()))
+                advance(len(waiting[future].out) * int(waiting[future].live.sum()))
         except KeyboardInterrupt:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, job in waiting.items():
@@ -177,9 +184,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
         _gather_factors(factors, start, column, known if len(known) == 1 else known[:size])
         job.run(job.tile, y[:size], u[:size], known if len(known) == 1 else known[:size], job.out[a:b])
         for lane in np.flatnonzero(length == b).tolist():
-            finals[lane] = _words(job.tile, L)[:, lane].copy()
+            finals[lane] = words_of(job.tile)[:, lane].copy()
     for lane, words in finals.items():
-        _words(job.tile, L)[:, lane] = words
+        words_of(job.tile)[:, lane] = words
 
 
 def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
@@ -189,12 +196,6 @@ def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Ar
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block
     return block
-
-
-def _words(tile: Array, L: int) -> Array:
-    """The fields of a tile as (words, L): one column is the whole state of one lane."""
-    flat = tile.view(np.int64).reshape(-1)
-    return flat[: len(flat) // L * L].reshape(-1, L)
 
 
 @Driver

@@ -29,7 +29,8 @@ from driftfit.trackers.base import Tracker
 class Many(Plain):
     """Results of many lanes, from key to `Track` like a dict; ``by`` names the parts of a key.
 
-    ``programs``, ``lanes`` and ``starts`` have an entry for each output of each series of ``records``, in that order.
+    ``programs``, ``lanes`` and ``starts`` have an entry for each output of each series of ``records``, in that order;
+    without a series there are the programs of some tracker, so that parameters have names.
     """
 
     _kind: ClassVar[str]
@@ -56,7 +57,7 @@ class Many(Plain):
 
     def __reduce__(self) -> Any:
         """A copy does not contain other series of a tile."""
-        lanes = [lane and lane.alone(one) for lane, one in zip(self._lanes, self._programs, strict=True)]
+        lanes = [lane and lane.alone(one) for lane, one in zip(self._lanes, self._programs, strict=False)]
         return type(self), (self._programs, self.records, lanes, self.failed, self._starts)
 
     def _named(self) -> Sequence[Hashable]:
@@ -76,6 +77,11 @@ class Many(Plain):
     def model(self) -> Model:
         """The model of all series, with all their outputs."""
         return self._programs[0].whole
+
+    @property
+    def programs(self) -> tuple[Program, ...]:
+        """The program of each lane; without a series, those of some tracker."""
+        return self._programs
 
     @property
     def labels(self) -> Labels:
@@ -197,7 +203,7 @@ class Many(Plain):
             keys, arrays["first"], arrays["length"], arrays["y"], arrays["u"], Known(arrays["known"]),
             arrays.get("time"), Labels(**header["labels"]), dropped, None, missing, outputs,
         )  # fmt: skip
-        lanes: list[Lane | None] = [None] * len(programs)
+        lanes: list[Lane | None] = [None] * (len(records.keys) * records.ny)
         for g in range(header["groups"]):
             for j, lane in _restored(path, arrays, g, programs, records):
                 lanes[j] = lane

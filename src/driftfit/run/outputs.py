@@ -133,9 +133,9 @@ class Outputs(Many):
         """Sum over the outputs: their noises are assumed to be independent."""
         return sum(track.loglik for track in self.values())
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, ny, n): pointwise bands of theta at this level."""
-        low, high = zip(*(track.band(level) for track in self.values()), strict=True)
+    def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T, ny, n): pointwise bands of theta at this level; ``conformal`` as for `Track.band`."""
+        low, high = zip(*(track.band(level, conformal) for track in self.values()), strict=True)
         return np.stack(low, axis=1), np.stack(high, axis=1)
 
     def cov(self, t: int) -> Array:
@@ -145,9 +145,13 @@ class Outputs(Many):
     @cached_property
     def _collected(self) -> Array:
         """The samples as the tracker received them, with the regressors that all outputs share."""
-        steps = self._programs[0].steps._replace(store=collect)
+        return self.replayed(collect, COLLECTED)
+
+    def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
+        """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = np.empty(len(self), output_type(tile, COLLECTED))
+        out = np.empty(len(self), output_type(tile, fields))
+        steps = self._programs[0].steps._replace(store=store)
         self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
@@ -198,7 +202,8 @@ class Outputs(Many):
         """The end of the run, from which another one can continue (`warm_start`)."""
         lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
-        return End(self._programs, states, self.time[-1] if self.timed else None)
+        labels = self.labels
+        return End(self._programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)
 
 
 def missing(name: str, output: str) -> str:

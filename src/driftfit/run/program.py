@@ -5,7 +5,8 @@ No other module makes tiles or drivers of a model and a tracker; a tile of sever
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -21,6 +22,7 @@ from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
@@ -34,6 +36,17 @@ SHORT = 32
 
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
+
+
+@contextmanager
+def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
+    """A progress bar that is called with what has been done; making one that is not shown would take a millisecond."""
+    if not shown:
+        yield lambda count: None
+        return
+    with Progress(console=Console(stderr=True), transient=True) as display:
+        task = display.add_task(what, total=total)
+        yield lambda count: display.advance(task, count)
 
 
 @dataclass(frozen=True)
@@ -97,6 +110,39 @@ class Program:
         """The tile of one lane at its start."""
         return _started([self])
 
+    def schema(self, arrays: bool = False) -> dict[str, str]:
+        """Columns and types of the results at a sample, which `to_table` writes after the signals, before any data.
+
+        Types have the names of SQL: "double", "boolean", "array<double>" (with ``arrays``, theta and std of all
+        parameters).
+        """
+        own = {"prediction": "double", "innovation": "double", "innovation_std": "double", "ok": "boolean"}
+        if arrays:
+            return own | {"theta": "array<double>", "std": "array<double>"}
+        return own | {f"{what}_{name}": "double" for name in self.names for what in ("theta", "std")}
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the fields of a lane are, and which of them a packed state holds."""
+        owner = {"model": storage.describe(self.model), "tracker": storage.describe(self.tracker)}
+        return Layout(self.tile().dtype, self.tracker.scratch, owner | {"output": self.output})
+
+    def pack(self, tile: Array, lane: int = 0) -> bytes:
+        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        return self.layout.pack(words_of(tile)[self.layout.held, lane])
+
+    def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
+        """A tile of one lane, or a lane of the given tile, with the state that `pack` wrote; microseconds.
+
+        Raises
+        ------
+        ValueError
+            For bytes that are damaged, or the state of another model, tracker, setting or layout.
+        """
+        into = self.tile() if tile is None else tile
+        self.layout.put(into, lane, self.layout.unpack(data))
+        return into
+
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
         keep = "std" if keep == "theta" else keep
@@ -128,8 +174,11 @@ class Program:
         if T <= CHUNK:
             self.fill(tile, *lanes_of(record), out)
             return out
-        for part in in_chunks(T):
-            self.fill(tile, *lanes_of(record.part(part)), out[part])
+        with progress("tracking", T, True) as advance:
+            for a in range(0, T, CHUNK):
+                part = slice(a, min(a + CHUNK, T))
+                self.fill(tile, *lanes_of(record.part(part)), out[part])
+                advance(part.stop - a)
         return out
 
     def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
@@ -168,16 +217,6 @@ def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
     return "cov" if "P" in names else "std" if "var" in names else "theta", rows["theta"].base
 
 
-def in_chunks(T: int) -> Iterator[slice]:
-    """The samples of a long record, in parts between which a progress bar advances."""
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("tracking", total=T)
-        for a in range(0, T, CHUNK):
-            part = slice(a, min(a + CHUNK, T))
-            yield part
-            progress.advance(task, part.stop - a)
-
-
 STANDING = ("interval", "noise", "drift", "each")
 """Fields with the known factors of one sample."""
 
@@ -196,6 +235,12 @@ def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
     memory = model.memory_for(programs[0].steps.doubts)
+    tracker = programs[0].tracker
+    if both := sorted((set(memory) & set(starts[programs[0]])) - set(tracker.replaces)):
+        raise ValueError(
+            f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "
+            "which would be one and the same; rename it in one of them, or list it in the tracker's `replaces`."
+        )
     return make_tile(model.n, model.m, memory, [starts[one] for one in programs])
 
 

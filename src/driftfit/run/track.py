@@ -40,8 +40,11 @@ def track(
 ) -> Result:  # fmt: skip
     """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
     task = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype, prob))
-    if task.many and warm_start is not None and not isinstance(warm_start, Fleet):
-        raise ValueError(f"warm_start: with by= or a grid pass the result of such a run; got {warm_start!r}.")
+    if task.many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
+        raise ValueError(
+            "warm_start: with by= or a grid pass the result of such a run, or a mapping from key to its end or bytes; "
+            f"got {warm_start!r}."
+        )
     run: Any
     if task.many:
         run = run_fleet(task.programs, task.records, keep, task.failed, warm_start, dtype)
@@ -60,6 +63,9 @@ def parts(
     if not task.many:
         raise ValueError("track: to= is for many series: give by=, or several trackers.")
     programs, records, ny = task.programs, task.records, task.records.ny
+    if not records.keys:
+        yield run_fleet(programs, records, keep, task.failed, dtype=dtype)
+        return
     row = programs[0].written(programs[0].tile(), 0, keep, dtype).dtype.itemsize * ny
     upto = np.cumsum(records.length) * row // PART
     bounds = [0, *(np.flatnonzero(np.diff(upto)) + 1).tolist(), len(records.keys)]
@@ -100,7 +106,8 @@ def _task(
         raise ValueError("track: prob= is for one series and one tracker.")
     if by is None and many:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
-    programs, records = _prepared(model, _per_series(tracker, records), records, kept.keep, kept.prob)
+    trackers = _per_series(tracker, records) or _any_of(tracker)
+    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob)
     return Task(programs, records, failed, many)
 
 
@@ -120,6 +127,12 @@ def _prepared(
             (one.model if one.alone is None else one.alone.model).inspect(y, records.u)
     records = records.for_trackers(programs[0].model, [one.tracker for one in programs], prob)
     return programs, records.in_rows() if model.shared else records
+
+
+def _any_of(tracker: Any) -> list[Any]:
+    """A tracker by which a fleet without a series knows its parameters."""
+    some = tracker.values() if isinstance(tracker, Mapping) else [tracker] if isinstance(tracker, Tracker) else tracker
+    return [next(iter(some))]
 
 
 def _is_grid(tracker: Trackers, records: Records) -> bool:

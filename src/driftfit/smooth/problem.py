@@ -76,9 +76,11 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
     weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run.known.drift
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
     if own and tracker.noted:
         noted = {name: seen[name][..., 0] for name in tracker.noted}
         q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
+        phi, y = tracker.regression(noted, phi, y)
         each, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE
     if prior.at_first_sample or prior.p0 is None:
@@ -86,6 +88,5 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
         drift[:first], trend[:first] = 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
-    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
     walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
     return average_drift(walk, time) if own and tracker.noted else walk

@@ -12,7 +12,8 @@ the levels are merged at once, which is a rank-one update (`driftfit.trackers.pa
 proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
 (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
 (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
-out too (`driftfit.trackers.parts.frozen`).
+out too (`driftfit.trackers.parts.frozen`). Where innovations are correlated, the previous one is one more regressor
+(`driftfit.trackers.parts.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -30,6 +31,7 @@ levels and the scaling are ours. Cost per sample: O(K^2 n^2 + K J) for K modes a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -41,6 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -50,7 +53,7 @@ from driftfit.trackers.parts.coordinates import (
     whiten,
     whiten_within,
 )
-from driftfit.trackers.parts.diffuse import knowing_nothing, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
 from driftfit.trackers.parts.modes.filters import (
@@ -77,6 +80,8 @@ from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
+LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
+"""log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
 
 
 @kernel
@@ -88,6 +93,13 @@ def learn_start(s: State, l: int) -> None:
     s.s[l] *= s.scale[l]
     scale = s.squares[l] / s.count[l]
     s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
+
+
+@kernel
+def start_density(e: float, s: float, nu: float) -> float:
+    """Student's log density of an innovation of the start, which has fewer than `RESIDUALS` before it; NaN for none."""
+    ratio = LOG_RATIOS[0] if nu < 1.5 else LOG_RATIOS[1] if nu < 2.5 else LOG_RATIOS[2]
+    return ratio - 0.5 * (log(s) + (nu + 1.0) * log(1.0 + e * e / (nu * s)))  # type: ignore[no-any-return]
 
 
 @kernel
@@ -135,12 +147,14 @@ def follow(s: State, entering: int, l: int) -> None:
         update_filters(s, l)
         learn_weights(s, l)
         learn_noise(s, l)
+    learn_colour(s, l)
     learn_scales(s, l)
     learn(s, l, s.odd[l])
 
 
 @kernel
 def correct(s: State, l: int) -> None:
+    whiten_noise(s, l)
     whiten(s, l)
     follow(s, -1, l)
 
@@ -166,6 +180,7 @@ def begin(s: State, l: int) -> None:
     are."""
     if s.settled[l] > 0:
         predict(s, l)
+        whiten_noise(s, l)
         follow(s, whiten_within(s, l), l)
         mixture(s, l)
         if s.ok[l] > 0.0:
@@ -182,8 +197,9 @@ def begin(s: State, l: int) -> None:
         take_in(s, l)
         s.noise[l] = noise
         if s.s[l] < np.inf:
+            residuals = s.count[l]
             learn_start(s, l)
-            s.density[l] = -0.5 * (log(2.0 * np.pi * s.s[l]) + s.e[l] * s.e[l] / s.s[l])
+            s.density[l] = start_density(s.e[l], s.s[l], residuals)
         spanned_variance(s, l)
         settle(s, l)
 
@@ -216,6 +232,9 @@ class AdaptiveKalman(Tracker):
     density: ClassVar[str] = "density"
     noted: ClassVar[tuple[str, ...]] = NOTED
     adapts: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = (
+        *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if self.groups is not None:
@@ -257,6 +276,7 @@ class AdaptiveKalman(Tracker):
             **unresolved(),
             **not_frozen(),
             **no_weights(n),
+            **white(n),
             **modes,
             **levels,
         }
@@ -266,6 +286,10 @@ class AdaptiveKalman(Tracker):
         return TrackerSteps(
             predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
         )
+
+    def regression(self, noted: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        running = noted["settled"] > 0
+        return np.where(running[:, None], noted["white"], phi), np.where(running, y - noted["explained"], y)
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         return varying(noted, e, time, self.state(model.n))
@@ -298,7 +322,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

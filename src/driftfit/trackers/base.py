@@ -50,6 +50,8 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     noted: ClassVar[tuple[str, ...]] = ()
@@ -59,9 +61,15 @@ class Tracker(Settings, ABC):
     adapts: ClassVar[bool] = False
     """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
     density: ClassVar[str] = ""
-    """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the Gaussian
-    density of the forecast.
+    """The field of ``outputs`` whose first entry is the log density of a sample given earlier ones; none: the density
+    of the forecast, Gaussian or Student's.
     """
+    learns_noise: ClassVar[bool] = False
+    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
+    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    """
+    scratch: ClassVar[tuple[str, ...]] = ()
+    """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 
@@ -111,6 +119,10 @@ class Tracker(Settings, ABC):
             f"{type(self).__name__} does not describe a random walk in Gaussian noise, so there is nothing to smooth; "
             "track with FLS or Kalman."
         )
+
+    def regression(self, noted: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        """phi (T, n) and y (T,) as the tracker took them, if it filtered both; ``noted`` as for `varying`."""
+        return phi, y
 
     def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
         """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.

@@ -40,7 +40,15 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
-from driftfit.trackers.parts.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.diffuse import (
+    MACHINES,
+    SCRATCH,
+    drifted,
+    enter,
+    knowing,
+    knowing_nothing,
+    spanned_variance,
+)
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.parts.varying_drift import told
 from driftfit.trackers.rls import correct, learn_scale, no_scale
@@ -113,6 +121,8 @@ class FLS(Tracker):
     differences: int = 1
 
     required: ClassVar[tuple[str, ...]] = ("mu",)
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
     drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -49,7 +49,15 @@ from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.diffuse import LEFT, MACHINES, knowing, knowing_nothing, prediction, symmetric_product
+from driftfit.trackers.parts.diffuse import (
+    LEFT,
+    MACHINES,
+    SCRATCH,
+    knowing,
+    knowing_nothing,
+    prediction,
+    symmetric_product,
+)
 from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, learn_scale, no_scale
 
@@ -189,6 +197,8 @@ class InstrumentalVariables(Tracker):
     c_max: float = 1e8
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
 
     def __post_init__(self) -> None:
         name = "InstrumentalVariables"

@@ -36,6 +36,7 @@ from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import square_root
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
+    SCRATCH,
     drifted,
     enter,
     knowing,
@@ -104,6 +105,7 @@ class Kalman(Tracker):
     form: str = "covariance"
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
     drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

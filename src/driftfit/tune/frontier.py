@@ -23,7 +23,7 @@ from driftfit.models.base import Model
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
-from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
+from driftfit.show.parts.axes import BLUE, GREY, RED, panels
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.fls import FLS
@@ -39,9 +39,9 @@ class Frontier(NamedTuple):
     measurement: Array
     dynamic: Array
 
-    def plot(self) -> Figure:
-        """r_M^2 against r_D^2, and both against mu; a matplotlib figure."""
-        return _plot(self)
+    def plot(self, ax: Any = None) -> Figure:
+        """r_M^2 against r_D^2, and both against mu; a matplotlib figure. ``ax`` as for `Track.plot`."""
+        return _plot(self, ax)
 
 
 def frontier(
@@ -96,10 +96,9 @@ def _movement(path: Smoothed) -> float:
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
 
 
-def _plot(frontier: Frontier) -> Figure:
+def _plot(frontier: Frontier, ax: Any) -> Figure:
     """Measurement cost against dynamic cost, and both against mu."""
-    figure = new_figure(9.0, 3.6)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = panels(ax, (9.0, 3.6), 2, 2)
     left.loglog(frontier.dynamic, frontier.measurement, color=BLUE, lw=1.3, marker="o", ms=2.5)
     for i in range(0, len(frontier.mu), max(len(frontier.mu) // 6, 1)):
         point = (frontier.dynamic[i], frontier.measurement[i])

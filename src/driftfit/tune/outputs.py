@@ -7,14 +7,20 @@ whose predictions also fill missing lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
 from driftfit.data.record import Reading
 from driftfit.models.base import Model
+from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
+from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
+from driftfit.show.parts.text import Printed
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task
@@ -24,7 +30,7 @@ STILL = Kalman(q=0.0, r=1.0)
 """Constant parameters with a diffuse start."""
 
 
-class TunedOutputs(Mapping[str, Tuned]):
+class TunedOutputs(Mapping[str, Tuned], Printed):
     """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
 
     def __init__(self, each: Mapping[str, Tuned]) -> None:
@@ -41,6 +47,11 @@ class TunedOutputs(Mapping[str, Tuned]):
 
     def __repr__(self) -> str:
         return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for place, (name, one) in enumerate(self.items()):
+            yield Text(f"\n{name}" if place else name, "bold")
+            yield one
 
     @property
     def tracker(self) -> dict[str, Tracker]:
@@ -59,13 +70,24 @@ class TunedOutputs(Mapping[str, Tuned]):
 
 
 def tune_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
-) -> Tuned | TunedOutputs:
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, by: Any,
+    one: Callable[[Task], Tuned],
+) -> Tuned | TunedOutputs:  # fmt: skip
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known), data=data)
+    run = track(model, STILL, y, u, Reading(**known), data=data, by=by)
     if isinstance(run, Shared):
-        return one(Task(run.rows.model, run.rows.record))
-    assert isinstance(run, Outputs)
-    return TunedOutputs({name: one(Task(run[name].model, run[name].record)) for name in run.outputs})
+        return one(Task(run.rows.model, (run.rows.record,)))
+    if model.shared:
+        assert isinstance(run, Fleet)
+        return one(_together(list(run.values())))
+    assert isinstance(run, Outputs | Fleet)
+    lanes = list(run.values())
+    names = run.outputs if isinstance(run, Outputs) else run.records.outputs
+    return TunedOutputs({name: one(_together(lanes[k :: len(names)])) for k, name in enumerate(names)})
+
+
+def _together(runs: Sequence[Track]) -> Task:
+    """The records of some runs with one model."""
+    return Task(runs[0].model, tuple(run.record for run in runs))

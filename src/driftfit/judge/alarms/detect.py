@@ -185,9 +185,9 @@ class Alarms(Printed):
         if len(self.onsets) > 20:
             yield Text(f" and {len(self.onsets) - 20} more", "dim")
 
-    def plot(self, labels: Any = None) -> Figure:
-        """Statistics over their limits, alarms marked; labels (T,) are shaded."""
-        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, labels)
+    def plot(self, labels: Any = None, ax: Any = None) -> Figure:
+        """Statistics over their limits, alarms marked; labels (T,) are shaded. ``ax`` as for `Track.plot`."""
+        return plot_alarms(self.run, self.rule, self.statistic, self.active, self.start, labels, ax)
 
 
 def detect(

@@ -42,7 +42,7 @@ from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price, unscored
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
@@ -160,12 +160,15 @@ class Selection(Printed):
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
-    def plot(self, most: int = 20) -> Figure:
-        """Distances from the best structure, with standard errors, and where in time the structures lost."""
+    def plot(self, most: int = 20, ax: Any = None) -> Figure:
+        """Distances from the best structure, with standard errors, and where in time the structures lost.
+
+        ``ax`` as for `Track.plot`.
+        """
         rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
         terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
         below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
-        return plot_selection([row.name for row in rows], below, std, terms)
+        return plot_selection([row.name for row in rows], below, std, terms, ax)
 
 
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
@@ -198,6 +201,7 @@ def select(
     keep: Sequence[str] = (),
     most: int | None = None,
     data: Any = None,
+    by: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -213,6 +217,9 @@ def select(
         Candidates; or one model whose regressors are to be selected, at most 30.
     y, u, data, time, dt, weights, drift, limits, exclude
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
+    by : names of columns, "row" or None
+        As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
+        from the start, the logliks are added, and the first m samples of each are not scored.
     tracker : Tracker
         Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
         q, not a vector.
@@ -239,8 +246,8 @@ def select(
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
     if any(len(model.outputs) > 1 for model in candidates):
         raise ValueError("select: structures are compared for one output at a time.")
-    _, records, _ = records_of(candidates[0], y, u, reading, data)
-    if data is None:
+    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
+    if data is None and by is None:
         factor("drift", drift, len(records.y))
     elif records.drifts is not None:
         raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
@@ -250,7 +257,7 @@ def select(
     if isinstance(models, Model) and bound[0].n > MOST:
         raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
     names = [repr(model) for model in candidates]
-    pool, structures = pool_of(bound, names, replace(records.part(0), time=None))
+    pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
     if isinstance(models, Model):
         structures, predictions = subsets(pool, tracker, structures[0], keep, most)
     else:
@@ -273,17 +280,20 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    start = unscored(len(pool.y), max(s.n for s in structures))
-    judged = np.arange(len(pool.y)) >= start
+    y, starts = pool.y, pool.starts(max(s.n for s in structures))
+    judged = pool.after(starts)
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]
-    totals = np.array([float(np.sum(term)) - price(s.n, start) for s, term in zip(structures, terms, strict=True)])
+    totals = np.array([float(np.sum(term)) - price(s.n, starts) for s, term in zip(structures, terms, strict=True)])
     top, count = int(np.argmax(totals)), int(judged.sum())
     rows = []
-    for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):
-        spread = float(np.sqrt(count * max(newey_west(terms[top] - term), 0.0))) if count > 10 else float("nan")
-        error = (pool.y - prediction.y_hat)[judged]
+    for structure, prediction, total in zip(structures, predictions, totals, strict=True):
+        lost = predictions[top].loglik - prediction.loglik
+        parts = [lost[span][judged[span]] for span in pool.spans]  # records are independent: their variances add up
+        variance = sum(len(part) * max(newey_west(part), 0.0) for part in parts if len(part) > 1)
+        spread = float(np.sqrt(variance)) if count > 10 else float("nan")
+        error = (y - prediction.y_hat)[judged]
         rms = float(np.sqrt(np.mean(error * error))) if count else float("nan")
         rows.append(Row(structure.name, structure.n, float(total), float(totals[top] - total), spread, rms))
     rows.sort(key=lambda row: -row.loglik)

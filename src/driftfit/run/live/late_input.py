@@ -28,7 +28,7 @@ NOTHING, INPUT, IGNORED = 0, 1, 2
 
 
 def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
-    """``apply(tile, u)`` for the tiles of this type; ValueError if outputs need the input of their own sample."""
+    """``apply(as_compiled(tile), u)`` for this type of tile; ValueError if outputs need the input of their sample."""
     step = tracker.apply_for(model)
     if step is None:
         raise ValueError(

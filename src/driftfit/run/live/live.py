@@ -20,7 +20,7 @@ from driftfit.data.labels import by_name
 from driftfit.data.signals import noise_of
 from driftfit.data.storage import Kept
 from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import one_or_all
+from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm
@@ -97,6 +97,7 @@ class Live(Operated, Stream):
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         self._update = self.program.drivers().updater(tile, self._m)
+        self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
     def _expect(self, what: int) -> None:
@@ -139,7 +140,7 @@ class Live(Operated, Stream):
                 return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
             u = self._floats(u)
         if time is None:
-            return self._update(self._tile, y, u)  # type: ignore[no-any-return]
+            return self._update(self._seen, y, u)  # type: ignore[no-any-return]
         return self._update_at(y, u, time)
 
     def _floats(self, u: Any) -> Any:
@@ -169,7 +170,7 @@ class Live(Operated, Stream):
         resting = self._interval[0]
         if resting:  # 0 while the stream is held: no time passes
             self._interval[0] = interval
-        step: Step = self._update(self._tile, y, u)
+        step: Step = self._update(self._seen, y, u)
         self._interval[0] = resting
         return step
 
@@ -200,7 +201,7 @@ class Live(Operated, Stream):
     def _step(self, y: float, u: Array, known: tuple[float, float, float], time: Any) -> Step:
         known = HELD if self.held else known
         self._rest(known)
-        step: Step = self._update(self._tile, y, one_or_all(u))
+        step: Step = self._update(self._seen, y, one_or_all(u))
         for _, alarm in self._watching:
             alarm.take(self._tile, 0, step[1], step[2], time)
         if known is not HELD:
@@ -217,7 +218,7 @@ class Live(Operated, Stream):
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
-        step: Step = self._update(self._tile, y, one_or_all(self._unknown))
+        step: Step = self._update(self._seen, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step
 
@@ -229,7 +230,7 @@ class Live(Operated, Stream):
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, one_or_all(inputs))
+        y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
         return y_hat, s
 
     def smooth(self) -> FixedLag:

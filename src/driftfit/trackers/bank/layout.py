@@ -33,7 +33,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     expected                their z'C z and z'm
     scores                  their unit of covariance or log density; then two rows to spare
     scratch, from_g, spare  rows to work in: all of them, those from g on, and those that hold none of the above
-    said                    what a likelihood of the user's own says (`leaves.own_sensor`)
+    said                    what a likelihood of the user's own says of each leaf (`leaves.own_sensor`)
     spare_lags, narrow      spare rows, as many as output lags; spare rows of eight columns
 """
 
@@ -58,10 +58,11 @@ is another than that of one nominal interval, PARTED that leaves go on as two (`
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, SIZE,
-) = range(21)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
+) = range(22)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
-prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`).
+prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
+variance before the tree grows: the residuals until then; inf for a variance that is given.
 """
 NEVER = 1e9
 """Floors since the last change of a leaf that has none, or more."""
@@ -98,8 +99,8 @@ walks; whether what may have happened since the last used sample is one floor; a
 likelihoods, while the compiled routine runs.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
-"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of many
-shapes have one type of record and one driver; and of the other arrays.
+"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all
+shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
 PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
 TABLE = Table(
@@ -115,6 +116,18 @@ ROW, ROWS = TABLE.row, len(TABLE.row)
 MEMORY_AT, REPORT_AT, PHI_AT, POWERS_AT, THETA_AT, COV_AT, COUNTERS_AT, SAMPLE_AT = (ROW[name] for name in BASES)
 table_at = TABLE.at
 """The table at an address, for compiled code."""
+
+
+@kernel
+def report_at(s: Any) -> int:
+    """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
+    return s.report.ctypes.data  # type: ignore[no-any-return]
+
+
+@kernel
+def memory_at(s: Any) -> int:
+    """Where the field `memory` begins, behind the report."""
+    return s.report.ctypes.data + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
 
 
 @kernel

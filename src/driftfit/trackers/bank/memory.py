@@ -10,7 +10,19 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
+from driftfit.trackers.bank.layout import (
+    BESIDE,
+    COUNT,
+    HEAD,
+    MEMORY_AT,
+    PACKED,
+    REPORT_AT,
+    REPORTED,
+    ROW,
+    ROWS,
+    SIZE,
+    TOLD,
+)
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
@@ -23,6 +35,8 @@ from driftfit.trackers.bank.sensor import Sensor, table_of
 
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
+SAID = 3
+"""Numbers that a likelihood of the user's own says of each leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -57,6 +71,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
     parents, children = _room(max(shape.parents * twice, K // H), Hd, Hm)
+    more += SAID if any(sensor.kind == "own" for sensor in bank.all_sensors) else 0
     if bank.form == "sqrt":
         parents, more = parents + WIDTH, more + n + -(-(2 * tri + 4 * n) * WIDTH // children)
     remembered, links = _whole_vectors(W * (H + 1)), _whole_vectors(K + 1)
@@ -111,12 +126,12 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
     return {
         "C": (0, tri), "m": (tri, n), "z": (tri + n, n), "g": (g, n), "from_g": (g, rows - g), "expected": (g + n, 2),
         "scores": (scores, 3), "spare": (scores + 1, rows - scores - 1), "spare_lags": (rows - na, na),
-        "narrow": (scores + 3, rows - scores - 3), "said": (rows - 1, 1),
+        "narrow": (scores + 3, rows - scores - 3), "said": (rows - na - SAID, SAID),
     }  # fmt: skip
 
 
 def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str, Any]:
-    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
+    """The fields memory, report and table; sizes are rounded up, so that records of many banks have one type.
 
     ``numbers`` are those of the table (`layout.NUMBERS`) but for two that the arrays say.
     """
@@ -139,10 +154,11 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))
+    table[MEMORY_AT], table[REPORT_AT] = (0, 1, len(memory)), (0, 1, len(report))
     for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
         table[ROW[name], 0] = value
-    memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+    return {"memory": memory, "report": report, "table": table, "flat": np.zeros(1)}
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:

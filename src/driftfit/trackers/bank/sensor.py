@@ -158,8 +158,8 @@ class Sensor(Settings):
         cleans : bool
             Whether ``clean`` takes the place of y in the leaf's output lags.
 
-        Cost: the function twice for every leaf and sample (thrice where it cleans); about a minute of compiling on each
-        computer. Saved runs keep the function's name, and import it again.
+        Cost: the function once for every leaf and sample; about a minute of compiling on each computer. Saved runs keep
+        the function's name, and import it again.
         """
         scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)
         return cls("own", prob=prob, factor=scale * scale, likelihood=likelihood, own_lags=bool(cleans))

@@ -89,7 +89,7 @@ FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
 def whiten(s: State, l: int) -> None:
     """x = M^-T phi, where no column is free."""
     for j in range(s.theta.shape[0]):
-        u = s.phi[j, l]
+        u = s.white[j, l]
         for i in range(j):
             u -= s.S[i, j, l] * s.x[i, l]
         s.x[j, l] = u / s.S[j, j, l]
@@ -99,7 +99,7 @@ def whiten(s: State, l: int) -> None:
 def whiten_within(s: State, l: int) -> int:
     """x where columns are free; returns the one by which phi leaves the span of what was seen, or -1."""
     n, L = s.d.shape
-    machine_place(s.S.ctypes.data, s.phi.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
+    machine_place(s.S.ctypes.data, s.white.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
     for i in range(n):
         s.x[i, l] = s.work[ROW, i, l]
     return int(s.at_start[ENTERING, l])
@@ -119,14 +119,14 @@ def frame(s: State, l: int) -> None:
 def new_row(s: State, j: int, l: int) -> float:
     """Let the rest of phi be row j of M; returns its sign there, which the row does not have."""
     n = s.theta.shape[0]
-    rest = s.phi[j, l]
+    rest = s.white[j, l]
     for i in range(j):
         rest -= s.x[i, l] * s.S[i, j, l]
     sign = 1.0 if rest > 0.0 else -1.0
     fresh = s.S[j, j, l] == 0.0
     s.S[j, j, l] = abs(rest)
     for k in range(j + 1, n):
-        rest = s.phi[k, l]
+        rest = s.white[k, l]
         for i in range(j):
             rest -= s.x[i, l] * s.S[i, k, l]
         s.S[j, k, l] = sign * rest

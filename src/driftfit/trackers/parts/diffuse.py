@@ -55,6 +55,10 @@ variance of the prediction without noise, u^2 of a new direction or 0, log det N
 and the column by which a regressor enters."""
 
 
+SCRATCH = ("H", "pivot", "work", "at_start")
+"""Fields of the start that carry nothing from one sample to the next."""
+
+
 def knowing_nothing(n: int, worst: float = WORST) -> dict[str, Any]:
     """Fields for a diffuse start of n parameters; ``root`` is 1 while S and d, and not theta and P, are the state."""
     square = np.zeros((n, n))

@@ -152,6 +152,7 @@ class ExtendedKalman(Tracker):
     inflation: float = 0.0
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    replaces: ClassVar[tuple[str, ...]] = ("blocks",)
     drift_each: ClassVar[bool] = True
 
     def __post_init__(self) -> None:

@@ -110,6 +110,7 @@ class OutputError(Tracker):
     p_w: float = 0.5
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
+    replaces: ClassVar[tuple[str, ...]] = ("blocks",)
     width: ClassVar[int] = 1
     output_error: ClassVar[bool] = True
 

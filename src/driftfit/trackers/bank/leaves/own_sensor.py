@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.callback import address_of, call
-from driftfit.engine.kernel import State, floats, kernel, machine, shared
+from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import LAST
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
@@ -39,11 +39,11 @@ LOG_P, NOISE, CLEAN = range(3)
 
 
 @shared
-def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
+def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array) -> None:
     """What function ``which`` says of the leaf in column at + l, its noise variance in the units of C; r is that of the
     nominal sensor.
     """
-    B, expected, said = t.leaves, t.expected, t.said[0]
+    B, expected = t.leaves, t.expected
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
     call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
@@ -55,36 +55,37 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float) -> None:
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """h + a in the place of h, which is kept in the first row of `scores`.
+    """What the function says of every leaf, three numbers for each in `said`; h + a in the place of h, which is kept in
+    the first row of `scores`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, since it is divided by.
     """
+    said = t.said.reshape(t.said.shape[0] * t.said.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):
         noise = r
         if l < columns:
-            judge(t, which, at, l, y, r)
-            noise = t.said[0, NOISE]
+            judge(t, which, at, l, y, r, said[3 * l : 3 * l + 3])
+            noise = said[3 * l + NOISE]
         t.scores[0, l] = t.expected[0, l]
         t.expected[0, l] += noise
 
 
 @shared
-def weigh_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+def weigh_all(t: Any, columns: int) -> None:
     """The log densities in the place of what `judge_all` kept, which is given back."""
+    said = t.said.reshape(t.said.shape[0] * t.said.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):
         t.expected[0, l] = t.scores[0, l]
         if l < columns:
-            judge(t, which, at, l, y, r)
-            t.scores[0, l] = t.said[0, LOG_P]
+            t.scores[0, l] = said[3 * l + LOG_P]
 
 
 @shared
-def clean_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
+def clean_all(t: Any, at: int, columns: int) -> None:
     """The newest output lag as the function has it."""
-    lag = FIRST + t.n + t.n * (t.n + 1) // 2
+    lag, said = FIRST + t.n + t.n * (t.n + 1) // 2, t.said.reshape(t.said.shape[0] * t.said.shape[1])
     for l in range(columns):
-        judge(t, which, at, l, y, r)
-        t.leaves[lag, at + l] = t.said[0, CLEAN]
+        t.leaves[lag, at + l] = said[3 * l + CLEAN]
 
 
 @kernel

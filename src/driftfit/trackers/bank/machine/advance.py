@@ -23,6 +23,7 @@ from driftfit.trackers.bank.layout import (
     FAULTS,
     FLIPPED,
     FLOORS,
+    FREEDOM,
     GROUPS,
     HELD,
     IMPOSSIBLE,
@@ -421,10 +422,17 @@ def advance(t: Any) -> None:
 
 @shared
 def lone_density(sample: Array) -> float:
-    """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none."""
-    far, s = sample[IN_Y] - sample[Y_HAT], sample[S2]
+    """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none.
+
+    It is Gaussian, or Student's where the noise variance is estimated.
+    """
+    far, s, nu = sample[IN_Y] - sample[Y_HAT], sample[S2], sample[FREEDOM]
     if not (sample[IN_OK] > 0.0 and 0.0 < s < math.inf):
         return 0.0
+    if nu < math.inf:
+        ratio = math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu)
+        wide = math.log(math.pi * nu * s) + (nu + 1.0) * math.log(1.0 + far * far / (nu * s))
+        return ratio - 0.5 * wide
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 

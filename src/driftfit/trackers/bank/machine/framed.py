@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
-from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
+from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
@@ -153,8 +153,8 @@ def write_walks(s: State, l: int) -> None:
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
     machine_walks(
-        s.memory.ctypes.data, s.table.ctypes.data, s.S.ctypes.data, s.c.ctypes.data, s.W.ctypes.data, unit,
-        s.memory.shape[0], n, L, l,
+        memory_at(s), s.table.ctypes.data, s.S.ctypes.data, s.c.ctypes.data, s.W.ctypes.data, unit,
+        s.table[MEMORY_AT, 2, 0], n, L, l,
     )  # fmt: skip
 
 
@@ -169,8 +169,8 @@ def enter_bank(s: State, column: int, l: int) -> None:
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     machine_enter(
-        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
-        s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.memory.shape[0],
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
+        s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.table[MEMORY_AT, 2, 0],
         s.counters.shape[0], n, L, l,
     )  # fmt: skip
 

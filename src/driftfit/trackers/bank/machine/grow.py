@@ -250,7 +250,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
         elif sensors[j, OWN] > 0.0:
             judge_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
             correct(t.n, t, at, columns, y, 0.0)
-            weigh_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+            weigh_all(t, columns)
         else:
             correct(t.n, t, at, columns, y - sensors[j, VALUE], sensors[j, FACTOR] * t.sample[R] * noise)
             if t.unknown > 0:
@@ -261,7 +261,7 @@ def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: fl
             own_lags = sensors[j, CLEANS] > 0.0
             remember(t, K, at, columns, y - sensors[j, VALUE], own_lags)
             if own_lags and sensors[j, OWN] > 0.0:
-                clean_all(t, sensors[j, OWN], at, columns, y, t.sample[R] * noise)
+                clean_all(t, at, columns)
             shift_covariance(t, t.parents, K, at, columns, own_lags)
         weigh(t, K, at, columns, j, own)
         encode(t, K, at, columns, j)

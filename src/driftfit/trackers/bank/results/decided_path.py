@@ -50,6 +50,9 @@ class EventSmoothed:
             self.events = [event for event in events if event.kind != "change" or event.span.date in fitted.dates]
         self.theta, self._given, self.gains = solve(self.problem)
 
+    def __repr__(self) -> str:
+        return f"Smoothed path of {len(self.theta)} samples given {len(self.events)} events: {self.run.tracker!r}"
+
     @cached_property
     def covs(self) -> Array:
         """(T, n, n), with what is not known of a drift that was fitted."""

@@ -11,12 +11,15 @@ change of prior probability p is kept if, with the drift fitted to those that ar
 more than (1 - p) / p; the weaker half of the others goes, until all that are left are kept.
 
 Bands also contain what is not known of the factors: for each of them in turn, the paths at other values, weighted by
-their likelihood,
+their likelihood and a prior that is flat in the standard deviation of the drift, f^(1/2),
 
-    C_s + sum_i sum_g w_ig (C_ig - C_s + (m_ig - m_s)(m_ig - m_s)')
+    C_s + sum_i sum_g w_ig (C_ig - C_s + (m_ig - m_s)(m_ig - m_s)'),    w_ig proportional to L(f_ig) f_ig^(1/2) d log f
 
-Source: the likelihood is Schweppe's (1965); the rest is ours. Cost: O(T n^2) for each of some hundred likelihoods, and
-O(T n^3) for each value of a factor that is likely enough.
+The likelihood of a short record is flat towards small drifts, all of which a prior flat in log f would count as
+evidence that nothing moves.
+
+Source: the likelihood is Schweppe's (1965), the prior Gelman's (2006), section 7.1; the rest is ours. Cost: O(T n^2)
+for each of some hundred likelihoods, and O(T n^3) for each value of a factor that is likely enough.
 """
 
 from __future__ import annotations
@@ -113,7 +116,7 @@ class FittedDrift:
             values = np.unique(np.clip(self._logs[i] + AWAY, 0.0, np.log(WIDER)))
             tried = np.tile(self._logs, (len(values), 1))
             tried[:, i] = values
-            costs = np.array([self._cost(one) for one in tried])
+            costs = np.array([self._cost(one) - one[i] for one in tried])  # -2 log of likelihood and prior
             weights = np.exp(-0.5 * (costs - costs.min()))
             weights[weights < LIKELY] = 0.0
             for weight, one in zip(weights / weights.sum(), tried, strict=True):

@@ -89,6 +89,9 @@ class Hypotheses:
                 stacklevel=3,
             )
 
+    def __repr__(self) -> str:
+        return f"Hypotheses of {len(self.run)} samples: {', '.join(self.names)}; {self.tracker!r}"
+
     def _told(self, name: str) -> Array:
         return self.tracker.told(self._report, name)
 
@@ -263,9 +266,12 @@ class Hypotheses:
         lane = self.run.lane(t)
         return mixture_of(self.tracker, self.run, lane)
 
-    def plot(self, threshold: float = 0.5, level: float = 0.95) -> Figure:
-        """Parameters with bands, the probabilities of events stacked below them, events marked."""
-        return plot_hypotheses(self.run, self.latest, self.names, self.found(threshold), level)
+    def plot(self, threshold: float = 0.5, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, the probabilities of events stacked below them, events marked.
+
+        ``ax`` as for `Track.plot`.
+        """
+        return plot_hypotheses(self.run, self.latest, self.names, self.found(threshold), level, ax)
 
 
 def onsets(on: Array) -> Array:

@@ -71,6 +71,7 @@ def innovate(s: State, l: int) -> None:
             s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
     mean = 0.0
     for k in range(K):
+        s.e_k[k, l] += s.explained[l]
         mean += s.prior[k, l] * s.e_k[k, l]
     level = 0.0
     for j in range(J - 1):
@@ -86,12 +87,23 @@ def innovate(s: State, l: int) -> None:
 
 
 @kernel
+def sum_of_row(s: State, l: int) -> float:
+    """Sum of the scratch row over the filters."""
+    total = 0.0
+    for k in range(s.mu.shape[0]):
+        total += s.row[k, l]
+    return total
+
+
+@kernel
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest, factor = np.inf, s.noise[l] * s.leverage[l]
     more = lasting(s, l)
     leap(s, l, factor * max(s.r[l], s.coarse[l]))
+    for k in range(K):
+        s.row[k, l] = np.inf
     for j in range(J):
         noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
         widest = np.inf if j == J - 1 else 0.0
@@ -99,7 +111,9 @@ def likelihoods(s: State, l: int) -> float:
             square = s.e_k[k, l] * s.e_k[k, l]
             v = s.h[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
-            nearest = min(nearest, square / v)
+            s.row[k, l] = min(s.row[k, l], square / v)
+    for k in range(K):
+        nearest = min(nearest, s.row[k, l])
     for j in range(J):
         for k in range(K):
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
@@ -109,26 +123,38 @@ def likelihoods(s: State, l: int) -> float:
 
 
 @kernel
+def as_predicted(s: State, nearest: float, l: int) -> None:
+    """Add, filter by filter, the density without an outlier to the scratch row, where it is not that of ``joint``."""
+    K, J = s.mu.shape[0], s.nu.shape[0]
+    factor = s.noise[l] * s.leverage[l]
+    for j in range(J - 1):
+        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
+        for k in range(K):
+            v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+            far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
+            s.row[k, l] += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
+
+
+@kernel
 def predictive_density(s: State, nearest: float, l: int) -> None:
     """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
-    leapt, again = s.rare[l] < 1.0, lasting(s, l) > 0.0
-    ordinary, outlier = 0.0, 0.0
-    for j in range(J - 1):
-        noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
-        for k in range(K):
-            if again or (leapt and k == TOP):
-                v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
-                far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
-                ordinary += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
-            else:
-                ordinary += s.joint[j, k, l]
     noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
     for k in range(K):
         v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
-        outlier += s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+        s.row[k, l] = s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+    outlier = sum_of_row(s, l)
+    for k in range(K):
+        s.row[k, l] = 0.0
+    if s.rare[l] < 1.0 or lasting(s, l) > 0.0:
+        as_predicted(s, nearest, l)
+    else:
+        for j in range(J - 1):
+            for k in range(K):
+                s.row[k, l] += s.joint[j, k, l]
+    ordinary = sum_of_row(s, l)
     tail = log(outlier / np.pi)
     body = log(ordinary / np.sqrt(2.0 * np.pi)) - 0.5 * nearest if ordinary > 0.0 else -np.inf
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
@@ -140,20 +166,21 @@ def weigh(s: State, l: int) -> None:
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest = likelihoods(s, l)
     predictive_density(s, nearest, l)
-    total = 0.0
+    for k in range(K):
+        s.row[k, l] = 0.0
     for j in range(J):
         for k in range(K):
-            total += s.joint[j, k, l]
+            s.row[k, l] += s.joint[j, k, l]
+    share = 1.0 / sum_of_row(s, l)
     for k in range(K):
-        s.mu[k, l] = 0.0
+        # at 0 a mode that only such modes lead to would have no mixture at all
+        s.mu[k, l] = max(s.row[k, l] * share, LEAST)
     for j in range(J):
         s.nu[j, l] = 0.0
         for k in range(K):
-            s.joint[j, k, l] /= total
+            s.joint[j, k, l] *= share
+        for k in range(K):
             s.nu[j, l] += s.joint[j, k, l]
-            s.mu[k, l] += s.joint[j, k, l]
-    for k in range(K):
-        s.mu[k, l] = max(s.mu[k, l], LEAST)  # at 0 a mode that only such modes lead to would have no mixture at all
     s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
     # an outlier says nothing about the level: the chain keeps what it was
     for j in range(J - 1):

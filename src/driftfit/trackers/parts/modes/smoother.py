@@ -5,7 +5,8 @@
 
 with f_t the probabilities after sample t and T their transitions, for drift modes and likewise for noise levels v_tj,
 and o_t the probability that sample t was an outlier. A smoother of that random walk (`driftfit.smooth.exact`) estimates
-theta from all samples, with the averaged drift and noise. Before the filters start nothing drifts.
+theta from all samples, with the averaged drift and noise, on the regressors and outputs from which coloured noise was
+taken (`driftfit.trackers.parts.coloured`). Before the filters start nothing drifts.
 
 Source: the backward pass is Kim's (1994), eq. 2.20; smoothing one random walk given its result, instead of one for each
 mode, is ours.
@@ -22,7 +23,8 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.modes.ladder import TOP
 from driftfit.trackers.parts.noise_levels import level_chain
 
-NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight")
+NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight",
+         "white", "explained")  # fmt: skip
 """Fields that a run notes at every sample."""
 
 
@@ -38,8 +40,9 @@ def note(o: State, s: State, l: int) -> None:
     for i in range(s.c.shape[0]):
         o.c[i, l] = s.c[i, l]
         o.weight[i, l] = s.weight[i, l]
+        o.white[i, l] = s.white[i, l]
     o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
-    o.leapt[l], o.weighed[l], o.settled[l] = s.leapt[l], s.weighed[l], s.settled[l]
+    o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
 
 
 def given_all(after: Array, transition: Array, moves: Array) -> Array:

@@ -46,7 +46,7 @@ ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, CURVATURE = 0, 1, 2, 3, 4, 5
 def no_weights(n: int) -> dict[str, Any]:
     """Fields before the first sample."""
     return {
-        "past": np.zeros((WINDOW, 2 * n + MORE)),
+        "samples": np.zeros((WINDOW, 2 * n + MORE)),
         "remembered": 0,
         "scores": np.zeros((CURVATURE + 2 * n, n)),
         "weight": np.ones(n),
@@ -144,11 +144,11 @@ def remember(s: State, at: int, l: int) -> None:
         gain, unit = 0.0, np.sqrt(s.c[i, l])
         for j in range(i, n):
             gain += s.R[i, j, l] * s.d[j, l]
-        s.past[at, i, l] = s.phi[i, l] / unit if unit > 0.0 else 0.0
-        s.past[at, n + i, l] = gain * unit
-    s.past[at, 2 * n + E, l] = e * np.sqrt(s.r[l])
-    s.past[at, 2 * n + PRECISION, l] = precision * s.r[l]
-    s.past[at, 2 * n + SPAN, l] = s.dt[l] * s.drift[l]
+        s.samples[at, i, l] = s.white[i, l] / unit if unit > 0.0 else 0.0
+        s.samples[at, n + i, l] = gain * unit
+    s.samples[at, 2 * n + E, l] = e * np.sqrt(s.r[l])
+    s.samples[at, 2 * n + PRECISION, l] = precision * s.r[l]
+    s.samples[at, 2 * n + SPAN, l] = s.dt[l] * s.drift[l]
 
 
 @kernel
@@ -159,7 +159,7 @@ def learn_weights(s: State, l: int) -> None:
     remember(s, at, l)
     s.remembered[l] += 1
     if s.remembered[l] >= WINDOW and s.remembered[l] % BLOCK == 0:
-        machine_weights(s.past.ctypes.data, at, s.scores.ctypes.data, n, L, l)
+        machine_weights(s.samples.ctypes.data, at, s.scores.ctypes.data, n, L, l)
         for i in range(n):
             s.weight[i, l] = s.scores[WEIGHT, i, l]
             for k in range(s.mu.shape[0]):
