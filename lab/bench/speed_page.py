@@ -28,6 +28,9 @@ compared programs take turns within one process, and figures are medians, so tha
 estimates relative to the largest estimate; above {SAME:g} the numbers count as different. "Other" is a different
 algorithm, shown only for its cost."""
 
+OTHERS = "## What a user waits for"
+"""From this heading on the page holds what scripts in ``benchmarks/`` print."""
+
 FACTORS = """\
 Seconds are medians over fresh processes in which numpy is already imported; MB are sizes of files without numpy.
 The first result is that of a thousand samples."""
@@ -120,9 +123,10 @@ def draw(slopes: Slopes) -> Figure:
 
 
 def write(folder: Path, text: str, slopes: Slopes) -> Path:
-    """Write ``scoreboard_speed.md`` and its picture into a folder; the page's path."""
+    """Write ``scoreboard_speed.md`` and its picture into a folder; the page's path. The end of the page stays."""
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     draw(slopes).savefig(folder / "figures" / "scoreboard_speed.png", dpi=100)
     target = folder / "scoreboard_speed.md"
-    target.write_text(text)
+    _, mark, others = target.read_text().partition(OTHERS) if target.exists() else ("", "", "")
+    target.write_text(text + (f"\n{mark}{others}" if mark else ""))
     return target

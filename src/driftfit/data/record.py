@@ -151,6 +151,22 @@ class Records:
         time = None if self.time is None else self.time[rows]
         return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
 
+    def some(self, a: int, b: int) -> Records:
+        """Series a to b - 1; their arrays are views."""
+        first, length = self.first[a:b], self.length[a:b]
+        low = int(first.min())
+        rows = slice(low, int((first + length).max()))
+        return replace(
+            self,
+            keys=self.keys[a:b],
+            first=first - low,
+            length=length,
+            y=self.y[rows],
+            u=self.u[rows],
+            known=self.known.part(rows),
+            time=None if self.time is None else self.time[rows],
+        )
+
     def only(self, k: int) -> Records:
         """Series k alone; its arrays are views."""
         one = self.part(k)

@@ -123,6 +123,17 @@ class KeyedResults(Plain):
             assert lane is not None
             yield self._programs[j], state_of(lane.tile, lane.lane)
 
+    def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
+        """Of `ends` those whose record does not determine every parameter."""
+        found: dict[int, Array] = {}  # by tile, because looking at each lane alone takes as long as running it
+        for j in self._index.values():
+            lane = self._lanes[j]
+            assert lane is not None
+            if id(lane.tile) not in found:
+                found[id(lane.tile)] = np.isinf(lane.tile["var"][0]).any(axis=0)
+            if found[id(lane.tile)][lane.lane]:
+                yield self._programs[j], state_of(lane.tile, lane.lane)
+
     def stack(self, name: str) -> Array:
         """One result of every lane in natural order, (lanes, T, ...), NaN after the end of a series.
 

@@ -29,7 +29,6 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
 from driftfit.run.states.layout import words_of
-from driftfit.trackers.base import Tracker
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
@@ -90,11 +89,12 @@ class Job:
 def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
-    kinds: dict[Tracker, Any] = {}
+    kinds: dict[int, list[int]] = {}  # most series share one program, and its steps take 100 us to compare
     for k, program in enumerate(programs):
-        if program.tracker not in kinds:
-            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
-        groups[kinds[program.tracker]].append(k)
+        group = kinds.get(id(program))
+        if group is None:
+            group = kinds[id(program)] = groups[program.steps, program.tracker.outputs, program.shapes]
+        group.append(k)
     return list(groups.values())
 
 

@@ -137,7 +137,7 @@ class Live(Operated, Stream):
             y = float(as_numbers("y", y))
         if type(u) is not float or self._m != 1:
             if u is LATER and self._m:
-                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
+                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
             u = self._floats(u)
         if time is None:
             return self._update(self._seen, y, u)  # type: ignore[no-any-return]
