@@ -18,7 +18,7 @@ from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
-from driftfit.run.program import Program, State, programs_of, tile_of
+from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.warm_start import Run, carried, first_interval

@@ -79,7 +79,7 @@ def written(
     """Header and arrays of a file: the packed states of all lanes, and the other facts about the stream."""
     described = [storage.describe(one.tracker) for one in programs]
     model = programs[0].whole
-    header = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
+    header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
     header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
     header |= {"extra": {name: value for name, value in extra.items() if value != UNSAID[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
