@@ -231,7 +231,7 @@ def test_a_failure_while_writing_leaves_the_old_file(saved, monkeypatch):
 
 
 def test_a_failure_at_the_first_writing_leaves_nothing(tmp_path, monkeypatch):
-    run = track(ARX(2, 2), RLS(0.9), Y, U)  # before that, because what it compiles is written too
+    run = track(ARX(2, 2), RLS(0.9), Y, U)
     monkeypatch.setattr(os, "replace", lambda *paths: (_ for _ in ()).throw(OSError("busy")))
     with pytest.raises(OSError, match="busy"):
         run.save(tmp_path / "run")
