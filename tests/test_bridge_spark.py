@@ -32,6 +32,7 @@ def session():
         warnings.simplefilter("ignore")
         found = spark.session(
             "local[2]", spark__sql__shuffle__partitions="2", spark__ui__enabled="false", spark__driver__memory="1g",
+            spark__python__unix__domain__socket__enabled="true",
         )  # fmt: skip
         found.sparkContext.setLogLevel("OFF")
         yield found
@@ -270,3 +271,23 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
             assert same([one[name] for one in good], path[: len(good)])
         assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
         assert len(state) < 1100
+
+
+def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_path):
+    from pyspark.sql.group import GroupedData
+
+    if not hasattr(GroupedData, "transformWithState"):
+        pytest.skip("this PySpark has no keyed state for rows; 4.1 has it")
+    session.conf.set("spark.sql.streaming.stateStore.providerClass",
+                     "org.apache.spark.sql.execution.streaming.state.RocksDBStateStoreProvider")  # fmt: skip
+    few = rows_of(3, 3, 60)
+    keyed = spark.follow_keyed(stream_of(session, tmp_path / "in", few, files=2), MODEL, K, hold=HOLD, **COLUMNS)
+    query = (
+        keyed.writeStream.format("parquet").option("path", str(tmp_path / "out"))
+        .option("checkpointLocation", str(tmp_path / "check")).trigger(availableNow=True).start()
+    )  # fmt: skip
+    query.awaitTermination()
+    due = few.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
+    expected = fleet_of(due).to_table().sort("unit", "t")
+    good = pl.read_parquet(tmp_path / "out" / "*.parquet").filter(pl.col("failed").is_null()).sort("unit", "t")
+    assert good.select(expected.columns).equals(expected)

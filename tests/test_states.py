@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support import arx_record, damaged, same
 
-from driftfit import ARX, Kalman, Live, track
+from driftfit import ARX, DataWarning, Kalman, Live, track
 from driftfit.data.known import Known
 from driftfit.data.record import Records
 from driftfit.run.program import Program
@@ -17,7 +17,9 @@ from driftfit.run.states.layout import MANY, packed, unpacked
 from driftfit.run.warm_start import End
 
 GOLDEN = Path(__file__).parent / "golden" / "kalman_arx22.state"
-"""`golden` as it was written on x86-64 by Python 3.11."""
+"""`golden` as written on x86-64 by Python 3.11. When the fields of the state change, it becomes the older one."""
+OLDER = GOLDEN.with_name("kalman_arx22_older.state")
+"""The same, by a version with other fields."""
 
 K = Kalman(q=1e-3, r=0.1)
 Y, U = damaged(*arx_record(120, 5))
@@ -36,6 +38,13 @@ def test_bytes_written_elsewhere_are_read_and_written_again():
     live = Live.from_bytes(data)
     assert (live.model, live.tracker, live.dt) == (ARX(2, 2).bind(1), Kalman(q=0.25, r=0.5, p0=1.0), 2.0)
     assert live.to_bytes() == data
+    np.testing.assert_allclose(live.theta, golden().theta, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(live.update(1.0, 1.0, time=8.0), golden().update(1.0, 1.0, time=8.0), rtol=1e-12)
+
+
+def test_bytes_of_an_older_version_are_read_by_the_names_of_fields():
+    with pytest.warns(DataWarning, match="was written by another version: .* begins as before the first sample"):
+        live = Live.from_bytes(OLDER.read_bytes())
     np.testing.assert_allclose(live.theta, golden().theta, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(live.update(1.0, 1.0, time=8.0), golden().update(1.0, 1.0, time=8.0), rtol=1e-12)
 
