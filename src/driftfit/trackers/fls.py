@@ -34,14 +34,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
-from driftfit.trackers.parts.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing
 from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import told
 from driftfit.trackers.rls import correct, learn_scale, no_scale
 
@@ -63,7 +64,7 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
-    spanned_variance(s, l)
+    spanned_folded(s, l)
 
 
 def price(mu: Any) -> Any:
@@ -166,4 +167,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, folded, begin, told=told, machines=MACHINES)

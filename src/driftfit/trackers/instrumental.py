@@ -43,7 +43,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
@@ -51,6 +51,7 @@ from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import LEFT, MACHINES, knowing, knowing_nothing, prediction, symmetric_product
 from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.parts.shared_rounding import folded
 from driftfit.trackers.rls import fade, learn_scale, no_scale
 
 FOLLOWING = 0.05
@@ -158,7 +159,7 @@ def steps(na: int) -> TrackerSteps:
                 s.G[j, i, l] = s.P[i, j, l]
         follow(s, l)
 
-    return TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
+    return TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
-limit of coarse readings (`driftfit.trackers.parts.resolution`).
+limit of coarse readings (`driftfit.trackers.parts.resolution`). Errors of rounding that readings share widen ``std``
+(`driftfit.trackers.parts.shared_rounding`).
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -33,7 +34,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
@@ -45,11 +46,11 @@ from driftfit.trackers.parts.diffuse import (
     knowing_nothing,
     measurement,
     reform,
-    spanned_variance,
     take_in,
     wander,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+from driftfit.trackers.parts.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 
 
 @kernel
@@ -82,7 +83,7 @@ def forget(s: State, l: int) -> None:
 
 def no_scale() -> dict[str, Any]:
     """Fields of an estimated noise variance before the first innovation."""
-    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved()}
+    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved(), **nothing_shared()}
 
 
 @kernel
@@ -91,9 +92,10 @@ def learn_scale(s: State, l: int) -> None:
     counted = s.ok[l] * s.fresh[l]
     s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
     s.count[l] += counted
-    s.s[l] *= s.scale[l]
-    scale = s.squares[l] / s.count[l]
+    before, scale = s.scale[l], s.squares[l] / s.count[l]
     s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
+    share_rounding(s, l)
+    s.s[l] *= before
 
 
 @kernel
@@ -115,7 +117,7 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
-    spanned_variance(s, l)
+    spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
         known = s.rank[l] > rank and s.P[i, i, l] > 0.0
@@ -170,11 +172,11 @@ def begin_direction(s: State, l: int) -> None:
     if s.s[l] < np.inf:
         learn_scale(s, l)
     hand_over(s, l)
-    spanned_variance(s, l)
+    spanned_folded(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, diagonal, begin_direction, machines=MACHINES)
+EXPONENTIAL = TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
+DIRECTIONAL = TrackerSteps(nothing, correct_direction, folded, begin_direction, machines=MACHINES)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.diffuse import (
     LEFT,
@@ -34,13 +34,13 @@ from driftfit.trackers.parts.diffuse import (
     hand_over,
     knowing_nothing,
     prediction,
-    spanned_variance,
     symmetric_product,
     take_in_row,
     wander,
 )
 from driftfit.trackers.parts.information import shear
 from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import told
 from driftfit.trackers.rls import learn_scale, no_scale
 
@@ -155,7 +155,7 @@ def begin(s: State, l: int) -> None:
     hand_over(s, l)
     if s.s[l] < np.inf:
         learn_scale(s, l)
-    spanned_variance(s, l)
+    spanned_folded(s, l)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, folded, begin, told=told, machines=MACHINES)
