@@ -40,6 +40,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
+    SCRATCH,
     enter,
     hand_over,
     knowing,
@@ -92,17 +93,24 @@ def learn_scale(s: State, l: int) -> None:
     counted = s.ok[l] * s.fresh[l]
     s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
     s.count[l] += counted
-    before, scale = s.scale[l], s.squares[l] / s.count[l]
+    s.s[l] *= s.scale[l]
+    scale = s.squares[l] / s.count[l]
     s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
-    share_rounding(s, l)
-    s.s[l] *= before
+
+
+@kernel
+def learn_variance(s: State, l: int) -> None:
+    """Learn the scale, and what readings of a coarse meter share."""
+    per_noise = s.s[l]
+    learn_scale(s, l)
+    share_rounding(s, per_noise, l)
 
 
 @kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     measurement(s, l)
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @kernel
@@ -116,7 +124,7 @@ def begin(s: State, l: int) -> None:
             s.S[i, j, l] *= shrink
     enter(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
+        learn_variance(s, l)
     spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
@@ -141,7 +149,7 @@ def correct_direction(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @kernel
@@ -170,7 +178,7 @@ def begin_direction(s: State, l: int) -> None:
     wander(s, np.sqrt(forgotten(s, l)), l)
     reform(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
+        learn_variance(s, l)
     hand_over(s, l)
     spanned_folded(s, l)
 
@@ -209,6 +217,8 @@ class RLS(Tracker):
     kind: str = "exponential"
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
 
     def __post_init__(self) -> None:
         if self.forgetting is not None:

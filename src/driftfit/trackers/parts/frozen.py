@@ -1,8 +1,8 @@
 """Frozen readings: a sensor that repeats its last value although the system moves.
 
 Whether the sensor is frozen is a two-state chain, which enters with probability ENTER at every reading and stays with
-probability STAY. A frozen sensor repeats its last reading for certain. A sensor that works repeats it with a probability
-of at most max(delta p, a) <= 1, where delta is the resolution, the smallest step between two readings so far, p the
+probability STAY. A frozen sensor repeats its last reading for certain. A sensor that works repeats it with at most the
+probability max(delta p, a) <= 1, where delta is the resolution, the smallest step between two readings so far, p the
 largest predicted density of the values that are rounded to the reading, and a the share of readings that repeated
 although they were not frozen. So
 
@@ -39,7 +39,7 @@ def not_frozen() -> dict[str, Any]:
 
 @kernel
 def leave_out_frozen(s: State, l: int) -> None:
-    """Leave a reading out that is more likely frozen than not; s.y_hat and s.s must be known."""
+    """Leave out a reading that is more likely frozen than not; s.y_hat and s.s must be known."""
     if s.seen[l] > 0.0:
         repeats = abs(s.y[l] - s.before[l]) <= ROUNDING * abs(s.y[l])
         s.before[l] = s.y[l]
@@ -63,7 +63,7 @@ def leave_out_frozen(s: State, l: int) -> None:
 
 
 def held_readings(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where no sensor was frozen."""
+    """Its remark in a summary: nothing if no sensor was frozen."""
     count = int(lane["frozen_readings"])
     return (
         (("Frozen", f"{count} readings that repeat the one before where a change was expected: not used"),)

@@ -48,11 +48,11 @@ def averaged(variance: float, quantum: float) -> float:
 
 
 @kernel
-def share_rounding(s: State, l: int) -> None:
-    """Take in a sample after its correction; s.s in units of the noise variance, s.scale that variance."""
+def share_rounding(s: State, per_noise: float, l: int) -> None:
+    """Take in a sample after its correction; ``per_noise`` is s.s in units of the noise variance, s.scale."""
     n, ok = s.theta.shape[0], s.ok[l]
     quantum = s.quantum[l] if s.coarse[l] > 0.0 else 1.0
-    kept = 1.0 - ok * max(1.0 - s.noise[l] / s.s[l], 0.0) / n
+    kept = 1.0 - ok * max(1.0 - s.noise[l] / per_noise, 0.0) / n
     N = kept * s.readings_in[l] + ok
     weight = ok / max(N, 1.0)
     off = s.y[l] - s.middle[l]

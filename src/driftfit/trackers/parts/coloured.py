@@ -1,0 +1,86 @@
+"""Coloured noise: the previous innovation as one more regressor, where innovations are correlated.
+
+    y_t = phi_t' theta + v_t + c v_(t-1)
+        = c y*_(t-1) + (phi_t - c phi*_(t-1))' theta + v_t
+        with y*_t = y_t - c y*_(t-1),  phi*_t = phi_t - c phi*_(t-1)
+
+because v_(t-1) = y*_(t-1) - phi*_(t-1)' theta, for a theta that hardly moves from one sample to the next. The filters
+therefore take phi* as regressor and c y*_(t-1) as known: theta is not biased by a lag of y that contains v_(t-1), and
+no parameter is added. c is estimated by weighted least squares on the derivative psi of the prediction,
+
+    psi_t = v_(t-1) - c psi_(t-1),    A <- f A + psi^2 / s,    b <- f b + psi (e + c psi) / s
+
+and used as c (1 - SURE / (c^2 A)) where that is positive: innovations that are white leave everything as it is. A
+sample that is missing or an outlier is no past.
+
+Source: recursive maximum likelihood is Soderstrom's (1973), see Ljung and Soderstrom, Theory and Practice of Recursive
+Identification (1983), section 3.7; the shrinkage is ours. Cost per sample: O(n).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, State, kernel
+
+FADE = 0.995
+"""Factor of the sums A and b at every sample."""
+SURE = 5.0
+"""Square of the estimate in standard deviations below which innovations count as white."""
+MOST = 0.95
+"""Largest size of c: the past is forgotten at this rate at least."""
+GAP = 1.5
+"""Intervals longer than this, in nominal ones, separate a sample from its past."""
+
+
+def white(n: int) -> dict[str, Any]:
+    """Fields before the first sample."""
+    return {
+        "white": np.zeros(n),
+        "past": np.zeros(n),
+        "past_y": 0.0,
+        "explained": 0.0,
+        "colour": 0.0,
+        "colour_used": 0.0,
+        "psi": 0.0,
+        "colour_scores": np.zeros(2),
+    }
+
+
+@kernel
+def whiten_noise(s: State, l: int) -> None:
+    """The regressor phi* and the known part of y."""
+    c = s.colour[l] if s.dt[l] <= GAP else 0.0
+    s.colour_used[l] = c
+    s.explained[l] = c * s.past_y[l]
+    for i in range(s.theta.shape[0]):
+        s.white[i, l] = s.phi[i, l] - c * s.past[i, l]
+
+
+@kernel
+def learn_colour(s: State, l: int) -> None:
+    """Update c, and store the past of the next sample; s.theta is still the prediction."""
+    c, v = s.colour_used[l], s.past_y[l]
+    ordinary = s.weighed[l] * (1.0 - s.odd[l])
+    for i in range(s.theta.shape[0]):
+        v -= s.past[i, l] * s.theta[i, l]
+        s.past[i, l] = ordinary * s.white[i, l]
+    s.past_y[l] = ordinary * (s.y[l] - s.explained[l])
+    psi = (v - c * s.psi[l]) if s.dt[l] <= GAP else 0.0
+    weight = ordinary / s.s[l] if s.weighed[l] > 0 else 0.0
+    A = FADE * s.colour_scores[0, l] + weight * psi * psi
+    b = FADE * s.colour_scores[1, l] + (weight * psi * (s.e[l] + c * psi) if weight > 0.0 else 0.0)
+    s.colour_scores[0, l], s.colour_scores[1, l] = A, b
+    s.psi[l] = ordinary * psi
+    square = b * b / A if A > 0.0 else 0.0
+    known = b / A * (1.0 - SURE / square) if square > SURE else 0.0
+    s.colour[l] = max(-MOST, min(MOST, known))
+
+
+def colour(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """What a summary says of it: nothing where innovations are white."""
+    c = float(lane["colour"])
+    return (("Coloured noise", f"v + {c:.2g} v of the sample before; the previous innovation is used"),) if c else ()
