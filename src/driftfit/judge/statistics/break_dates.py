@@ -27,7 +27,8 @@ SWEEPS = 10
 def whiten(X: Array, y: Array, ar: Array, t: int, breaks: Array, row: Array) -> None:
     """Whiten row t of [x in its segment, 0 in the others, y], row (K n + 1,), for K - 1 breaks."""
     n, k = X.shape[1], breaks.shape[0]
-    row[:] = 0.0
+    for i in range(row.shape[0]):
+        row[i] = 0.0
     for lag in range(ar.shape[0] + 1):
         a = 1.0 if lag == 0 else -ar[lag - 1]
         while k > 0 and t - lag < breaks[k - 1]:
@@ -47,17 +48,21 @@ def add(M: Array, row: Array, sign: float) -> None:
                 M[i, j] += sign * row[i] * row[j]
 
 
-def _dates(X: Array, y: Array, ar: Array, first: Array, loglik: Array) -> None:
-    """log L of the dates first .. first + len(loglik) - 1, rows of X (N, n) from p on."""
+def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Array, row: Array) -> None:
+    """log L of the dates from ``dates`` (2, 1) on, a date and the next; rows of X (N, n) from p on.
+
+    Room for two matrices that are zero and a row, (2, 2 n + 1, 2 n + 1) and (2 n + 1,): arrays that are made in
+    compiled code take seconds to compile.
+    """
     N, n, p = X.shape[0], X.shape[1], ar.shape[0]
-    M, L, row = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1)), np.zeros(2 * n + 1)
-    here, following = np.zeros(1, np.int64), np.zeros(1, np.int64)
-    here[0], following[0] = first[0], first[0] + 1
+    M, L, here, following = sums[0], sums[1], dates[0], dates[1]
     for t in range(p, N):
         whiten(X, y, ar, t, here, row)
         add(M, row, 1.0)
     for place in range(loglik.shape[0]):
-        L[:] = M
+        for i in range(2 * n + 1):
+            for j in range(i + 1):
+                L[i, j] = M[i, j]
         rss = cholesky(L, 2 * n)
         loglik[place] = -0.5 * rss
         for i in range(2 * n):
@@ -76,8 +81,9 @@ _run = Driver(_dates)
 
 def date_loglik(X: Array, y: Array, ar: Array, first: int, last: int) -> Array:
     """log L of the dates first .. last, X (N, n) and y (N,) in units of the white noise."""
-    loglik = np.empty(last - first + 1)
-    _run(np.ascontiguousarray(X), np.ascontiguousarray(y), np.ascontiguousarray(ar), np.array([first]), loglik)
+    loglik, k = np.empty(last - first + 1), 2 * X.shape[1] + 1
+    X, y, ar = (np.ascontiguousarray(one) for one in (X, y, ar))
+    _run(X, y, ar, np.array([[first], [first + 1]]), loglik, np.zeros((2, k, k)), np.zeros(k))
     return loglik
 
 

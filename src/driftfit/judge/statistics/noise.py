@@ -91,7 +91,8 @@ def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, le
         level[w] = huber(Q[a:b], y[a:b], theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
         first = a if w == 0 else (a + ends[w - 1]) // 2
         final = b if w == W - 1 else (starts[w + 1] + b) // 2
-        residual[first:final] = own[first - a : final - a]
+        for t in range(first, final):
+            residual[t] = own[t - a]
         for k in range(P + 1):
             r[w, k] = lagged(own, HELD * level[w], k)
 
@@ -111,7 +112,8 @@ def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Arra
         first = min(a + order[0], b - 1)
         huber(X[first:b], z[first:b], theta[k], own[first:b])
         lever(X[first:b], leverage[first:b])
-        leverage[a:first] = 0.0
+        for t in range(a, first):
+            leverage[t] = 0.0
     for k in range(K):
         a, b = bounds[k], bounds[k + 1]
         for t in range(a, b):
