@@ -30,7 +30,7 @@ from driftfit.models.hammerstein_wiener.trackers.extended_kalman import Extended
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.run.conformal import ConformalFactor
+from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.piecewise import piecewise

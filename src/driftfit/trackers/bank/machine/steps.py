@@ -218,7 +218,7 @@ def correct(s: State, l: int) -> None:
 @kernel
 def in_coordinates(s: State, l: int) -> None:
     """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
-    column, y_hat = whiten_within(s, l), prediction(s, l)
+    column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
     write_walks(s, l)
     hand_over(s, l)
     if column >= 0:
