@@ -8,7 +8,10 @@ sensor, prior and form, one output and two, and with records that have outages, 
 readings and regressors that begin late; and the tests of banks are run as well.
 Prints every violation with its line, and every bank that was not finite.
 
-Run: python benchmarks/bank_bounds.py [--quick] [--banks N]. Compiling both forms with checks takes some minutes;
+Run: python benchmarks/bank_bounds.py [--quick] [--banks N] [--first N] [--tests FILE ..]
+
+Compiling both forms with checks takes some minutes and 4 GB. In pieces: ``--first 500 --banks 250 --tests none`` draws
+banks 500 to 749 and runs no tests; ``--banks 0`` runs the tests alone, all files tests/test_bank*.py or those named.
 --quick uses one form and size, few banks and no tests. The exit status is 1 if anything was found.
 """
 
@@ -22,6 +25,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -229,14 +233,14 @@ def faults(run: Any) -> list[str]:
     return wrong if proper else [*wrong, "not probabilities"]
 
 
-def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
-    """Run this many banks; returns how many had a violation or wrong numbers."""
+def fuzz(seeds: range, quick: bool, noted: Any, sites: list[str]) -> int:
+    """Run the banks of these seeds; returns how many had a violation or wrong numbers."""
     from driftfit import track
 
     move_apart()
 
     bad = 0
-    for seed in range(banks):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         form = "sqrt" if seed % 2 and not quick else "covariance"
         model, bank, record = drawn(rng, form, quick)
@@ -250,19 +254,22 @@ def fuzz(banks: int, quick: bool, noted: Any, sites: list[str]) -> int:
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)
+        if (seed + 1) % 10 == 0:
+            print(f"banks {seeds[0]} to {seed}, {bad} at fault", flush=True)
     return bad
 
 
-def work(banks: int, quick: bool) -> int:
+def work(seeds: range, tests: Sequence[str], quick: bool) -> int:
     """The work of the process with the checks."""
     noted, sites = watch()
-    bad = fuzz(banks, quick, noted, sites)
-    print(f"{banks} banks, {len(sites)} checks, {bad} banks at fault")
-    if quick:
+    bad = 0
+    if seeds:
+        bad = fuzz(seeds, quick, noted, sites)
+        print(f"{len(seeds)} banks, {len(sites)} checks, {bad} banks at fault", flush=True)
+    if not tests:
         return int(bad > 0)
     import pytest
 
-    tests = sorted(str(path) for path in (Path(__file__).parents[1] / "tests").glob("test_bank*.py"))
     failed = pytest.main(["-q", "-n", "0", "-p", "no:cacheprovider", *tests])
     wrong = found(noted, sites)
     print(f"tests of banks: exit status {int(failed)}, {len(wrong)} places out of bounds", *wrong, sep="\n    ")
@@ -272,15 +279,19 @@ def work(banks: int, quick: bool) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--banks", type=int)
+    parser.add_argument("--banks", type=int, help="how many banks are drawn; 0: none")
+    parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
+    parser.add_argument("--tests", nargs="+", help="files of tests, or none")
     given = parser.parse_args()
-    banks = given.banks or (60 if given.quick else 1000)
+    banks = (60 if given.quick else 1000) if given.banks is None else given.banks
+    tests = [str(path) for path in sorted((Path(__file__).parents[1] / "tests").glob("test_bank*.py"))]
+    if given.tests is not None or given.quick:
+        tests = [name for name in given.tests or () if name != "none"]
     if os.environ.get("NUMBA_BOUNDSCHECK") == "1":
-        sys.exit(work(banks, given.quick))
+        sys.exit(work(range(given.first, given.first + banks), tests, given.quick))
     with tempfile.TemporaryDirectory() as cache:
         checked = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": cache, "NUMBA_OPT": "0"}
-        arguments = ["--banks", str(banks), *(["--quick"] if given.quick else [])]
-        sys.exit(subprocess.run([sys.executable, __file__, *arguments], env=checked, check=False).returncode)
+        sys.exit(subprocess.run([sys.executable, *sys.argv], env=checked, check=False).returncode)
 
 
 if __name__ == "__main__":

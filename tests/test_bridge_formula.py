@@ -50,6 +50,16 @@ def test_same_numbers_as_statsmodels():
         mine.params_path[order].iloc[5:], theirs.recursive_coefficients.filtered.T[5:], rtol=1e-6
     )
     np.testing.assert_allclose(mine.cusum[3:], theirs.cusum, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(mine.cusum_squares[3:], theirs.cusum_squares, rtol=1e-6, atol=1e-8)
+    alphas = {
+        "cusum": (0.01, 0.05),
+        "cusum_squares": (0.01, 0.05, 0.10),
+    }  # at 0.10 it has a = 0.950, which is misprinted
+    for name, some in alphas.items():
+        for alpha in some:
+            ends = getattr(theirs, f"_{name}_significance_bounds")(alpha, points=np.array([4, 40]))
+            found = getattr(mine, f"{name}_limits")(alpha)
+            np.testing.assert_allclose(found.iloc[[3, 39]], np.transpose(ends), rtol=1e-6)
 
 
 def test_formula_keeps_missing_rows_and_reads_transforms():
@@ -76,7 +86,29 @@ def test_cusum_leaves_its_limits_when_a_coefficient_jumps():
     assert outside == [False, True]
     with pytest.raises(ValueError, match="tabulated"):
         result.cusum_limits(0.2)
-    assert len(result.plot_cusum().axes[0].lines) == 4
+    with pytest.raises(ValueError, match="tabulated"):
+        result.cusum_squares_limits(0.3)
+    drawn = [line.get_ydata() for line in result.plot_cusum().axes[0].lines]
+    assert drawn[0] == pytest.approx(result.cusum, nan_ok=True)
+    limits = result.cusum_limits(0.05)
+    assert np.stack(drawn[1:3]) == pytest.approx(limits.to_numpy().T, nan_ok=True)
+
+
+def test_cusum_of_squares_leaves_its_limits_when_the_noise_grows():
+    """Of records with constant noise a tenth leaves the limits at 10 %; with nine times the variance it leaves them."""
+    rng = np.random.default_rng(5)
+    count = 0
+    for seed in range(60):
+        data = table(seed=seed)
+        data["y"] = 1 + 2 * data.x1 + rng.normal(size=80)
+        result = TimeVaryingRegression.from_formula("y ~ x1", data, RLS(1.0)).fit()
+        limits = result.cusum_squares_limits(0.10)
+        count += bool(((result.cusum_squares > limits.upper) | (result.cusum_squares < limits.lower)).any())
+    assert 1 <= count <= 13  # 6 are expected; 14 and more have a probability of 0.001
+    data["y"] = 1 + 2 * data.x1 + np.where(np.arange(80) < 50, 1.0, 3.0) * rng.normal(size=80)
+    louder = TimeVaryingRegression.from_formula("y ~ x1", data, RLS(1.0)).fit()
+    assert (louder.cusum_squares < louder.cusum_squares_limits(0.05).lower).any()
+    assert len(louder.plot_cusum_squares().axes[0].lines) == 4
 
 
 def test_summary_as_text_html_and_latex():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from scipy.io import savemat
+from support import arx_record
 
-from driftfit import ARX, RLS, track
+from driftfit import ARX, RLS, Kalman, select, track, tune
 from driftfit.bridges.matlab import Experiment, merge, read_mat, write_mat
 
 
@@ -78,3 +79,56 @@ def test_merged_experiments_share_no_regressor():
     np.testing.assert_allclose(joined.theta[-1], expected, rtol=1e-9)
     pure = track(ARX(2, 0), RLS(1.0), merge(Experiment(first.y), Experiment(second.y)).joined(ARX(2, 0))[0])
     assert pure.ok.sum() == 58 + 58
+
+
+def test_settings_of_merged_experiments_are_those_of_all_of_them():
+    """The log-likelihoods of the experiments add up, each from the start; nothing runs from one into the next."""
+    merged = merge(experiment(120), experiment(90, seed=1), experiment(150, seed=2))
+    tuned = tune(ARX(1, [1, 1]), Kalman(), **merged.arguments)
+    fleet = track(ARX(1, [1, 1]), tuned.tracker, **merged.arguments)
+    assert list(fleet) == [0, 1, 2]
+    assert fleet[1].names == ("a1", "b1[pressure]", "b1[current]")
+    assert fleet[1].time[1] == 3.5
+    assert tuned.loglik == pytest.approx(sum(run.loglik for run in fleet.values()), rel=1e-9)
+    alone = [tune(ARX(1, [1, 1]), Kalman(), one.y, one.u).tracker.r for one in merged]
+    assert min(alone) < tuned.tracker.r < max(alone)
+    assert tuned.interval["r"][1] / tuned.interval["r"][0] < 1.4  # of 357 samples: exp(2 * 1.96 sqrt(2 / 357))
+    shuffled = tune(ARX(1, [1, 1]), Kalman(), **merge(merged[2], merged[0], merged[1]).arguments)
+    assert shuffled.tracker.r == pytest.approx(tuned.tracker.r, rel=1e-6)
+
+
+def test_the_structure_of_merged_experiments():
+    """The logliks of the experiments add up, each from the start, and so do the variances of their differences."""
+    merged = merge(*(Experiment(*arx_record(130, seed)) for seed in range(4)))
+    models = [ARX(1, 1), ARX(2, 2)]
+    said = select(models, tracker=RLS(1.0), **merged.arguments)
+    assert said.best == said.simplest == "ARX(na=2, nb=2)"
+    alone = [select(models, one.y, one.u, tracker=RLS(1.0)) for one in merged]
+    assert said.scored == sum(one.scored for one in alone)
+    for row in said.rows:
+        assert row.loglik == pytest.approx(sum(r.loglik for one in alone for r in one.rows if r.n == row.n))
+    spread = [row.std for one in alone for row in one.rows if row.n == 2]
+    assert said.rows[1].std == pytest.approx(np.sqrt(np.sum(np.square(spread))))
+    assert len(said.average().y_hat) == 4 * 130
+
+
+def test_merged_experiments_need_one_interval():
+    with pytest.raises(ValueError, match=r"Ts must be the same in all; got 1, 0\.5"):
+        _ = merge(Experiment(np.ones(9), np.ones((9, 2))), experiment(9)).arguments
+
+
+def test_tuning_of_rows_and_of_several_outputs():
+    """`by` is that of track; a smoother's criteria pool the residuals of all records."""
+    y, u = map(np.stack, zip(*(arx_record(100, seed) for seed in (0, 1)), strict=True))
+    model = ARX(1, 1)
+    rows = tune(model, Kalman(), y, u, by="row")
+    fleet = track(model, rows.tracker, y, u, by="row")
+    assert rows.loglik == pytest.approx(sum(run.loglik for run in fleet.values()), rel=1e-9)
+    loo = tune(model, Kalman(), y, u, by="row", method="loo")
+    paths = [run.smooth() for run in track(model, loo.tracker, y, u, by="row").values()]
+    pooled = np.nanmean(np.concatenate([path.loo for path in paths]) ** 2)
+    assert loo.table["loo"].min() == pytest.approx(pooled, rel=1e-6)
+    each = tune(ARX(1, 1, ny=2), Kalman(), np.stack([y, 2 * y], axis=-1), u, by="row")
+    assert each["y2"].tracker.r == pytest.approx(4 * each["y1"].tracker.r, rel=1e-3)
+    with pytest.raises(ValueError, match="samples of one record"):
+        tune(model, Kalman(), y, u, by="row", order_by=np.arange(100))

@@ -1,6 +1,8 @@
 """The river bridge: river's own checks, and the numbers of `Live`."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -78,3 +80,22 @@ def test_missing_values_are_not_used_and_do_not_poison():
         model.learn_one(x if i % 7 else x | {"a": None}, y if i % 5 else math.nan)
     assert model.coef == pytest.approx({"a": 2.0, "b": -1.0}, abs=0.1)
     assert model.predict_one({"a": None, "b": 1.0}) == 0.0
+
+
+def test_river_counts_the_state_and_the_samples_that_are_kept():
+    """And neither the compiled code nor the library, which all models share; copies and pickles go on as they are."""
+    short, long = TrackedRegressor(Kalman(q=1e-3, r=0.01), window=20), TrackedRegressor(Kalman(q=1e-3, r=0.01))
+    for x, y in samples(100):
+        short.learn_one(x, y)
+        long.learn_one(x, y)
+    assert 3_000 < short._raw_memory_usage < long._raw_memory_usage < 200_000
+    others = [copy.deepcopy(short), pickle.loads(pickle.dumps(short))]
+    for other in others:
+        assert other._raw_memory_usage == pytest.approx(short._raw_memory_usage, rel=0.1)
+        other.learn_one({"a": 1.0, "b": 1.0}, 9.0)
+        assert other.coef != short.coef  # nothing is shared
+    short.learn_one({"a": 1.0, "b": 1.0}, 9.0)
+    for x, y in samples(20, seed=1):
+        assert {other.predict_one(x) for other in others} == {short.predict_one(x)}
+        for model in (short, *others):
+            model.learn_one(x, y)

@@ -1,7 +1,8 @@
 """The build fails when the docs lie.
 
 Python blocks of a page run in order, in one namespace; a text block right after one is what it prints. A text block
-after a line ``Printed by `examples/NAME.py`:`` is what that script prints. Links and pictures must exist.
+after a line ``Printed by `examples/NAME.py`:`` is what that script prints. Links and pictures must exist. Where an
+optional package is absent, a page is left at the block that imports it, and the test says so.
 """
 
 import contextlib
@@ -22,6 +23,23 @@ def squeezed(text: str) -> list[str]:
     return [" ".join(line.split()) for line in text.strip().splitlines()]
 
 
+OPTIONAL = {"formulaic", "h5py", "river", "sktime", "statsmodels", "xarray"}
+"""What extras or the pages themselves ask users to install."""
+
+
+@contextlib.contextmanager
+def present(page):
+    """Skip the rest of a page where an optional package is absent."""
+    try:
+        yield
+    except ImportError as error:
+        said = f"{error.name or ''} {error.__cause__ or ''} {error}"
+        absent = next((name for name in OPTIONAL if name in said), None)
+        if absent is None:
+            raise
+        pytest.skip(f"{page}: {absent} is not installed, so the rest of the page was not run")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -32,7 +50,7 @@ def test_python_blocks_print_what_the_page_says(page, tmp_path, monkeypatch):
         if block[1] != "python":
             continue
         printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
+        with contextlib.redirect_stdout(printed), present(page.name):
             exec(compile(block[2], f"{page.name}: block {i}", "exec"), namespace)
         follows = i + 1 < len(blocks) and not text[block.end() : blocks[i + 1].start()].strip()
         if follows and blocks[i + 1][1] == "text":

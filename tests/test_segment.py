@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import signal
+from support import arx_record
 
 from driftfit import ARX, RLS, Regression, segment, track
 from driftfit.judge.statistics.break_dates import date_loglik, smallest
@@ -117,7 +118,13 @@ def test_parameters_and_standard_errors_of_segments():
         assert part.std == pytest.approx(0.3 / np.sqrt(count), rel=3.5 / np.sqrt(count))  # of two standard deviations
     assert said.theta.shape == (500, 2)
     assert str(only.date)[:13].replace("T", " ") in said.summary()
-    assert len(said.plot().axes) == 3
+    top, *panels = said.plot().axes
+    np.testing.assert_array_equal(top.lines[0].get_ydata(), run.y)
+    for i, panel in enumerate(panels):
+        drawn = [line.get_ydata()[0] for line in panel.lines[: len(said.segments)]]
+        assert drawn == [part.theta[i] for part in said.segments]
+        assert panel.lines[-1].get_xdata()[0] == only.date
+    assert i == 1
     large = segment(1000.0 * y, u, Regression(2))
     assert [one.at for one in large.breaks] == [only.at]
     assert large.segments[0].theta == pytest.approx(1000.0 * said.segments[0].theta)
@@ -136,3 +143,14 @@ def test_lags_of_the_output_and_records_that_cannot_be_divided():
     for wrong in ({"level": 1.0}, {"false": 0.0}, {"shortest": 0}):
         with pytest.raises(ValueError, match="segment"):
             segment(y, **wrong)
+
+
+def test_segments_shorter_than_the_correlation_of_the_noise_have_no_standard_errors():
+    """A level that the model has no regressor for leaves noise of a long correlation and many short segments."""
+    y, u = arx_record(1200, 1)
+    found = segment(y + 9.0 * (np.arange(1200) >= 500), u, ARX(2, 2))
+    short = [part for part in found.segments if part.stop - part.start - len(found.ar) <= 4]
+    assert short
+    for part in found.segments:
+        assert np.isfinite(part.theta).all()
+        assert np.isnan(part.std).all() == (part in short)

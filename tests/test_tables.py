@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from datetime import UTC, date, datetime, timedelta
 from decimal import Decimal
 from zoneinfo import ZoneInfo
@@ -12,8 +13,9 @@ import pandas as pd
 import polars as pl
 import pyarrow as pa
 import pytest
+from support import arx_record
 
-from driftfit import ARX, Kalman, Track, track
+from driftfit import ARX, Fleet, Kalman, Live, Track, track
 
 MODEL, TRACKER = ARX(1, 1), Kalman(q=1e-3, r=0.1)
 T = 60
@@ -279,3 +281,62 @@ def test_fleet_plot_and_ranking():
     assert [axis.get_title() for axis in figure.axes] == ["fast", "slow", "still"]
     with pytest.raises(ValueError, match=r"no parameter 'b2\[u\]'; did you mean b1\[u\]"):
         fleet.plot("b2[u]")
+
+
+def test_names_of_units_keep_their_type():
+    """Parts of a table agree on it: text stays text in a table; files of text have no types."""
+    rows = pl.DataFrame({"unit": ["1", "2"], "t": [0.0, 0.0], "flow": [1.0, 2.0], "u": [1.0, 2.0]})
+    fleet = track(ARX(1, 1), Kalman(q=1e-3, r=0.1), "flow", "u", data=rows, time="t", by="unit")
+    assert list(fleet) == ["1", "2"]
+    assert fleet.to_table()["unit"].dtype == pl.String
+
+
+def test_files_agree_on_the_type_of_units(tmp_path):
+    for name, unit in (("a", "7"), ("b", "x")):
+        (tmp_path / f"{name}.csv").write_text(f"unit,flow,u\n{unit},1,1\n")
+    one = track(ARX(1, 1), Kalman(q=1e-3, r=0.1), "flow", "u", data=tmp_path / "a.csv", by="unit")
+    both = track(ARX(1, 1), Kalman(q=1e-3, r=0.1), "flow", "u", data=tmp_path / "*.csv", by="unit")
+    assert (list(one), list(both)) == ([7], ["7", "x"])
+
+
+def test_a_table_without_a_usable_row_is_an_empty_fleet(tmp_path):
+    rows = pl.DataFrame({"unit": ["a", "b", None], "t": [None, float("nan"), 1.0], "flow": [1.0] * 3, "u": [1.0] * 3})
+    for tracker in (Kalman(q=1e-3, r=0.1), {"a": Kalman(q=1e-3, r=0.1)}):
+        fleet = track(ARX(1, 1), tracker, "flow", "u", data=rows, time="t", by="unit")
+        assert (len(fleet), fleet.failed) == (0, dict.fromkeys("ab", "no row has a time"))
+        assert fleet.dropped == {"without a time": 2, "without a unit": 1}
+        fleet.save(tmp_path / "fleet")
+        for again in (fleet, Fleet.load(tmp_path / "fleet"), pickle.loads(pickle.dumps(fleet))):
+            assert (again.names, again.failed) == (("a1", "b1[u]"), fleet.failed)
+            assert "no result for a: no row has a time" in str(again.summary())
+            assert again.to_table().columns == ["unit", "t", "flow", "u", *again.programs[0].schema()]
+            assert again.to_table().height == 0
+        with pytest.raises(ValueError, match="no series has a result to draw"):
+            fleet.plot()
+
+
+def test_the_parameters_of_a_sample_in_one_column():
+    y, u = arx_record(30)
+    run = track(ARX(1, 1), Kalman(q=1e-3, r=0.1), y, u)
+    program = run.program
+    for kind in ("polars", "pandas", "pyarrow"):
+        table = run.to_table(kind, arrays=True)
+        names = table.columns if kind == "polars" else list(getattr(table, "column_names", table))
+        assert names == ["sample", "y", "u1", *program.schema(arrays=True)]
+        rows = table["theta"].to_pylist() if kind == "pyarrow" else list(table["theta"])
+        assert np.array_equal(np.array([list(row) for row in rows]), run.theta)
+    assert run.to_table().columns == ["sample", "y", "u1", *program.schema()]
+    two = track(ARX(1, 1, ny=2), Kalman(q=1e-3, r=0.1), np.stack([y, y], 1), u).to_table(arrays=True)
+    assert [name for name in two.columns if name.startswith("theta")] == ["theta[y1]", "theta[y2]"]
+
+
+def test_a_fleet_continues_from_its_states_as_bytes():
+    y, u = (np.stack(part) for part in zip(*(arx_record(60, k) for k in range(3)), strict=True))
+    K = Kalman(q=1e-3, r=0.1)
+    whole = track(ARX(1, 1), K, y, u, by="row")
+    first = track(ARX(1, 1), K, y[:, :25], u[:, :25], by="row")
+    rest = track(ARX(1, 1), K, y[:, 25:], u[:, 25:], by="row", warm_start=first.states())
+    assert np.array_equal(rest.stack("theta"), whole.stack("theta")[:, 25:])
+    assert np.array_equal(Live.from_bytes(rest.states()[2]).cov, whole[2].cov(59))
+    with pytest.raises(ValueError, match="a mapping from key to its end or bytes"):
+        track(ARX(1, 1), K, y, u, by="row", warm_start=b"one")

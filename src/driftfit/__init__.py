@@ -28,6 +28,7 @@ from driftfit.models.hammerstein_wiener.results.product_drift import track_produ
 from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curves
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.results import Track
 from driftfit.run.live.conformal import ConformalFactor
@@ -56,16 +57,19 @@ from driftfit.use.rational import rational_model
 from driftfit.use.system_from_path import static_curve
 
 __all__ = [
+    "ARMAX",
     "ARX",
     "FLS",
     "GPB",
     "IMM",
+    "OE",
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
     "BSpline",
     "Bank",
     "Beam",
+    "BoxJenkins",
     "Change",
     "Chebyshev",
     "ConformalFactor",
@@ -89,6 +93,7 @@ __all__ = [
     "Outputs",
     "PiecewiseLinear",
     "Polynomial",
+    "PolynomialModel",
     "Regression",
     "Saturation",
     "Sensor",

@@ -11,15 +11,18 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
-from driftfit.run import fleet, many, outputs, result, shared_outputs
+from driftfit.run import fleet, keyed_results, outputs, result, shared_outputs
 from driftfit.run.live.rule import AlarmRule
+from driftfit.show.cells import cell_of
 from driftfit.show.fleet_summary import FleetSummary, summarise
-from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
 from driftfit.show.report import check_path, report
 from driftfit.show.report_many import page_of_many
+from driftfit.show.summary import Summary, summarise_outputs, summarise_shared
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.use.crossing import crossings
@@ -27,11 +30,12 @@ from driftfit.use.forecast import Forecast, forecast_outputs
 
 if TYPE_CHECKING:
     import polars
+    import xarray
     from matplotlib.figure import Figure
 
 
-class Judged(many.Many):
-    """Methods of many runs with keys; see `driftfit.judge.fleet_verdict`."""
+class Judged(keyed_results.KeyedResults):
+    """Verbs of results by key; see `driftfit.judge.fleet_verdict`."""
 
     def values(self) -> Iterator[Track]:
         """The results."""
@@ -40,6 +44,9 @@ class Judged(many.Many):
     def items(self) -> Iterator[tuple[Hashable, Track]]:
         """Keys and results."""
         return ((key, _public(run)) for key, run in super().items())
+
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
@@ -83,11 +90,20 @@ class Judged(many.Many):
         """
         return crossings(dict(self.items()), self.by, what, below, above, horizon, u, level)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`."""
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """All results as one xarray dataset, with one dimension more than a `Track`; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""
@@ -118,9 +134,12 @@ class Fleet(fleet.Fleet, Judged, public=True):
         """Results ranked by how much their parameters moved; print it."""
         return summarise(self)
 
-    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95) -> Figure:
-        """Small multiples of one parameter for the results that moved most; a matplotlib figure."""
-        return plot_fleet(self, which, most, level)
+    def plot(self, which: str | None = None, most: int = 12, level: float = 0.95, ax: Any = None) -> Figure:
+        """Small multiples of one parameter for the results that moved most; a matplotlib figure.
+
+        ``ax`` as for `Track.plot`.
+        """
+        return plot_fleet(self, which, most, level, ax)
 
 
 class Outputs(outputs.Outputs, Judged, public=True):
@@ -138,17 +157,24 @@ class Outputs(outputs.Outputs, Judged, public=True):
         """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
         return forecast_outputs(self, h, u)
 
-    def summary(self) -> OutputsSummary:
+    def joint_noise(self, memory: float | None = None) -> JointNoise:
+        """One noise covariance for all outputs, and their joint density; see `driftfit.judge.joint_noise`."""
+        return JointNoise(self, memory)
+
+    def summary(self) -> ByOutput[Summary]:
         """The summaries of all outputs, by name; print it."""
         return summarise_outputs(self)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands: one row of panels for each output."""
-        return plot_outputs(self, level)
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands: one row of panels for each output. ``ax`` as for `Track.plot`."""
+        return plot_outputs(self, level, ax)
 
 
 class Shared(shared_outputs.Shared, public=True):
     __doc__ = shared_outputs.Shared.__doc__
+
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
     def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
         """The smoothed path: theta (T, n), and residuals of every output (T, ny)."""
@@ -174,19 +200,28 @@ class Shared(shared_outputs.Shared, public=True):
         """The report on the rows; see `driftfit.show.report`. ``alarms`` of `detect` have a separate section."""
         report(self.rows, path, title, alarms)
 
-    def summary(self) -> SharedSummary:
-        """Present parameters, and the one-step error of each output; print it."""
+    def summary(self) -> Summary:
+        """The summary of the rows, with the one-step error of each output; print it."""
         return summarise_shared(self)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, predictions and innovations of the rows."""
-        return plot_track(self.rows, level)
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, predictions and innovations of the rows. ``ax`` as for `Track.plot`."""
+        return plot_track(self.rows, level, ax)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The results as one table, one row per sample; see `driftfit.show.export`."""
+    def to_xarray(self) -> xarray.Dataset:
+        """The results as an xarray dataset, predictions by time and output; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
+
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The results as one table, one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
 
 
 def _public(run: result.Track) -> Track:

@@ -16,6 +16,7 @@ from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks
 from driftfit.run import result
 from driftfit.run.live.rule import AlarmRule
+from driftfit.show.cells import cell_of
 from driftfit.show.plots import plot_track
 from driftfit.show.report import report
 from driftfit.show.summary import Summary, summarise
@@ -30,6 +31,7 @@ from driftfit.use.system import FrequencyResponse, LongRun, Response
 from driftfit.use.system_plots import plot_system, plot_validation
 
 if TYPE_CHECKING:
+    import xarray
     from matplotlib.figure import Figure
 
 
@@ -66,15 +68,32 @@ class Track(result.Track, public=True):
         """Present parameters, and one-step errors compared with those of simpler methods; print it."""
         return summarise(self)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, prediction against output, innovations; a matplotlib figure."""
-        return plot_track(self, level)
+    def _repr_html_(self) -> str:
+        return cell_of(self)
 
-    def to_table(self, kind: str = "polars") -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`."""
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, prediction against output, innovations; a matplotlib figure.
+
+        ``ax``: None for a new figure; one matplotlib axes, whose place the panels share (a picture of one panel is
+        drawn in it); or as many axes as the picture has panels, here n + 2. The figure of the axes is returned.
+        ValueError for another number.
+        """
+        return plot_track(self, level, ax)
+
+    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
         from driftfit.show.export import to_table  # importing polars takes as long as all other imports
 
-        return to_table(self, kind)
+        return to_table(self, kind, arrays)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The result as an xarray dataset with the dimensions time and parameter; see `driftfit.show.datasets`."""
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """The same table as an Arrow stream, for any program that reads one."""
@@ -98,9 +117,9 @@ class Track(result.Track, public=True):
         """
         return blocks_of(self, method, input, output, at)
 
-    def plot_blocks(self, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
-        """The static curves at some samples, and the coefficients over time; a matplotlib figure."""
-        return plot_blocks(self, method, times)
+    def plot_blocks(self, method: str = "svd-joint", times: Sequence[int] | None = None, ax: Any = None) -> Figure:
+        """The static curves at some samples, and the coefficients over time; ``ax`` as for `plot`."""
+        return plot_blocks(self, method, times, ax)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
         """Is the time variation real, which parameters move, and does tracking them pay? See
@@ -121,7 +140,7 @@ class Track(result.Track, public=True):
         return simulate.ahead(self, k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
-        """Outputs that inputs u would cause in the system at a sample, with bands; see `driftfit.use.simulate`."""
+        """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
         return simulate.simulate(self, u, at, y)
 
     def crossing(
@@ -176,15 +195,15 @@ class Track(result.Track, public=True):
         """
         return detect(self, kind, **settings)
 
-    def plot_system(self, input: int | str = 0, at: Any = None, **settings: Any) -> Figure:
+    def plot_system(self, input: int | str = 0, at: Any = None, ax: Any = None, **settings: Any) -> Figure:
         """Step and frequency response over time with bands, poles in the plane, gain; see
-        `driftfit.use.system_plots`.
+        `driftfit.use.system_plots`. ``ax`` as for `plot`.
         """
-        return plot_system(self, input, at, **settings)
+        return plot_system(self, input, at, ax=ax, **settings)
 
-    def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95) -> Figure:
+    def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95, ax: Any = None) -> Figure:
         """Simulated and measured outputs of a record that was not used, with bands and the fit in per cent."""
-        return plot_validation(self, y, u, at, level)
+        return plot_validation(self, y, u, at, level, ax)
 
     def report(
         self,

@@ -46,6 +46,37 @@ def test_live_says_what_the_record_says(model, tracker, known):
         assert same(live.std, run.std[t]), t
 
 
+@pytest.mark.parametrize("known", [{}, factors(5)], ids=["plain", "times, weights, drift"])
+def test_several_samples_at_once_leave_what_one_after_the_other_leave(model, tracker, known):
+    """Results and the bytes of the state, in pieces of any length, some of them single updates; late times too."""
+    y, u = damaged(*arx_record(T, 1), seed=2)
+    if known:
+        known["time"][[0, 40, 41, 299]] = np.nan, 3.0, np.inf, -np.inf
+    singly, together = Live(model, tracker), Live(model, tracker)
+    names = {"time": "time", "weights": "weight", "drift": "drift"}
+    for a, b in [(0, 5), (5, 5), (5, 6), (6, 170), (170, 172), (172, 300)]:
+        steps, thetas, stds = [], [], []
+        for live in (singly, together):
+            live.hold(a == 170)
+        for t in range(a, b):
+            at = {names[name]: float(value[t]) for name, value in known.items()}
+            steps.append(singly.update(y[t], u[t : t + 1], **at))
+            thetas.append(singly.theta), stds.append(np.sqrt(singly.lane()["var"]))
+        got = together.update_many(y[a:b], u[a:b], **{name: value[a:b] for name, value in known.items()})
+        assert len(got) == b - a
+        y_hat, e, s, ok = np.reshape(steps, (-1, 4)).T
+        assert same(got.prediction, y_hat)
+        assert same(got.innovation, e)
+        assert same(got.innovation_var, s)
+        assert same(got.ok, ok > 0)
+        assert same(got.theta, np.reshape(thetas, (-1, len(live.names))))
+        assert same(got.std, np.reshape(stds, (-1, len(live.names))))
+        assert together._tile.tobytes() == singly._tile.tobytes(), (a, b)
+        assert together.to_bytes() == singly.to_bytes()
+        assert together.ignored == singly.ignored
+    assert singly.ignored == (4 if known else 0)
+
+
 def test_a_lane_says_what_the_record_says(model, tracker):
     series = [damaged(*arx_record(T, lane), seed=lane, share=0.01 * lane) for lane in range(tracker.width)]
     known = [factors(lane) for lane in range(tracker.width)]

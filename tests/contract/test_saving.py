@@ -30,7 +30,7 @@ def test_a_stream_continues_as_if_never_stopped(model, tracker, tmp_path, stop):
     other = Live.load(tmp_path / "state")
     assert (other.model, other.tracker) == (live.model, live.tracker)
     assert same(feed(live, stop, 300), feed(other, stop, 300))
-    assert live._tile.tobytes() == other._tile.tobytes()
+    assert live.to_bytes() == other.to_bytes()
     assert same(live.cov, other.cov)
 
 

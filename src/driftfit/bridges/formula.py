@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.show.parts.axes import BLUE, RED, panels
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import Kalman
@@ -33,6 +33,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INTERCEPT = "Intercept"
+
+_SQUARES = {
+    0.20: (1.0729830, -0.6698868, -0.5816458),
+    0.10: (1.2238734, -0.6700069, -0.7351697),
+    0.05: (1.3581015, -0.6701218, -0.8858694),
+    0.02: (1.5174271, -0.6702672, -1.0847745),
+    0.01: (1.6276236, -0.6703724, -1.2365861),
+}
+"""By level, the coefficients of the limits of the sum of squares."""
 
 
 @dataclass(frozen=True)
@@ -179,19 +188,52 @@ class TimeVaryingResults:
         limit = factors[alpha] * (np.sqrt(count) + 2 * np.cumsum(there) / np.sqrt(count))
         return pd.DataFrame({"lower": -limit, "upper": limit}, self.endog.index)
 
-    def plot_cusum(self, alpha: float = 0.05) -> Figure:
-        """`cusum` with its limits; a matplotlib figure. A path that leaves them contradicts constant coefficients."""
-        figure = new_figure(8.0, 3.0)
-        axis = figure.subplots()
-        axis.plot(_places(self.endog), self.cusum, color=BLUE, label="cumulative sum of recursive residuals")
-        axis.plot(_places(self.endog), self.cusum_limits(alpha), color=RED, linestyle="--", linewidth=1)
-        axis.axhline(0.0, color="black", linewidth=0.6)
-        axis.set_title(f"CUSUM, limits at {alpha:.0%}")
+    def plot_cusum(self, alpha: float = 0.05, ax: Any = None) -> Figure:
+        """`cusum` with its limits. A path that leaves them contradicts constant coefficients.
+
+        Returns a matplotlib figure; ``ax`` as for `Track.plot`.
+        """
+        return self._path(self.cusum, self.cusum_limits(alpha), f"CUSUM, limits at {alpha:.0%}", ax)
+
+    @property
+    def cusum_squares(self) -> pd.Series:
+        """Sum of the squared recursive residuals so far over that of all, (T,), eq. 10 of the same paper."""
+        squares = self.recursive_residuals**2
+        return (squares.cumsum() / squares.sum()).rename("cusum of squares")
+
+    def cusum_squares_limits(self, alpha: float = 0.05) -> pd.DataFrame:
+        """Lower and upper limits of `cusum_squares` if coefficients and noise variance are constant, (T, 2).
+
+        i / N -+ c at the i-th of N errors, c = a_1 / sqrt(n) + a_2 / n + a_3 / sqrt(n)^3, n = N / 2 - 1, with the
+        coefficients of Edgerton and Wells (1994, table 1). ValueError for an alpha other than .01, .02, .05, .10, .20.
+        """
+        if alpha not in _SQUARES:
+            raise ValueError(f"cusum_squares_limits: alpha={alpha} is not tabulated; choose from {sorted(_SQUARES)}.")
+        there = self.recursive_residuals.notna()
+        n = 0.5 * max(int(there.sum()), 4) - 1.0
+        half = float(np.dot(_SQUARES[alpha], [n**-0.5, 1.0 / n, n**-1.5]))
+        line = np.cumsum(there) / max(int(there.sum()), 1)
+        return pd.DataFrame({"lower": line - half, "upper": line + half}, self.endog.index)
+
+    def plot_cusum_squares(self, alpha: float = 0.05, ax: Any = None) -> Figure:
+        """`cusum_squares` with its limits; it leaves them when the noise variance or a coefficient changes.
+
+        Returns a matplotlib figure; ``ax`` as for `Track.plot`.
+        """
+        limits = self.cusum_squares_limits(alpha)
+        return self._path(self.cusum_squares, limits, f"CUSUM of squares, limits at {alpha:.0%}", ax)
+
+    def _path(self, path: pd.Series, limits: pd.DataFrame, title: str, ax: Any) -> Figure:
+        figure, (axis,) = panels(ax, (8.0, 3.0))
+        axis.plot(_places(self.endog), path, color=BLUE)
+        axis.plot(_places(self.endog), limits, color=RED, linestyle="--", linewidth=1)
+        axis.plot(_places(self.endog), limits.mean(axis=1), color="black", linewidth=0.6)
+        axis.set_title(title)
         return figure
 
-    def plot_coefficients(self, level: float = 0.95) -> Figure:
-        """Every coefficient over time with its band, the prediction and the errors; a matplotlib figure."""
-        return self.run.plot(level)
+    def plot_coefficients(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Every coefficient over time with its band, the prediction and the errors; ``ax`` as for `Track.plot`."""
+        return self.run.plot(level, ax)
 
     def summary(self, alpha: float = 0.05) -> CoefficientTable:
         """The table of coefficients after the last row, as text, HTML or LaTeX."""
@@ -209,7 +251,7 @@ class TimeVaryingResults:
 
 @dataclass(frozen=True)
 class CoefficientTable:
-    """What `summary` returns; ``print`` shows it as text, and a notebook as HTML."""
+    """The result of `summary`; ``print`` shows it as text, and a notebook as HTML."""
 
     facts: dict[str, str]
     table: pd.DataFrame

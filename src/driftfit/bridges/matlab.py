@@ -84,8 +84,35 @@ class Experiments:
     def __getitem__(self, place: int) -> Experiment:
         return self.records[place]
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What `track`, `tune` and `select` take: ``tune(model, Kalman(), **merge(z1, z2).arguments)``.
+
+        A table with one row per sample, and the names of its columns: the experiment (0, 1, ..), the time, the signals
+        by their names (y, y1, y2, .., u1, u2, .. without). Each experiment begins with unknown parameters: `track`
+        returns a fleet, `tune` and `select` add the log-likelihoods. ValueError for different sampling intervals.
+        """
+        import polars as pl
+
+        first = self[0]
+        if len({one.Ts for one in self}) > 1:
+            raise ValueError(f"Experiments: Ts must be the same in all; got {', '.join(f'{z.Ts:g}' for z in self)}.")
+        ny, m = _columns("y", first.y).shape[1], 0 if first.u is None else first.u.shape[1]
+        outputs = first.y_names or (("y",) if ny == 1 else tuple(f"y{i + 1}" for i in range(ny)))
+        inputs = first.u_names or tuple(f"u{j + 1}" for j in range(m))
+        tables = []
+        for k, one in enumerate(self):
+            columns = {"experiment": np.full(len(one), k), "time": one.time}
+            columns |= dict(zip(outputs, _columns("y", one.y).T, strict=True))
+            columns |= dict(zip(inputs, np.zeros((0, len(one))) if one.u is None else one.u.T, strict=True))
+            tables.append(pl.DataFrame(columns))
+        return {
+            "y": outputs[0] if ny == 1 else list(outputs), "u": list(inputs) or None, "data": pl.concat(tables),
+            "by": "experiment", "time": "time", "dt": "label",
+        }  # fmt: skip
+
     def joined(self, model: Model) -> tuple[Array, Array | None]:
-        """(y, u) of all experiments as one record, for `track`, `tune` and `select`.
+        """(y, u) of all experiments as one record, through which the parameters are followed (compare `arguments`).
 
         Between two experiments are ``model.reach + 1`` missing samples, so that no regressor of ``model`` (or of one
         that looks back less far) combines two experiments. Parameters are carried over; they drift for these samples.

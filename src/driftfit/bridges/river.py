@@ -14,7 +14,6 @@ Needs river 0.21 or later (``pip install "driftfit[river]"``).
 from __future__ import annotations
 
 from collections import deque
-from sys import getsizeof
 from typing import Any
 
 import numpy as np
@@ -67,37 +66,57 @@ class TrackedRegressor(base.Regressor):
         self.window = window
         self._columns: dict[Any, int] = {}
         self._past: deque[tuple[dict[Any, Any], float]] = deque(maxlen=window)
-        self._live: Live | None = None
         self._count = 0
         self._range = (np.inf, -np.inf)
+        self._hold(None)
+
+    def _hold(self, live: Live | None) -> None:
+        """Keep a stream, and its state for river to count.
+
+        river measures a model by walking through all that it refers to, functions excepted. A stream refers to compiled
+        code that all models share, so it is behind a function.
+        """
+        self._stream = lambda: live
+        self._state = {} if live is None else live.lane()
+        self._width = 0 if live is None else live.model.m
+        self._early = 0 if live is None else 5 * live.model.n
+
+    @property
+    def _live(self) -> Live | None:
+        return self._stream()
+
+    def __getstate__(self) -> dict[str, Any]:
+        live = self._live
+        return {**vars(self), "_stream": None if live is None else live.to_bytes(), "_state": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._hold(None if state["_stream"] is None else Live.from_bytes(state["_stream"]))
 
     def learn_one(self, x: dict[Any, Any], y: Any) -> None:
         """Learn one sample: features by name, and the output; None and NaN are missing."""
         output = _number(y)
-        known = len(self._columns)
-        for name in sorted(x.keys() - self._columns.keys(), key=str):
-            self._columns[name] = len(self._columns)
-        if self._live is None or len(self._columns) > self._live.model.m:
-            self._widen(len(self._columns) if known == 0 else 2 * known)
-        assert self._live is not None
-        self._live.update(output, self._row(x))
+        known, live = len(self._columns), self._live
+        if live is None or not x.keys() <= self._columns.keys():
+            for name in sorted(x.keys() - self._columns.keys(), key=str):
+                self._columns[name] = len(self._columns)
+            if live is None or len(self._columns) > self._width:
+                live = self._widen(len(self._columns) if known == 0 else 2 * known)
+        live.update(output, self._row(x, self._width))
         self._past.append((dict(x), output))
-        if np.isfinite(output) and self._starts():
+        if self._count < self._early and np.isfinite(output):
             self._count += 1
             self._range = (min(self._range[0], output), max(self._range[1], output))
 
-    def _starts(self) -> bool:
-        """Whether predictions are still clipped to the range of the outputs."""
-        return self._live is None or self._count < 5 * self._live.model.n
-
     def predict_one(self, x: dict[Any, Any]) -> float:
         """The output that is expected for these features."""
-        if self._live is None:
+        live = self._live
+        if live is None:
             return 0.0
-        y_hat = self._live.predict(self._row(x))[0]
+        y_hat = live.predict(self._row(x, self._width))[0]
         if not np.isfinite(y_hat):
             return 0.0
-        return float(np.clip(y_hat, *self._range)) if self._starts() and self._count else y_hat
+        return float(np.clip(y_hat, *self._range)) if 0 < self._count < self._early else y_hat
 
     @property
     def coef(self) -> dict[Any, float]:
@@ -114,28 +133,22 @@ class TrackedRegressor(base.Regressor):
         """The present intercept; 0 if there is none."""
         return float(self._live.theta[-1]) if self._live is not None and self.fit_intercept else 0.0
 
-    @property
-    def _raw_memory_usage(self) -> int:
-        """Bytes of the state and of the samples that are kept; all models share the compiled code."""
-        state = 0 if self._live is None else sum(value.nbytes for value in self._live.lane().values())
-        return state + sum(getsizeof(x) + getsizeof(0.0) * (len(x) + 1) for x, _ in self._past)
-
-    def _widen(self, m: int) -> None:
+    def _widen(self, m: int) -> Live:
         """A stream with m columns, for which the samples that are kept are learned again."""
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
-        self._live = Live(Regression(max(m, 1), intercept=self.fit_intercept), tracker)
+        live = Live(Regression(max(m, 1), intercept=self.fit_intercept), tracker)
         for x, y in self._past:
-            self._live.update(y, self._row(x))
+            live.update(y, self._row(x, live.model.m))
+        self._hold(live)
+        return live
 
-    def _row(self, x: dict[Any, Any]) -> Array:
+    def _row(self, x: dict[Any, Any], m: int) -> Array:
         """The regressors (m,): an absent feature is 0, one that is None is NaN. Unknown features are left out."""
-        assert self._live is not None
-        row = np.zeros(self._live.model.m)
+        row, columns = [0.0] * m, self._columns
         for name, value in x.items():
-            column = self._columns.get(name)
-            if column is not None:
-                row[column] = _number(value)
-        return row
+            if name in columns:
+                row[columns[name]] = _number(value)
+        return np.array(row)
 
     def _by_name(self, values: Any) -> dict[Any, float]:
         return {name: float(values[column]) for name, column in self._columns.items() if column < len(values)}

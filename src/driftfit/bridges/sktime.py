@@ -72,6 +72,8 @@ class TrackedForecaster(BaseForecaster):
         "enforce_index_type": None,
     }
 
+    _config: ClassVar[dict[str, Any]] = {"remember_data": False}  # the state contains what the past is needed for
+
     def __init__(self, tracker: Tracker | None = None, lags: int = 2, fit_intercept: bool = True) -> None:
         self.tracker = tracker
         self.lags = lags
@@ -79,7 +81,7 @@ class TrackedForecaster(BaseForecaster):
         super().__init__()
 
     def _fit(self, y: pd.Series, X: pd.DataFrame | None, fh: Any) -> Self:
-        self._columns = [] if X is None else list(X.columns)
+        self._columns, self._name = [] if X is None else list(X.columns), y.name
         tracker = AdaptiveKalman() if self.tracker is None else self.tracker
         self.run_: Track = track(self._model(), tracker, *self._signals(y, X))
         return self
@@ -92,7 +94,7 @@ class TrackedForecaster(BaseForecaster):
 
     def _predict(self, fh: Any, X: pd.DataFrame | None) -> pd.Series:
         ahead, rows = self._ahead(fh, X)
-        return pd.Series(ahead.y_hat[rows], index=fh.to_absolute_index(self.cutoff), name=self._y.name)
+        return pd.Series(ahead.y_hat[rows], index=fh.to_absolute_index(self.cutoff), name=self._name)
 
     def _predict_quantiles(self, fh: Any, X: pd.DataFrame | None, alpha: list[float]) -> pd.DataFrame:
         ahead, rows = self._ahead(fh, X)

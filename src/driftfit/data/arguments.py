@@ -20,6 +20,8 @@ def check_roles(owner: str, model: Any, tracker: Any, several: bool = False) -> 
 
     The message says what was passed, and what to write instead.
     """
+    if isinstance(model, Model) and isinstance(tracker, Tracker):
+        return
     if _is(model, Tracker) and _is(tracker, Model):
         raise TypeError(
             f"{owner}: model and tracker are in the wrong order; the model comes first: "

@@ -73,6 +73,8 @@ class Clock:
     @classmethod
     def of(cls, dt: Any, zone: str | None = None) -> Clock:
         """The clock of ``dt``, for times shown in a zone; ValueError if ``dt`` is not valid."""
+        if dt is None:
+            return UNSET
         clock = cls._of(dt)
         return replace(clock, zone=zone) if clock.kind in CALENDARS and zone is not None else clock
 
@@ -80,8 +82,6 @@ class Clock:
     def _of(cls, dt: Any) -> Clock:
         if isinstance(dt, Clock):
             return dt
-        if dt is None:
-            return cls("unset")
         if isinstance(dt, str):
             return _of_text(dt)
         if isinstance(dt, np.timedelta64 | timedelta):
@@ -138,8 +138,13 @@ class Clock:
 
     def at(self, time: Any) -> Clock:
         """This clock with days and months in the zone of a time that has one."""
-        known = self.zone is not None or self.kind not in CALENDARS or getattr(time, "tzinfo", None) is None
-        return self if known else replace(self, zone=zone_name(time.tzinfo))
+        zone = getattr(time, "tzinfo", None)
+        return self if zone is None or self.zone is not None else self.within(zone_name(zone))
+
+    def within(self, zone: str | None) -> Clock:
+        """This clock with days and months in a zone, unless it has one already."""
+        known = self.zone is not None or self.kind not in CALENDARS or zone is None
+        return self if known else replace(self, zone=zone)
 
     def _local(self, time: Array) -> Array:
         """Times in UTC converted to the wall clock of the zone."""
@@ -187,13 +192,29 @@ class Clock:
         return gaps
 
     def since(self, last: Any, time: Any) -> float:
-        """Nominal intervals from one instant to another; 1 if there is none before, NaN if time does not advance."""
+        """Nominal intervals from one instant to another; 1 if there is none before.
+
+        NaN if time does not advance, or is not known or infinite.
+        """
         if type(time) is float and type(last) is float and self.kind in ("number", "unset"):
-            return (time - last) / self.count if time > last else float("nan")
+            return (time - last) / self.count if last < time < np.inf else float("nan")
         self._fits(time)
+        if not np.isfinite(time):
+            return float("nan")
         if last is None:
             return 1.0
         return float(self.between(np.asarray(last), np.asarray(time))) if time > last else float("nan")
+
+    def arrivals(self, last: Any, time: Array) -> tuple[Array, Array]:
+        """(which samples (T,) come after ``last`` and all before them, nominal intervals before these): as `since`."""
+        self._fits(time)
+        fine = np.isfinite(time)
+        none = np.array(["NaT" if time.dtype.kind == "M" else np.nan], time.dtype)
+        first = none if last is None else np.atleast_1d(last)
+        newest = np.fmax.accumulate(np.concatenate([first, np.where(fine, time, none)]))[:-1]
+        taken = fine & ~(time <= newest)
+        kept = time[taken]
+        return taken, self.steps(kept) if last is None else self.steps(np.concatenate([first, kept]))[1:]
 
     def ahead(self, last: Any, h: int) -> Array | None:
         """The times (h,) of the nominal samples after ``last``; None if times are only labels."""
@@ -219,6 +240,10 @@ class Clock:
         ends = day + 1 == (month + 1).astype("datetime64[D]")  # the last day of a month stays the last day
         there = after - 1 if ends else np.minimum(first + (day - month.astype("datetime64[D]")), after - 1)
         return self._in_utc(np.asarray(there + part))
+
+
+UNSET = Clock("unset")
+"""No dt was given."""
 
 
 def instant(time: Any) -> Any:

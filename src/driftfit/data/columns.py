@@ -127,9 +127,7 @@ def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
 
 
 def _units(series: nw.Series[Any]) -> list[Any]:
-    """The unit of every row, or None. Text that reads as integers becomes integers."""
+    """The unit of every row, or None, in the type of the column: the parts of a table agree on it."""
     if not _is_text(series):
         return [None if value is None or value != value else value for value in series.to_list()]
-    text = _as_text(series)
-    whole = text.cast(pl.Int64, strict=False)
-    return (whole if whole.cast(pl.String).eq_missing(text).all() else text).to_list()
+    return _as_text(series).to_list()

@@ -117,7 +117,15 @@ def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
     separator = max(",;\t", key=header.count)
     options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
     names = pl.read_csv(path, n_rows=0, **options).columns
-    return names, pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
+    frame = pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
+    whole = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
+    return names, frame.with_columns(_whole(column) for column in whole)
+
+
+def _whole(text: pl.Series) -> pl.Series:
+    """A column that names units, which has no type in a file of text: integers where all of it reads as such."""
+    whole = text.cast(pl.Int64, strict=False)
+    return whole if whole.cast(pl.String).eq_missing(text).all() else text
 
 
 def _together(parts: Mapping[str, Columns]) -> Columns:
@@ -127,10 +135,18 @@ def _together(parts: Mapping[str, Columns]) -> Columns:
     if len(kinds) > 1:
         raise ValueError(f"the times of {kinds['f']} are numbers, but those of {kinds['M']} are dates.")
     first = next(iter(parts.values()))
+    units = [[value for part in parts.values() for value in part.by[k]] for k in range(len(first.by))]
     return Columns(
         {name: np.concatenate([part.numbers[name] for part in parts.values()]) for name in first.numbers},
         np.concatenate(list(times.values())) if times else None,
         first.zone,
-        [[value for part in parts.values() for value in part.by[k]] for k in range(len(first.by))],
+        [_of_one_type(column) for column in units],
         sum(part.rows for part in parts.values()),
     )
+
+
+def _of_one_type(units: list[Any]) -> list[Any]:
+    """Text for all of them if some files name units by text, and others by integers."""
+    if not any(isinstance(unit, str) for unit in units):
+        return units
+    return [str(unit) if isinstance(unit, int) else unit for unit in units]

@@ -1,4 +1,4 @@
-"""What is known of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
+"""Known numbers of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 INTERVAL, NOISE, DRIFT, COMMON = 0, 1, 2, 3
-"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker understands."""
+"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker reads."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more where a tracker takes more.
+    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more if there are extras.
 
     Samples of several outputs have columns (T, k, ny) or (1, k, ny); `for_output` gives those of one.
 
     ``interval``, ``noise`` and ``drift`` are its first columns: nominal intervals since the sample before, factors of
-    the noise variance, and factors of the drift. ``more`` (T, k - 3) is what `Tracker.beside` made.
+    the noise variance, and factors of the drift. ``extra`` (T, k - 3) is what `Tracker.extra_columns` made.
     """
 
     columns: Array
@@ -29,8 +29,10 @@ class Known:
     @classmethod
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
         """From numbers or arrays (T,)."""
-        parts = (np.atleast_1d(np.asarray(part, float)) for part in (interval, noise, drift))
-        return cls(np.stack(np.broadcast_arrays(*parts), axis=1))
+        parts = (interval, noise, drift)
+        if not any(map(np.ndim, parts)):
+            return cls(np.array([parts], float))  # a row for all samples
+        return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:
         return len(self.columns)
@@ -56,13 +58,13 @@ class Known:
         return self.columns[:, DRIFT]
 
     @property
-    def more(self) -> Array:
-        """(T, k - 3): further columns, which only some trackers understand."""
+    def extra(self) -> Array:
+        """(T, k - 3): extra columns, which only some trackers read."""
         return self.columns[:, COMMON:]
 
     @property
     def common(self) -> Known:
-        """Without what only some trackers understand."""
+        """Without the extra columns."""
         return Known(self.columns[:, :COMMON])
 
     def part(self, rows: slice | Array) -> Known:
@@ -80,7 +82,7 @@ class Known:
         columns = self.over(T).columns.copy()
         for place, values in given.items():
             if values is not None:
-                columns[:, place] = values
+                columns[:, place] = values if columns.ndim == 2 else np.reshape(values, (-1, 1))
         return Known(columns)
 
     def begun(self, factors: Mapping[int, float]) -> Known:
@@ -90,8 +92,8 @@ class Known:
             columns[place, INTERVAL] *= factor
         return Known(columns)
 
-    def with_more(self, columns: Array) -> Known:
-        """With further columns (T, k) after interval, noise and drift."""
+    def with_extra(self, columns: Array) -> Known:
+        """With extra columns (T, k) after interval, noise and drift."""
         common = self.common.over(len(columns)).columns
         if common.ndim > 2:
             columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)
@@ -111,6 +113,6 @@ class Known:
     def in_rows(self, T: int) -> Known:
         """(T ny, k): every output as a sample; between those of one instant no time passes."""
         ny = self.columns.shape[2]
-        columns = np.moveaxis(self.over(T).columns, 1, 2).reshape(T * ny, -1)
+        columns = np.moveaxis(self.over(T).columns, 1, 2).flatten().reshape(T * ny, -1)
         columns[np.arange(T * ny) % ny > 0, INTERVAL] = 0.0
         return Known(columns)

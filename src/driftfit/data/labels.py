@@ -16,6 +16,9 @@ from driftfit.data.clock import instants, zone_name
 from driftfit.data.signals import as_inputs
 from driftfit.engine.kernel import Array
 
+PLAIN = (np.ndarray, list, tuple, float, int)
+"""What has neither names nor an index."""
+
 
 class Held(NamedTuple):
     """What a user passed: values as an array, names of its columns (may be empty), and its index or None."""
@@ -27,7 +30,7 @@ class Held(NamedTuple):
 
 def held(what: str, given: Any) -> Held:
     """Values (T,) or (T, m) with their names, from anything that a user may pass."""
-    if given is None or isinstance(given, np.ndarray | list | tuple | float | int):
+    if given is None or isinstance(given, PLAIN):
         return Held(given)
     if isinstance(given, Mapping):
         parts = {str(name): held(f"{what}[{name!r}]", column) for name, column in given.items()}

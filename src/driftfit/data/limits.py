@@ -74,9 +74,9 @@ class Gate:
         return {name: count for name, count in found if count}
 
     def sample(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Outputs (ny,) and inputs (.., m) of one sample; values outside are counted."""
+        """Outputs (.., ny) and inputs (.., m) of one sample or several; values outside are counted."""
         out_y, out_u = self._limits.outside(y, u)
-        self._counts += np.concatenate([out_y, out_u.reshape(-1, u.shape[-1]).sum(axis=0)])
+        self._counts += np.concatenate([out.sum(axis=tuple(range(out.ndim - 1))) for out in (out_y, out_u)])
         return np.where(out_y, np.nan, y), np.where(out_u, np.nan, u)
 
     def inputs(self, u: Array) -> Array:

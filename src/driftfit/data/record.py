@@ -28,7 +28,7 @@ from driftfit.trackers.base import Tracker
 
 @dataclass(frozen=True)
 class Labels:
-    """The names and units of the signals of a series, and what was left out of it.
+    """The names and units of the signals of a series, and counts of what was left out.
 
     ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
     counts rows that never became samples, and ``missing`` counts, by reason, numbers that were treated as missing.
@@ -84,6 +84,8 @@ class Reading:
     units: Mapping[str, str] | None = None
     limits: Mapping[Any, Any] | None = None
     exclude: Any = None
+    indexed: bool = True
+    """Whether an index of dates labels the samples if no time is given."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,24 @@ class Records:
     def part(self, k: int) -> Record:
         """Series k; its arrays are views."""
         rows = slice(int(self.first[k]), int(self.first[k] + self.length[k]))
-        return Record(self.y, self.u, self.known, self.time, self.labels_of(k)).part(rows)
+        time = None if self.time is None else self.time[rows]
+        return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
+
+    def some(self, a: int, b: int) -> Records:
+        """Series a to b - 1; their arrays are views."""
+        first, length = self.first[a:b], self.length[a:b]
+        low = int(first.min())
+        rows = slice(low, int((first + length).max()))
+        return replace(
+            self,
+            keys=self.keys[a:b],
+            first=first - low,
+            length=length,
+            y=self.y[rows],
+            u=self.u[rows],
+            known=self.known.part(rows),
+            time=None if self.time is None else self.time[rows],
+        )
 
     def only(self, k: int) -> Records:
         """Series k alone; its arrays are views."""
@@ -179,10 +198,10 @@ class Records:
         """With everything that is known of the samples as columns of ``known``, as these trackers take it."""
         if self.drifts is None and prob is None:
             return self
-        columns, *others = (one.beside(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
+        columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
         if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
             raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
-        return replace(self, known=self.known.with_more(columns), drifts=None)
+        return replace(self, known=self.known.with_extra(columns), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""
@@ -196,7 +215,8 @@ class Records:
         """The labels of series k."""
         key = self.keys[k]
         counted = {"dropped": self.dropped.get(key), "missing": self.missing.get(key)}
-        return replace(self.labels, **{name: counts for name, counts in counted.items() if counts})  # type: ignore[arg-type]
+        found: Any = {name: counts for name, counts in counted.items() if counts}
+        return replace(self.labels, **found) if found else self.labels
 
     def for_model(self, model: Model, reading: Reading, reach: int | None = None) -> Records:
         """Sort the inputs for a model with named inputs, and apply valid ranges and excluded intervals.
@@ -204,7 +224,7 @@ class Records:
         Warns if most samples cannot be used because of dt, with lags of ``reach`` samples, or those of the model.
         """
         u, names = ordered(model, self.u, self.labels.u)
-        found = replace(self, u=u, labels=replace(self.labels, u=names))
+        found = self if u is self.u else replace(self, u=u, labels=replace(self.labels, u=names))
         found = found._restricted(names or model.input_names, reading)
         if self.time is not None and len(self.known) > 1:
             clock, zone = Clock.of(self.labels.dt), self.labels.zone
@@ -234,11 +254,11 @@ class Records:
 def one_series(y: Any, u: Any, reading: Reading) -> Records:
     """One series; y (T,), u (T,), (T, m) or None."""
     signals = {"y": held("y", y), "u": held("u", u)}
-    factors = {name: held(name, getattr(reading, name)) for name in ("weights", "drift")}
+    factors = {"weights": held("weights", reading.weights), "drift": held("drift", reading.drift)}
     together(**signals, **factors)
     output = as_output(signals["y"].values)
     T = len(output)
-    times = times_of(reading.time, list(signals.values()))
+    times = times_of(reading.time, list(signals.values()) if reading.indexed else ())
     dt = LABEL if times.labels and reading.dt is None else reading.dt
     axis, gaps = (None, 1.0) if times.axis is None else intervals(times.axis, Clock.of(dt, times.zone), T)
     drift = factors["drift"].values

@@ -1,4 +1,14 @@
-"""Files of states and results: one .npz each, with arrays and a header of plain JSON, without pickle.
+"""Files of states and results: arrays and a header of plain JSON, without pickle.
+
+Results are .npz files. States are small and there may be millions of them, so they have a form of their own, in which
+the names and sizes of the arrays are in the header: with all numbers little-endian,
+
+    bytes 0 .. 7      "driftfit"
+          8, 9        format, 2
+         10, 11       0
+         12 .. 15     CRC-32 of all that follows
+         16 .. 19     length of the header
+         20 ..        the header, and the arrays one after the other
 
 A file is written under a temporary name and then moved into place, so it is complete or absent. Classes are stored by
 module and class name; loading imports that module, so load only files from people whose code you would run.
@@ -7,14 +17,17 @@ module and class name; loading imports that module, so load only files from peop
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
+import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timedelta
 from importlib import import_module
 from io import BytesIO
 from os import PathLike
+from struct import Struct
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -23,6 +36,12 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
 
 FORMAT = 1
+"""Of .npz files."""
+MAGIC, COMPACT = b"driftfit", 2
+"""How the bytes of a state begin, and their format."""
+HEAD = Struct("<8sHHII")
+CHECKED = 16
+"""Where that begins which the CRC covers."""
 
 
 def describe(settings: Settings) -> dict[str, Any]:
@@ -49,13 +68,18 @@ def rebuild(description: Mapping[str, Any], kind: type) -> Any:
 
 
 def write(path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Write a header and arrays completely or not at all."""
+    """Write a header and arrays as .npz, completely or not at all."""
+    _write(path, lambda file: _put(file, header, arrays))
+
+
+def _write(path: str | PathLike[str], put: Callable[[Any], Any]) -> None:
+    """Let ``put`` write a file that is complete or absent."""
     target = os.path.abspath(os.fspath(path))
     name = os.path.join(os.path.dirname(target), f".driftfit-{secrets.token_hex(8)}")
     file = open(name, "xb")  # noqa: SIM115  (with the rights of any new file, unlike one of tempfile)
     try:
         with file:
-            _put(file, header, arrays)
+            put(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(name, target)
@@ -75,17 +99,54 @@ def _put(file: Any, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> N
     np.savez(file, header=np.array(text), **cast(Any, dict(arrays)))
 
 
+def compact(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
+    """A header and arrays as bytes."""
+    little = {name: array.astype(array.dtype.newbyteorder("<"), copy=False) for name, array in arrays.items()}
+    described = [[name, array.dtype.str, array.shape] for name, array in little.items()]
+    text = json.dumps({**header, "arrays": described}, default=_encode, separators=(",", ":")).encode()
+    body = b"".join([text, *(array.tobytes() for array in little.values())])
+    return HEAD.pack(MAGIC, COMPACT, 0, zlib.crc32(body, zlib.crc32(_length(text))), len(text)) + body
+
+
+def _length(text: bytes) -> bytes:
+    return len(text).to_bytes(4, "little")
+
+
+def _expand(data: bytes) -> tuple[dict[str, Any], dict[str, Array]]:
+    """The inverse of `compact`; ValueError if it is damaged."""
+    _, version, unused, check, length = HEAD.unpack_from(data)
+    if version <= COMPACT and (zlib.crc32(data[CHECKED:]) != check or version < COMPACT or unused):
+        raise ValueError("its check sum does not fit its content")
+    if version > COMPACT:
+        return {"format": version}, {}
+    header = json.loads(data[HEAD.size : HEAD.size + length], object_hook=_decode)
+    arrays, at = {}, HEAD.size + length
+    for name, kind, shape in header.pop("arrays"):
+        array = np.frombuffer(data, kind, math.prod(shape), at)
+        arrays[name] = array.astype(array.dtype.newbyteorder("="), copy=False).reshape(shape)
+        at += array.nbytes
+    return header, arrays
+
+
+def expand(data: bytes, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of bytes that hold one of the ``kinds``; ValueError where they do not."""
+    return _take(BytesIO(data), "what was given", kinds)
+
+
 def _take(file: Any, name: str, kinds: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
+        data, reads = file.read(), COMPACT
+        if data.startswith(MAGIC):
+            header, arrays = _expand(data)
+        else:
+            reads = FORMAT
+            with np.load(BytesIO(data), allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            header = dict(json.loads(str(arrays.pop("header")), object_hook=_decode))
     except Exception as error:  # zipfile, NumPy and JSON raise a dozen kinds of errors for damaged files
         raise ValueError(f"{name} is not a driftfit file, or it is damaged ({error}).") from None
-    if header.get("format", 0) > FORMAT:
-        raise ValueError(
-            f"{name} was written by a newer driftfit (format {header['format']}); this one reads {FORMAT}."
-        )
+    if header.get("format", 0) > reads:
+        raise ValueError(f"{name} was written by a newer driftfit (format {header['format']}); this one reads {reads}.")
     if header.get("kind") not in kinds:
         raise ValueError(f"{name} holds a {header.get('kind')}, not a {' or a '.join(kinds)}.")
     return header, arrays
@@ -107,11 +168,11 @@ class Kept(ABC):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write model, settings and state to one file without pickle, completely or not at all."""
-        write(path, *self._written())
+        _write(path, lambda file: file.write(self.to_bytes()))
 
     @classmethod
     def _kinds(cls) -> Mapping[str, type[Kept]]:
-        """What `load` understands: the class that each kind of file becomes."""
+        """Classes that `load` accepts: the class that each kind of file becomes."""
         return {cls._kind: cls}
 
     @classmethod
@@ -122,19 +183,17 @@ class Kept(ABC):
 
     def to_bytes(self) -> bytes:
         """The content of a saved file as bytes, for a queue or a database."""
-        file = BytesIO()
-        _put(file, *self._written())
-        return file.getvalue()
+        return compact(*self._written())
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Any:
         """The inverse of `to_bytes`."""
-        header, arrays = _take(BytesIO(data), "what was given", list(cls._kinds()))
+        header, arrays = expand(data, list(cls._kinds()))
         return cls._kinds()[header["kind"]]._read("what was given", header, arrays)
 
 
 def _encode(value: Any) -> Any:
-    """Encode what JSON does not support: times and intervals."""
+    """Encode values that JSON does not support: times and intervals."""
     if isinstance(value, datetime):
         return {"datetime": value.isoformat()}
     if isinstance(value, timedelta):

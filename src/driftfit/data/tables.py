@@ -31,7 +31,8 @@ def read_records(
     ------
     ValueError
         For a column that does not exist (with near matches), a cell that is not a number (with row and value), a file
-        that cannot be read, or a table without a usable row.
+        that cannot be read, or a single series without a usable row. Where there are units, those without one have a
+        reason, and there may be none with one.
     """
     inputs, weights, drift, time = _names("u", u), reading.weights, reading.drift, reading.time
     axis = None if time is None else _name("time", time)
@@ -45,8 +46,8 @@ def read_records(
     length = np.bincount(code[order], minlength=len(keys))
     failed |= {keys[k]: "no row has a time" for k in np.flatnonzero(length == 0)}
     there = np.flatnonzero(length)
-    if not there.size:
-        raise ValueError(f"there is nothing to track: the {columns.rows} rows have no unit or no time.")
+    if not there.size and not wanted.by:
+        raise ValueError(f"there is nothing to track: none of the {columns.rows} rows has a time.")
     first = (np.cumsum(length) - length)[there]
     values = {name: column[order] for name, column in columns.numbers.items()}
     clock = Clock.of(reading.dt, columns.zone)

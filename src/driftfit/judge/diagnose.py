@@ -24,7 +24,7 @@ record makes too tight are widened by three standard errors. Source: Mehra (1970
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -117,10 +117,13 @@ class Diagnosis(Printed):
         for sentence in self.sentences or ("Everything is within its limits.",):
             yield Text(f" {sentence}")
 
-    def plot(self) -> Figure:
-        """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page."""
+    def plot(self, ax: Any = None) -> Figure:
+        """Innovations, their correlations, level, distribution; excitation; paths of the estimates: one page.
+
+        ``ax`` as for `Track.plot`.
+        """
         parts = (self.run, self.z, self.white, self.excited, self.constant, self.rows)
-        return draw_diagnosis(Health(*parts, lambda name: self[name].ok))
+        return draw_diagnosis(Health(*parts, lambda name: self[name].ok), ax)
 
 
 def diagnose(run: Track) -> Diagnosis:
@@ -154,7 +157,7 @@ def _whiteness(white: Whiteness) -> Check:
     )
     advice = (
         f"The innovations are correlated ({first:.2f} at the first lag, {sign}): the model leaves something "
-        f"predictable. Try {hint}."
+        f"predictable. Try {hint}; if they stay correlated, the noise is coloured: use ARMAX, OE or BoxJenkins."
     )
     return Check("whiteness (p)", white.p, 0.01, np.inf, advice)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -15,7 +15,7 @@ from driftfit.judge.statistics.constancy import Constancy
 from driftfit.judge.statistics.whiteness import Whiteness
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, new_figure, time_label
+from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +25,9 @@ COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d
 
 
 class Health(NamedTuple):
-    """What a diagnosis looked at; ``fine`` says whether a check, by its name, is within its limits."""
+    """The quantities that a diagnosis examines; ``fine`` maps the names of checks to whether they are within their
+    limits.
+    """
 
     run: Track
     z: Array
@@ -36,21 +38,14 @@ class Health(NamedTuple):
     fine: Callable[[str], bool]
 
 
-def draw_diagnosis(said: Health) -> Figure:
+def draw_diagnosis(said: Health, ax: Any = None) -> Figure:
     """Six plots on one page."""
-    figure = new_figure(11.0, 8.2)
-    axes = figure.subplots(3, 2)
-    _innovations(axes[0, 0], said)
-    _correlations(axes[0, 1], said)
-    _levels(axes[1, 0], said)
-    _quantiles(axes[1, 1], said)
-    _excitation(axes[2, 0], said)
-    _paths(axes[2, 1], said)
-    for axis in axes[:, 0]:
+    figure, axes = panels(ax, (11.0, 8.2), 6, 2)
+    for draw, axis in zip((_innovations, _correlations, _levels, _quantiles, _excitation, _paths), axes, strict=True):
+        draw(axis, said)
+    for axis in (*axes[::2], axes[5]):
         axis.set_xlabel(time_label(said.run))
         date_axis(axis, said.run)
-    date_axis(axes[2, 1], said.run)
-    axes[2, 1].set_xlabel(time_label(said.run))
     return figure
 
 
@@ -131,12 +126,12 @@ def _paths(axis: Axes, said: Health) -> None:
 
 
 def plot_alarms(
-    run: Track, rule: AlarmRule, statistic: Array, active: Array, start: int, labels: Array | None = None
-) -> Figure:
+    run: Track, rule: AlarmRule, statistic: Array, active: Array, start: int, labels: Array | None = None,
+    ax: Any = None,
+) -> Figure:  # fmt: skip
     """The output, and each statistic over its limit (probabilities unscaled), with alarms and labels shaded."""
     c = len(rule.names)
-    figure = new_figure(9.5, 1.5 * c + 2.0)
-    axes = figure.subplots(c + 1, 1, sharex=True)
+    figure, axes = panels(ax, (9.5, 1.5 * c + 2.0), c + 1, sharex=True)
     axes[0].plot(run.time, run.y, color=BLUE, lw=0.8)
     axes[0].set_ylabel(run.labels.y)
     for j, (axis, name) in enumerate(zip(axes[1:], rule.names, strict=True)):
@@ -168,13 +163,12 @@ def plot_alarms(
     return figure
 
 
-def plot_selection(names: Sequence[str], below: Array, std: Array, terms: Sequence[Array]) -> Figure:
+def plot_selection(names: Sequence[str], below: Array, std: Array, terms: Sequence[Array], ax: Any = None) -> Figure:
     """Distances from the best with standard errors, and the losses of the leading structures over time.
 
     Structures are in order, the best first; ``terms`` are the log-likelihoods of each sample under the first of them.
     """
-    figure = new_figure(11.0, max(3.2, 0.27 * len(names) + 1.2))
-    table, loss = figure.subplots(1, 2, width_ratios=[1.1, 1.0])
+    figure, (table, loss) = panels(ax, (11.0, max(3.2, 0.27 * len(names) + 1.2)), 2, 2)
     place = np.arange(len(names))
     table.errorbar(-below, place, xerr=std, fmt="o", ms=4, color=BLUE, lw=1)
     table.set_yticks(place, [name if len(name) < 60 else f"{name[:57]}..." for name in names], fontsize=7)

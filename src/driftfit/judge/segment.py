@@ -32,14 +32,16 @@ from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import regressors
-from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.segments.joint import jointly
+from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
-from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
+from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
 from driftfit.judge.statistics.robust import orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.run.track import track
+from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, panels, time_label
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.rls import RLS
 
@@ -48,7 +50,6 @@ if TYPE_CHECKING:
 
 CELLS = 2000
 """Largest number of positions for breaks that are compared at once."""
-SWEEPS = 10
 
 
 class Break(NamedTuple):
@@ -128,30 +129,29 @@ class Segmentation(Printed):
     def _sample(self, time: Any) -> int:
         return int(np.searchsorted(self.run.time, time))
 
-    def plot(self) -> Figure:
-        """Parameters of the segments with two standard errors, and the intervals of the dates; a matplotlib figure."""
-        import matplotlib.pyplot as plt
+    def plot(self, ax: Any = None) -> Figure:
+        """Parameters of the segments with two standard errors, and the intervals of the dates; a matplotlib figure.
 
-        names, time = self.run.model.names, self.run.time
-        figure: Figure
-        figure, axes = plt.subplots(
-            len(names) + 1, 1, sharex=True, figsize=(8.0, 2.0 * len(names) + 2.0), squeeze=False
-        )
-        axes[0, 0].plot(time, self.run.y, ".", ms=2, color="0.5")
-        axes[0, 0].set_ylabel("y")
-        for i, name in enumerate(names):
-            panel = axes[i + 1, 0]
+        ``ax`` as for `Track.plot`.
+        """
+        run = self.run
+        names, time = run.model.names, run.time
+        figure, axes = panels(ax, (8.0, 2.0 * len(names) + 2.0), len(names) + 1, sharex=True)
+        axes[0].plot(time, run.y, ".", ms=2, color=GREY)
+        axes[0].set_ylabel(run.labels.y)
+        for i, (panel, name) in enumerate(zip(axes[1:], names, strict=True)):
             for part in self.segments:
                 span, value, width = time[[part.start, part.stop - 1]], part.theta[i], 2.0 * part.std[i]
-                panel.plot(span, [value, value], color="C0")
-                panel.fill_between(span, value - width, value + width, color="C0", alpha=0.25, lw=0)
+                panel.plot(span, [value, value], color=BLUE)
+                panel.fill_between(span, value - width, value + width, color=BLUE, alpha=0.25, lw=0)
             panel.set_ylabel(name)
-        for panel in axes[:, 0]:
+        for panel in axes:
             for one in self.breaks:
-                panel.axvspan(one.first, one.last, color="C3", alpha=0.2, lw=0)
-                panel.axvline(one.date, color="C3", lw=0.8)
-        figure.align_ylabels()
-        figure.tight_layout()
+                panel.axvspan(one.first, one.last, color=RED, alpha=0.2, lw=0)
+                panel.axvline(one.date, color=RED, lw=0.8)
+        axes[-1].set_xlabel(time_label(run))
+        date_axis(axes[-1], run)
+        figure.align_ylabels(axes)
         return figure
 
 
@@ -212,11 +212,12 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     if not fit.scale > 1e-10 * np.sqrt(np.mean(rows.y**2)):
         return _undivided(run, rows.phi, rows.y, level)
     Q = orthonormal(rows.phi / size)[0]
-    found = noise(Q, fit.residual, CELLS, least, quiet=false)
+    search, found, starts = begun(Q, fit.residual, CELLS, least, quiet=false)
+    found = jointly(search, found, starts, false)
     # a value limited by the fit still supports one side; without its row it does not
     used = np.abs(found.near) <= HELD * found.level
     X, z = Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
-    breaks, spans = _dated(X / found.white, z / found.white, found, least, level)
+    breaks, spans = dated(X / found.white, z / found.white, found.ar, found.breaks.tolist(), least, level)
     at = [int(rows.at[b]) for b in breaks]
     time = run.time
     edges = [0, *breaks, N]
@@ -225,37 +226,23 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
         Segment(limits[k], limits[k + 1], *_fitted(rows.phi[a:b], rows.y[a:b], found, a, b))
         for k, (a, b) in enumerate(pairwise(edges))
     )
-    dated = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
+    said = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
     spread = float(np.median(found.level))
-    return Segmentation(dated, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
-
-
-def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[list[int], list[tuple[int, int]]]:
-    """The most likely dates, each between its neighbours until all are stable, and their intervals."""
-    breaks, N = [int(b) for b in found.breaks], len(z)
-    spans = [(b, b) for b in breaks]
-    p = len(found.ar)
-    for _ in range(SWEEPS):
-        before = list(breaks)
-        for k, _b in enumerate(breaks):
-            a, b = ([0, *breaks][k], [*breaks, N][k + 1])
-            low, high = min(max(least // 2, p + 1), (b - a) // 3), max((b - a) - least // 2, (b - a) * 2 // 3)
-            loglik = date_loglik(X[a:b], z[a:b], found.ar, low, high)
-            breaks[k] = a + low + int(np.argmax(loglik))
-            first, last = smallest(loglik, level)
-            spans[k] = (a + low + first, a + low + last)
-        if breaks == before:
-            break
-    return breaks, spans
+    return Segmentation(said, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
 
 
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:
-    """theta and its standard errors, Huber's for noise that is white after whitening."""
-    c = found.level[a:b]
+    """theta and its standard errors, Huber's for noise that is white after whitening.
+
+    A segment too short for that has plain least squares, and errors that are not known.
+    """
+    c, n = found.level[a:b], phi.shape[1]
+    if b - a - len(found.ar) <= n:
+        return np.linalg.lstsq(phi / c[:, None], y / c, rcond=None)[0], np.full(n, np.nan)
     X, z = whitened(phi / c[:, None], y / c, found.ar)
     X, z = X[len(found.ar) :], z[len(found.ar) :]
     fit = robust_fit(X, z)
-    N, n = X.shape
+    N = len(X)
     variance = float(fit.psi @ fit.psi) / max(N - n, 1) / max(float(np.mean(fit.inside)), 0.1) ** 2
     return fit.theta, np.sqrt(np.maximum(variance * np.diag(np.linalg.pinv(X.T @ X)), 0.0))
 

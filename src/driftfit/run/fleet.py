@@ -8,17 +8,19 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from driftfit.data.record import Records
-from driftfit.run.lanes import run_lanes
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
+from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
-from driftfit.run.warm_start import Run, carried, first_interval
+from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
-class Fleet(Many):
+class Fleet(KeyedResults):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
@@ -57,6 +59,13 @@ class Fleet(Many):
     def series(self) -> dict[Hashable, Track | Outputs | Shared]:
         """Every record by the key of its series, with all its outputs."""
         return {key: self._whole(k) for key, k in self._series.items()}
+
+    def states(self) -> dict[Hashable, bytes]:
+        """Where every series ended, as bytes that continue it: ``track(..., by=.., warm_start=fleet.states())``.
+
+        Each is what `driftfit.Live.from_bytes` reads, too.
+        """
+        return {key: run.end().to_bytes() for key, run in self.series().items()}
 
     def _whole(self, k: int) -> Track | Outputs | Shared:
         """The record of series k."""
@@ -101,15 +110,18 @@ def run_fleet(
     records: Records,
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
-    before: Mapping[Hashable, Run] | None = None,
+    before: Mapping[Hashable, Run | bytes] | None = None,
+    dtype: Any = np.float64,
 ) -> Fleet:
     """Run every series by its programs (one for each output) and return the results; all have one bound model.
 
     ``failed`` gives the reasons why units did not become series, ``before`` the earlier runs that series continue. An
     interrupt (Ctrl-C) stops the fleet and returns what is finished, with a warning.
     """
+    if not records.keys:
+        return Fleet(programs, records, [], failed or {}, {})
     starts, records = _begun(programs, records, before or {})
-    lanes = run_lanes(programs, records, keep, starts)
+    lanes = run_lanes(programs, records, keep, starts, dtype)
     series = lanes[:: records.ny]
     absent = {key: "interrupted before it was run" for key, lane in zip(records.keys, series, strict=True) if not lane}
     if absent:
@@ -122,7 +134,7 @@ def run_fleet(
 
 
 def _begun(
-    programs: Sequence[Program], records: Records, before: Mapping[Hashable, Run]
+    programs: Sequence[Program], records: Records, before: Mapping[Hashable, Run | bytes]
 ) -> tuple[dict[int, State], Records]:
     """(fields that lanes take over, by their number; the records with the intervals since the earlier runs)."""
     starts: dict[int, State] = {}
@@ -130,7 +142,7 @@ def _begun(
     ny = records.ny
     for k, key in enumerate(records.keys):
         if key in before:
-            run, first, lanes = before[key], int(records.first[k]), range(k * ny, (k + 1) * ny)
+            run, first, lanes = ended(before[key]), int(records.first[k]), range(k * ny, (k + 1) * ny)
             starts |= zip(lanes, carried(run, [programs[j] for j in lanes]), strict=True)
             if records.time is not None:
                 factors[first] = first_interval(run, records.time[first], records.labels)

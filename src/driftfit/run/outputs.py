@@ -23,14 +23,14 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.many import Many
-from driftfit.run.program import Program, lanes_of, shown, state_of, tile_of
+from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
 
-class Outputs(Many):
+class Outputs(KeyedResults):
     """A record with several outputs, each with its own theta.
 
     Attributes
@@ -145,9 +145,13 @@ class Outputs(Many):
     @cached_property
     def _collected(self) -> Array:
         """The samples as the tracker received them, with the regressors that all outputs share."""
-        steps = self._programs[0].steps._replace(store=collect)
+        return self.replayed(collect, COLLECTED)
+
+    def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
+        """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = np.empty(len(self), output_type(tile, COLLECTED))
+        out = np.empty(len(self), output_type(tile, fields))
+        steps = self._programs[0].steps._replace(store=store)
         self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
@@ -181,7 +185,7 @@ class Outputs(Many):
         own = [name for name, shape in shapes.items() if shape == state[name].shape]
         for name in own:
             tile[name][0, ..., 0] = state[name]
-        out = alone.written(tile, len(self), "cov" if "P" in names_of(lane.out) else "std")
+        out = alone.written(tile, len(self), *kept(lane.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = lane.written(name)
         start = {name: value for name, value in self._starts[j].items() if name in own} if self._starts else None
@@ -198,7 +202,8 @@ class Outputs(Many):
         """The end of the run, from which another one can continue (`warm_start`)."""
         lanes = [state_of(lane.tile, lane.lane) for lane in self._lanes if lane]
         states = tuple({name: value.copy() for name, value in lane.items()} for lane in lanes)
-        return End(self._programs, states, self.time[-1] if self.timed else None)
+        labels = self.labels
+        return End(self._programs, states, self.time[-1] if self.timed else None, dt=labels.dt, zone=labels.zone)
 
 
 def missing(name: str, output: str) -> str:

@@ -5,8 +5,10 @@ No other module makes tiles or drivers of a model and a tracker; a tile of sever
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,22 +18,40 @@ from rich.progress import Progress
 from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
-from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type
+from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type, repeat_tile
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
 CHUNK = 1_000_000
 """Samples between two updates of the progress bar."""
 
+BLOCK = 4096
+"""Samples of a block of results of which only a part is kept."""
+
+SHORT = 32
+"""Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
+
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
 
 
+@contextmanager
+def progress(what: str, total: int, shown: bool) -> Iterator[Callable[[int], None]]:
+    """A progress bar that is called with what has been done; making one that is not shown would take a millisecond."""
+    if not shown:
+        yield lambda count: None
+        return
+    with Progress(console=Console(stderr=True), transient=True) as display:
+        task = display.add_task(what, total=total)
+        yield lambda count: display.advance(task, count)
+
+
 @dataclass(frozen=True)
 class Program:
-    """A bound model and the tracker that estimates its parameters."""
+    """A bound model and the tracker that estimates its parameters; what follows from them is found once."""
 
     model: Model
     tracker: Tracker
@@ -40,12 +60,16 @@ class Program:
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
 
+    def __reduce__(self) -> Any:
+        """A copy, or a program sent to another process, consists of its fields."""
+        return Program, (self.model, self.tracker, self.output, self.shared)
+
     @property
     def whole(self) -> Model:
         """The model that the user gave, with all its outputs."""
         return self.model if self.shared is None else self.shared
 
-    @property
+    @cached_property
     def alone(self) -> Program | None:
         """The program of its output alone; None if the model needs the other outputs, or has none."""
         model = None if self.output is None else self.model.alone(self.output)
@@ -67,7 +91,7 @@ class Program:
         own = self.model if self.alone is None else self.alone.model
         return {**own.memory_for(self.steps.doubts), **self.tracker.state_for(own)}
 
-    @property
+    @cached_property
     def steps(self) -> TrackerSteps:
         """The compiled steps of the tracker."""
         return self.tracker.steps_for(self.model)
@@ -77,49 +101,153 @@ class Program:
         """Names and shapes of the tracker's state: programs with equal shapes and equal steps may share a tile."""
         return tuple((name, np.shape(value)) for name, value in self.tracker.state_for(self.model).items())
 
+    @cached_property
+    def _drivers(self) -> dict[tuple[str, TrackerSteps | None], Drivers]:
+        return {}
+
+    @cached_property
+    def _begin(self) -> Array:
+        """The tile of one lane at its start."""
+        return _started([self])
+
+    def schema(self, arrays: bool = False) -> dict[str, str]:
+        """Columns and types of the results at a sample, which `to_table` writes after the signals, before any data.
+
+        Types have the names of SQL: "double", "boolean", "array<double>" (with ``arrays``, theta and std of all
+        parameters).
+        """
+        own = {"prediction": "double", "innovation": "double", "innovation_std": "double", "ok": "boolean"}
+        if arrays:
+            return own | {"theta": "array<double>", "std": "array<double>"}
+        return own | {f"{what}_{name}": "double" for name in self.names for what in ("theta", "std")}
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where the fields of a lane are, and which of them a packed state holds."""
+        owner = {"model": storage.describe(self.model), "tracker": storage.describe(self.tracker)}
+        return Layout(self.tile().dtype, self.tracker.scratch, owner | {"output": self.output})
+
+    def pack(self, tile: Array, lane: int = 0) -> bytes:
+        """The state of a lane as bytes (`driftfit.run.states.layout`)."""
+        return self.layout.pack(words_of(tile)[self.layout.held, lane])
+
+    def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
+        """A tile of one lane, or a lane of the given tile, with the state that `pack` wrote; microseconds.
+
+        Raises
+        ------
+        ValueError
+            For bytes that are damaged, or the state of another model, tracker, setting or layout.
+        """
+        into = self.tile() if tile is None else tile
+        self.layout.put(into, lane, self.layout.unpack(data))
+        return into
+
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
-        return drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
+        keep = "std" if keep == "theta" else keep
+        found = self._drivers.get((keep, steps))
+        if found is None:
+            found = drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
+            self._drivers[keep, steps] = found
+        return found
 
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
-        return tile_of([self], () if state is None else (state,))
+        tile = repeat_tile(self._begin, 1)
+        if state is not None:
+            put(tile, 0, state)
+        return tile
 
     def resting(self, state: State) -> Array:
         """A tile with the state of a run, without the known factors of its last sample."""
         return self.tile({name: value for name, value in state.items() if name not in STANDING})
 
-    def written(self, tile: Array, T: int, keep: str = "std") -> Array:
-        """An array for the driver's output of T samples of a tile."""
-        return np.empty(T, output_type(tile, self.tracker.outputs, keep))
+    def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
+        """An array for the results of T samples of a tile."""
+        return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
 
-    def run(self, tile: Array, record: Record, keep: str = "std") -> Array:
-        """Run a tile over a record, a lane for each output; returns the driver's output, (T,) of `output_type`."""
+    def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
+        """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
         T = len(record)
-        out = self.written(tile, T, keep)
-        with Progress(console=Console(stderr=True), transient=True, disable=T <= CHUNK) as progress:
-            task = progress.add_task("tracking", total=T)
+        out = self.written(tile, T, keep, dtype)
+        if T <= CHUNK:
+            self.fill(tile, *lanes_of(record), out)
+            return out
+        with progress("tracking", T, True) as advance:
             for a in range(0, T, CHUNK):
-                b = min(a + CHUNK, T)
-                self.drivers(keep).run(tile, *lanes_of(record.part(slice(a, b))), out[a:b])
-                progress.advance(task, b - a)
+                part = slice(a, min(a + CHUNK, T))
+                self.fill(tile, *lanes_of(record.part(part)), out[part])
+                advance(part.stop - a)
         return out
 
+    def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        """Run a tile over samples. What is not kept of their results is written to a block that stays in the cache."""
+        keep, _ = kept(out.dtype)
+        run, rows = self.drivers(keep).run, output_type(tile, self.tracker.outputs, "std" if keep == "theta" else keep)
+        if out.dtype == rows:
+            run(tile, y, u, known, out)
+            return
+        block = np.empty(min(BLOCK, len(out)), rows)
+        for a in range(0, len(out), BLOCK):
+            part = slice(a, min(a + BLOCK, len(out)))
+            results = block[: part.stop - a]
+            run(tile, y[part], u[part], known if len(known) == 1 else known[part], results)
+            _copy(results, out[part])
 
-STANDING = ("interval", "noise", "drift", "each")
+
+def _copy(results: Array, out: Array) -> None:
+    """Store what ``out`` keeps of results, all at once where it keeps all."""
+    T, names = len(out), out.dtype.names or ()
+    if names == results.dtype.names and all(results.dtype[name].base == np.float64 for name in names):
+        out.view(out.dtype[names[0]].base).reshape(T, -1)[...] = results.view(np.float64).reshape(T, -1)
+        return
+    for name in names:
+        into, given = out[name].reshape(T, -1), results[name].reshape(T, -1)
+        if into.shape[1] >= SHORT:
+            into[...] = given
+            continue
+        for k in range(into.shape[1]):
+            into[:, k] = given[:, k]
+
+
+def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
+    """(what is kept, in which precision) in rows of results."""
+    names = rows.names or ()
+    return "cov" if "P" in names else "std" if "var" in names else "theta", rows["theta"].base
+
+
+STANDING = ("interval", "noise", "drift", "drift_root")
 """Fields with the known factors of one sample."""
 
 
 def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
     """A tile with a lane for each program (all of one model), at its start or with the given fields."""
+    if len(programs) == 1:
+        return programs[0].tile(*states)
+    tile = _started(programs)
+    for lane, state in enumerate(states):
+        put(tile, lane, state)
+    return tile
+
+
+def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
     memory = model.memory_for(programs[0].steps.doubts)
-    tile = make_tile(model.n, model.m, memory, [starts[one] for one in programs])
-    for lane, state in enumerate(states):
-        for name, value in state.items():
-            tile[name][0, ..., lane] = value
-    return tile
+    tracker = programs[0].tracker
+    if both := sorted((set(memory) & set(starts[programs[0]])) - set(tracker.replaces)):
+        raise ValueError(
+            f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "
+            "which would be one and the same; rename it in one of them, or list it in the tracker's `replaces`."
+        )
+    return make_tile(model.n, model.m, memory, [starts[one] for one in programs])
+
+
+def put(tile: Array, lane: int, state: State) -> None:
+    """Write fields of a lane."""
+    for name, value in state.items():
+        tile[name][0, ..., lane] = value
 
 
 def lanes_of(record: Record) -> tuple[Array, Array, Array]:
@@ -154,7 +282,7 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
     if len(model.outputs) == 1:
         if not isinstance(tracker, Tracker):
             raise ValueError(f"a model with one output takes one tracker for each series; got {tracker!r}.")
-        return (Program(model.bind(inputs), check_ready(tracker)),)
+        return _programs(model, tracker, inputs if isinstance(inputs, int) else tuple(inputs))
     if isinstance(tracker, Mapping) and not model.shared:
         if set(tracker) != set(model.outputs):
             raise ValueError(
@@ -175,6 +303,12 @@ def programs_of(model: Model, tracker: Any, inputs: int | Sequence[str]) -> tupl
     if len({one.steps for one in programs}) > 1 or len({one.shapes for one in programs}) > 1:
         raise ValueError(f"the trackers of several outputs must be of one kind and form; got {shown(trackers)}.")
     return programs
+
+
+@lru_cache(maxsize=64)
+def _programs(model: Model, tracker: Tracker, inputs: int | tuple[str, ...]) -> tuple[Program, ...]:
+    """Kept for the next record: settings are equal by value."""
+    return (Program(model.bind(inputs), check_ready(tracker)),)
 
 
 def _row_model(model: Model, tracker: Tracker, inputs: int | Sequence[str]) -> Model:

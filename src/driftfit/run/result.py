@@ -16,10 +16,11 @@ from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.conformal import quantile, widened
-from driftfit.run.program import Program, State, lanes_of, state_of
+from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.student import log_student, residuals_before
 
 
 class Lane(NamedTuple):
@@ -39,7 +40,7 @@ class Lane(NamedTuple):
         if self.tile["theta"].shape[-1] == 1:
             return self
         tile = program.tile(state_of(self.tile, self.lane))
-        out = program.written(tile, len(self.out), "cov" if "P" in names_of(self.out) else "std")
+        out = program.written(tile, len(self.out), *kept(self.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = self.written(name)
         return Lane(out, tile)
@@ -117,9 +118,26 @@ class Track(Plain):
         """The state after the last sample, field by field; these are views and must not be written to."""
         return state_of(self._lane.tile, self._lane.lane)
 
+    @property
+    def undetermined(self) -> Array:
+        """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""
+        var: Array = self._lane.tile["var"][0, :, self._lane.lane]
+        return np.isinf(var)
+
     def written(self, name: str) -> Array:
-        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example."""
-        return self._lane.written(name)
+        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example.
+
+        Replays the record, once, if only theta was kept.
+        """
+        return (self._lane if name in self.stores() else self._complete).written(name)
+
+    @cached_property
+    def _complete(self) -> Lane:
+        """The results with everything that ``keep="std"`` stores."""
+        if kept(self._lane.out.dtype)[0] != "theta":
+            return self._lane
+        tile = self.fresh()
+        return Lane(self.program.run(tile, self.record), tile)
 
     def stores(self) -> tuple[str, ...]:
         """Names of these fields."""
@@ -204,15 +222,21 @@ class Track(Plain):
     def log_density(self) -> Array:
         """(T,): log density of each used sample given earlier ones, NaN where there is none.
 
-        It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s); for a tracker that weighs hypotheses it
-        is that of their mixture. A model whose innovation is not that of y adds its log Jacobian.
+        It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s), or Student's if the tracker estimates
+        the noise variance (`driftfit.trackers.parts.student`); for a tracker that weighs hypotheses it is that of their
+        mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
-        s = self.innovation_var
+        s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))
         counted = self.ok & np.isfinite(s) & (s > 0.0)
-        own = self.tracker.log_density(self._lane.out)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            gaussian = -0.5 * (np.log(2.0 * np.pi * s) + self.innovation**2 / s)
-        terms = np.where(counted, gaussian if own is None else own[:, self._lane.lane], np.nan)
+        own = self.tracker.log_density(self._complete.out)
+        if own is not None:
+            terms = own[:, self._complete.lane]
+        elif self.tracker.learns_noise:
+            terms = log_student(e, s, residuals_before(self.ok, s, float((self.start or {}).get("count", 0.0))))
+        else:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                terms = -0.5 * (np.log(2.0 * np.pi * s) + e**2 / s)
+        terms = np.where(counted, terms, np.nan)
         if self.model.implicit and not self.tracker.output_error:
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
@@ -279,7 +303,8 @@ class Track(Plain):
 
     def end(self) -> End:
         """The end of the run, from which another one can continue (`warm_start`)."""
-        return End((self.program,), ({name: value.copy() for name, value in self.state.items()},), self.last)
+        state = {name: value.copy() for name, value in self.state.items()}
+        return End((self.program,), (state,), self.last, dt=self.labels.dt, zone=self.labels.zone)
 
     def polynomials(self) -> tuple[Array, list[Array]]:
         """A(z) and B(z) of an ARX model in powers of z^-1, (T, .) each; see `ARX.polynomials`."""
@@ -296,7 +321,7 @@ class Track(Plain):
             "model": storage.describe(self.model),
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
-            "keep": "cov" if self.keeps_cov else "std",
+            "keep": kept(self._lane.out.dtype)[0],
         }
         arrays = {"y": self.y, "u": self.u, "known": self.known.columns}
         if self.record.time is not None:
@@ -324,7 +349,7 @@ class Track(Plain):
         )
         tile = program.tile()
         storage.restore(path, program.tracker, arrays, "state_", state_of(tile))
-        out = program.written(tile, len(record), header["keep"])
+        out = program.written(tile, len(record), header["keep"], arrays["out_theta"].dtype)
         storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
         start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
         return cls(program, record, Lane(out, tile), start or None)

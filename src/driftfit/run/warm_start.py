@@ -7,43 +7,140 @@ value, for example a larger q.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from driftfit.data import storage
 from driftfit.data.clock import Clock, instant
 from driftfit.data.record import Labels
-from driftfit.run.program import Program, State
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import warn
+from driftfit.models.base import Model
+from driftfit.run.program import Program, State, programs_of, state_of, tile_of
+from driftfit.run.states.layout import fields_of, unpacked
+from driftfit.trackers.base import Tracker
 
-_LEFT = ("interval", "noise", "drift", "each", "F")
+_LEFT = ("interval", "noise", "drift", "drift_root", "F")
 """Fields that are not carried over: an operator's settings of the stream, and the diffuse likelihood of that run."""
+
+
+KINDS = ("state", "outputs")
+"""Kinds of files that hold the state of one output, or of several."""
 
 
 class End(NamedTuple):
     """Where a run ended, lane by lane (one for a single output): its programs, their states, and its last time.
 
-    ``awaits`` says whether a stream still expects the input of that sample (`driftfit.run.live.late_input`).
+    ``awaits`` says whether a stream still expects the input of that sample (`driftfit.run.live.late_input`); ``dt`` and
+    ``zone`` are those of its clock.
     """
 
     programs: tuple[Program, ...]
     states: tuple[State, ...]
     last: Any
     awaits: int = 0
+    dt: Any = None
+    zone: str | None = None
+
+    def end(self) -> End:
+        """Itself: a run continues from it."""
+        return self
+
+    def to_bytes(self) -> bytes:
+        """What `Live.from_bytes` and ``warm_start=`` continue from: a few hundred bytes beside the state itself."""
+        lanes = [one.pack(one.tile(state)) for one, state in zip(self.programs, self.states, strict=True)]
+        extra = {"last": self.last, "awaits": self.awaits, "dt": self.dt, "zone": self.zone}
+        return storage.compact(*written(self.programs, lanes, extra))
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> End:
+        """From the bytes of an end or of a stream (``live.to_bytes()``); ValueError if they are damaged or foreign."""
+        header, arrays = storage.expand(data, KINDS)
+        model, trackers, extra = read(header)
+        programs = programs_of(model, by_output(model, trackers), model.m)
+        tile = tile_of(programs)
+        restore("what was given", programs, header, arrays, tile)
+        states = tuple(state_of(tile, lane) for lane in range(len(programs)))
+        return cls(programs, states, *(extra[name] for name in ("last", "awaits", "dt", "zone")))
+
+
+UNSAID: Mapping[str, Any] = {
+    "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
+    "windows": (), "alarms": (),
+}  # fmt: skip
+"""Values that are not written for a stream, because they are the default."""
+
+
+def written(
+    programs: Sequence[Program], lanes: Sequence[bytes], extra: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Header and arrays of a file: the packed states of all lanes, and the other facts about the stream."""
+    described = [storage.describe(one.tracker) for one in programs]
+    model = programs[0].whole
+    header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
+    header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
+    header |= {"extra": {name: value for name, value in extra.items() if value != UNSAID[name]}}
+    return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
+
+
+def read(header: Mapping[str, Any]) -> tuple[Model, tuple[Tracker, ...], dict[str, Any]]:
+    """(the model, the tracker of each output, everything else) from a header that `written` made."""
+    given = header["tracker"]
+    trackers = tuple(storage.rebuild(one, Tracker) for one in (given if isinstance(given, list) else [given]))
+    return storage.rebuild(header["model"], Model), trackers, {**UNSAID, **header["extra"]}
+
+
+def by_output(model: Model, trackers: Sequence[Tracker]) -> Any:
+    """One tracker, or the tracker of each output by its name."""
+    return trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
+
+
+def restore(
+    source: str, programs: Sequence[Program], header: Mapping[str, Any], arrays: Mapping[str, Array], tile: Array
+) -> None:
+    """Set the lanes of a tile to the states of a file; ``source`` is named in errors.
+
+    States of a version with other fields are matched by the names of their fields, with a warning. ValueError if a
+    field has another shape, or if there is no theta.
+    """
+    for lane, program in enumerate(programs):
+        packed = arrays[f"state{lane}"].tobytes()
+        if header["fields"] == program.layout.text:
+            program.unpack(packed, tile, lane)
+            continue
+        stored, now = fields_of(header["fields"], unpacked(packed)[1]), state_of(tile, lane)
+        wrong = [name for name in now if name in stored and stored[name].shape != now[name].shape]
+        if wrong or "theta" not in stored:
+            raise ValueError(
+                f"{source} does not fit {type(program.tracker).__name__} in this version: field "
+                f"{(*wrong, 'theta')[0]!r}."
+            )
+        new = ", ".join(sorted(program.layout.shapes.keys() - stored.keys())) or "nothing"
+        gone = ", ".join(sorted(stored.keys() - now.keys())) or "nothing"
+        warn(f"{source} was written by another version: {new} begins as before the first sample, {gone} is left out.")
+        for name in now.keys() & stored.keys():
+            now[name][...] = stored[name]
 
 
 class Run(Protocol):
-    """What a warm start can begin from: a `Track`, a `Live`, or one of several outputs."""
+    """Runs from which a warm start can begin: a `Track`, a `Live`, or one of several outputs."""
 
     def end(self) -> End:
         """The end of the run."""
 
 
-def carried(run: Run | None, programs: Sequence[Program]) -> tuple[State, ...]:
-    """The fields that each lane takes over from a run before; ValueError where the two do not fit."""
+def ended(run: Run | bytes) -> End:
+    """The end of a run, or of that whose bytes are given."""
+    return End.from_bytes(run) if isinstance(run, bytes) else run.end()
+
+
+def carried(run: Run | bytes | None, programs: Sequence[Program]) -> tuple[State, ...]:
+    """The fields that each lane takes over from a run before; ValueError if the two do not fit."""
     if run is None:
         return ()
-    end = run.end()
+    end = ended(run)
     if len(end.programs) != len(programs):
         raise ValueError(f"warm_start: {run!r} is not a run of these outputs.")
     return tuple(_carried(*lane) for lane in zip(end.programs, end.states, programs, strict=True))
@@ -66,9 +163,9 @@ def _same(one: Any, other: Any) -> bool:
     return np.shape(one) == np.shape(other) and bool(np.all(np.equal(one, other) | (np.not_equal(one, one))))
 
 
-def first_interval(run: Run, time: Any, labels: Labels) -> float:
+def first_interval(run: Run | bytes, time: Any, labels: Labels) -> float:
     """Nominal intervals from the end of a run to the first sample of the next; 1 if either has no time."""
-    last = run.end().last
+    last = ended(run).last
     if last is None or time is None:
         return 1.0
     interval = Clock.of(labels.dt, labels.zone).since(instant(last), instant(time))

@@ -2,17 +2,17 @@
 
 One row per sample. The columns are those that identify the series of a fleet, the time (or the sample number), the
 signals under their own names, ``prediction``, ``innovation``, ``innovation_std``, ``ok``, and for every parameter
-``theta_<name>`` and ``std_<name>``. Units are stored where each format has room for them: ``attrs`` in pandas, the
-metadata of fields in pyarrow, the metadata of the file in Parquet.
+``theta_<name>`` and ``std_<name>``, or all in the array columns ``theta`` and ``std``. Units are stored where each
+format has room for them: ``attrs`` in pandas, the metadata of fields in pyarrow, the metadata of the file in Parquet.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -21,14 +21,14 @@ from driftfit.data.clock import Clock
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.run.fleet import Fleet
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
 
-Result = Track | Shared | Many
+Result = Track | Shared | KeyedResults
 Single = Track | Outputs | Shared
 """One record."""
 
@@ -36,15 +36,18 @@ ENDINGS = (".csv", ".parquet", ".npz")
 _OWN = ("prediction", "innovation", "innovation_std", "ok")
 
 
-def as_table(result: Result) -> pl.DataFrame:
-    """A result as a polars table."""
+def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
+    """A result as a polars table; with ``arrays`` all parameters of a sample are in one column."""
     records, keys = _records(result)
+    if not records:
+        assert isinstance(result, Fleet)
+        return _of_nothing(result, arrays)
     columns: dict[str, Any] = {}
     lengths = [len(one) for one in records]
     for place, name in enumerate(result.records.labels.by if isinstance(result, Fleet) else ()):
         values = [key[place] if isinstance(key, tuple) else key for key in keys]
         columns[name] = pl.Series(values).gather(np.repeat(np.arange(len(records)), lengths))
-    signals = [_of_track(one) if isinstance(one, Track) else _of_outputs(one) for one in records]
+    signals = [_of_track(one, arrays) if isinstance(one, Track) else _of_outputs(one, arrays) for one in records]
     for name in signals[0]:
         columns[name if name not in columns else f"{name}_"] = np.concatenate([part[name] for part in signals])
     table = pl.DataFrame(columns)
@@ -52,6 +55,47 @@ def as_table(result: Result) -> pl.DataFrame:
     if zone is not None:
         table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
     return table
+
+
+class Written(NamedTuple):
+    """Results that were written to Parquet: the folder, how many series and rows, and units without a result."""
+
+    path: Path
+    series: int
+    rows: int
+    failed: dict[Hashable, str]
+
+
+def write_parts(fleets: Iterator[Fleet], to: str | PathLike[str]) -> Written:
+    """Write the table of each fleet to a file of the folder ``to``, before the next is run; ValueError if it has any.
+
+    Each file is complete or absent.
+    """
+    folder, series, rows = Path(to), 0, 0
+    failed: dict[Hashable, str] = {}
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"track: to={str(to)!r} exists and is not empty; give a new folder.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, fleet in enumerate(fleets):
+        failed |= fleet.failed
+        if not len(fleet):
+            continue
+        table, file = as_table(fleet), folder / f"part-{k:06d}.parquet"
+        table.write_parquet(file.with_suffix(".partial"))
+        file.with_suffix(".partial").rename(file)
+        series, rows = series + len(fleet.series()), rows + len(table)
+    return Written(folder, series, rows, failed)
+
+
+def _of_nothing(fleet: Fleet, arrays: bool) -> pl.DataFrame:
+    """The table of a fleet in which no series has a result."""
+    given = fleet.labels
+    program = fleet.programs[0]
+    time = pl.Datetime("us", given.zone) if given.zone else pl.Float64
+    columns: dict[str, Any] = {**dict.fromkeys(given.by, pl.String), given.time or "sample": time}
+    columns |= {_free(name): pl.Float64 for name in (given.y, *given.u)}
+    kinds = {"double": pl.Float64, "boolean": pl.Boolean, "array<double>": pl.Array(pl.Float64, program.model.n)}
+    return pl.DataFrame(schema=columns | {name: kinds[kind] for name, kind in program.schema(arrays).items()})
 
 
 def _records(result: Result) -> tuple[list[Single], list[Any]]:
@@ -67,17 +111,27 @@ def _time_name(run: Single) -> str:
     return run.labels.time or ("time" if run.timed else "sample")
 
 
-def _of_track(run: Track) -> dict[str, Array]:
+def _of_track(run: Track, arrays: bool) -> dict[str, Array]:
     """The columns of a run, by name; a signal that is called like a result gets a trailing underscore."""
     columns = {_time_name(run): run.time, _free(run.labels.y): run.y}
     columns |= {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
     columns |= {name: getattr(run, name) for name in _OWN}
-    for i, name in enumerate(run.names):
-        columns |= {f"theta_{name}": run.theta[:, i], f"std_{name}": run.std[:, i]}
-    return columns
+    return columns | _parameters(run.names, run.theta, run.std, "" if arrays else None)
 
 
-def _of_outputs(run: Outputs | Shared) -> dict[str, Array]:
+def _parameters(names: Sequence[str], theta: Array, std: Array, of: str | None) -> dict[str, Array]:
+    """The columns of the parameters; ``of`` follows the names of array columns, None gives a column for each."""
+    if of is not None:
+        return {f"theta{of}": theta, f"std{of}": std}
+    each = [
+        (f"{what}_{name}", path[:, i])
+        for i, name in enumerate(names)
+        for what, path in (("theta", theta), ("std", std))
+    ]
+    return dict(each)
+
+
+def _of_outputs(run: Outputs | Shared, arrays: bool) -> dict[str, Array]:
     """The same of several outputs: each result with its output in brackets, inputs and parameters under their names."""
     columns: dict[str, Array] = {_time_name(run): run.time}
     for j, output in enumerate(run.outputs):
@@ -86,12 +140,12 @@ def _of_outputs(run: Outputs | Shared) -> dict[str, Array]:
     if isinstance(run, Outputs):
         inputs = {_free(name): run.u[:, j] for j, name in enumerate(_inputs(run))}
         columns |= {name: column for name, column in inputs.items() if name not in columns}
-        parts = [(names, run.theta[:, j], run.std[:, j]) for j, names in enumerate(run.names)]
+        each = zip(run.outputs, run.names, strict=True)
+        parts = [(names, run.theta[:, j], run.std[:, j], f"[{output}]") for j, (output, names) in enumerate(each)]
     else:
-        parts = [(run.names, run.theta, run.std)]
-    for names, theta, std in parts:
-        for i, name in enumerate(names):
-            columns |= {f"theta_{name}": theta[:, i], f"std_{name}": std[:, i]}
+        parts = [(run.names, run.theta, run.std, "")]
+    for names, theta, std, of in parts:
+        columns |= _parameters(names, theta, std, of if arrays else None)
     return columns
 
 
@@ -105,7 +159,9 @@ def _free(name: str) -> str:
 
 def units_of(result: Result) -> dict[str, str]:
     """Units of the columns of a result that have one."""
-    run = _records(result)[0][0]
+    if not (records := _records(result)[0]):
+        return {}
+    run = records[0]
     given = run.labels.units
     signals = (run.labels.y,) if isinstance(run, Track) else run.outputs
     units = {_free(name): given[name] for name in (*signals, *run.labels.u) if name in given}
@@ -159,10 +215,10 @@ def _columns(names: Sequence[str], y_hat: Array, y_std: Array, theta: Array, std
     return columns
 
 
-def to_table(result: Result, kind: str = "polars") -> Any:
+def to_table(result: Result, kind: str = "polars", arrays: bool = False) -> Any:
     """A result as a table of polars, pandas or pyarrow (each must be installed)."""
     one_of("to_table", "kind", kind, ("polars", "pandas", "pyarrow"))
-    table = as_table(result)
+    table = as_table(result, arrays)
     if kind == "polars":
         return table
     units = units_of(result)
@@ -172,7 +228,10 @@ def to_table(result: Result, kind: str = "polars") -> Any:
 def _to_pandas(table: pl.DataFrame, units: Mapping[str, str]) -> Any:
     import pandas as pd
 
-    frame = pd.DataFrame({name: table[name].to_numpy() for name in table.columns})
+    nested = [name for name, kind in table.schema.items() if kind.is_nested()]
+    frame = pd.DataFrame(
+        {name: table[name].to_list() if name in nested else table[name].to_numpy() for name in table.columns}
+    )
     for name, kind in table.schema.items():
         if isinstance(kind, pl.Datetime) and kind.time_zone is not None:  # numpy has no time zones: these times are UTC
             frame[name] = frame[name].dt.tz_localize("UTC").dt.tz_convert(kind.time_zone)

@@ -88,9 +88,9 @@ class Segments:
             columns |= {name: self.theta[:, i], f"std_{name}": self.std[:, i]}
         return pl.DataFrame(columns)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters of the segments with bands, over the tracked path."""
-        return plot_segments(self.run, self.bounds.tolist(), self.theta, self.std, level)
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters of the segments with bands, over the tracked path. ``ax`` as for `Track.plot`."""
+        return plot_segments(self.run, self.bounds.tolist(), self.theta, self.std, level, ax)
 
 
 def piecewise(run: Track, breaks: Any = None, r: float | None = None) -> Segments:

@@ -5,46 +5,42 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, date_axis, frame, new_figure, settled, time_label
+from driftfit.show.parts.axes import BLUE, GREY, date_axis, frame, panels, settled, time_label
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def plot_smoothed(run: Track, theta: Array, low: Array, high: Array) -> Figure:
+def plot_smoothed(run: Track, theta: Array, low: Array, high: Array, ax: Any = None) -> Figure:
     """Parameters with bands, smoothed over filtered."""
     n = len(run.names)
     columns = 1 if n <= 4 else 2 if n <= 12 else 4
     rows = -(-n // columns)
-    figure = new_figure(9.0, 1.7 * rows + 0.8)
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    figure, axes = panels(ax, (9.0, 1.7 * rows + 0.8), n, columns, sharex=True)
     for i, axis in enumerate(axes):
-        axis.set_visible(i < n)
-        if i < n:
-            known = np.isfinite(low[:, i]) & np.isfinite(high[:, i])
-            axis.fill_between(run.time, low[:, i], high[:, i], where=known, color=BLUE, alpha=0.2, lw=0)
-            axis.plot(run.time, theta[:, i], color=BLUE, lw=1.4, label="smoothed")
-            view = axis.get_ylim()
-            axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
-            axis.set_ylim(*view)
-            axis.set_ylabel(run.names[i])
-            axis.grid(alpha=0.25, lw=0.5)
+        known = np.isfinite(low[:, i]) & np.isfinite(high[:, i])
+        axis.fill_between(run.time, low[:, i], high[:, i], where=known, color=BLUE, alpha=0.2, lw=0)
+        axis.plot(run.time, theta[:, i], color=BLUE, lw=1.4, label="smoothed")
+        view = axis.get_ylim()
+        axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, zorder=1, label="filtered")
+        axis.set_ylim(*view)
+        axis.set_ylabel(run.names[i])
+        axis.grid(alpha=0.25, lw=0.5)
     axes[0].legend(loc="best", fontsize=8, ncols=2, frameon=False)
     axes[-1].set_xlabel("time" if run.timed else "sample")
     return figure
 
 
-def plot_segments(run: Track, bounds: Sequence[int], theta: Array, std: Array, level: float) -> Figure:
+def plot_segments(run: Track, bounds: Sequence[int], theta: Array, std: Array, level: float, ax: Any = None) -> Figure:
     """Constant parameters with bands, segment by segment, over the tracked path."""
     n = len(run.names)
-    figure = new_figure(9.0, 1.7 * n + 0.8)
-    axes = figure.subplots(n, 1, sharex=True, squeeze=False).ravel()
+    figure, axes = panels(ax, (9.0, 1.7 * n + 0.8), n, sharex=True)
     half = NormalDist().inv_cdf(0.5 + level / 2.0) * std
     for i, axis in enumerate(axes):
         axis.plot(run.time, run.theta[:, i], color=GREY, lw=0.8, label="tracked")

@@ -181,9 +181,9 @@ class Smoothed:
         """The path with its covariances; the problem is solved again unless they were kept."""
         return self._path if len(self._path.cov) else solve(self.walk, "cov", self.order_by)
 
-    def plot(self, level: float = 0.95) -> Figure:
-        """Parameters with bands, smoothed and filtered; a matplotlib figure."""
-        return plot_smoothed(self.run, self.theta, *self.band(level))
+    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
+        """Parameters with bands, smoothed and filtered; a matplotlib figure. ``ax`` as for `Track.plot`."""
+        return plot_smoothed(self.run, self.theta, *self.band(level), ax)
 
 
 def solve(walk: Walk, keep: str, order_by: Any = None) -> Path:

@@ -40,9 +40,17 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
-from driftfit.trackers.parts.diffuse import MACHINES, drifted, enter, knowing, knowing_nothing, spanned_variance
+from driftfit.trackers.parts.diffuse import (
+    MACHINES,
+    SCRATCH,
+    drifted,
+    enter,
+    knowing,
+    knowing_nothing,
+    spanned_variance,
+)
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import correct, learn_scale, no_scale
 
 
@@ -51,7 +59,7 @@ def drift(s: State, l: int) -> None:
     """Between samples only, because the prior refers to the first sample."""
     time = s.dt[l] * s.drift[l] * s.begun[l]
     for i in range(s.theta.shape[0]):
-        s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
+        s.P[i, i, l] += s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * time
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
 
 
@@ -113,7 +121,9 @@ class FLS(Tracker):
     differences: int = 1
 
     required: ClassVar[tuple[str, ...]] = ("mu",)
-    drift_each: ClassVar[bool] = True
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
+    drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.mu is not None:
@@ -137,7 +147,7 @@ class FLS(Tracker):
             "G": np.diag(np.sqrt(1.0 / mu)),
             "r": 1.0,
             "g": np.zeros(n),
-            "each": np.ones(n),
+            "drift_root": np.ones(n),
             "begun": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
@@ -166,4 +176,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)

@@ -39,6 +39,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
+    SCRATCH,
     enter,
     hand_over,
     knowing,
@@ -207,6 +208,8 @@ class RLS(Tracker):
     kind: str = "exponential"
 
     required: ClassVar[tuple[str, ...]] = ("forgetting",)
+    learns_noise: ClassVar[bool] = True
+    scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
 
     def __post_init__(self) -> None:
         if self.forgetting is not None:

@@ -1,6 +1,7 @@
-"""One record with many settings at once: every lane of a tile runs the same series with its own tracker.
+"""Records with many settings at once: every lane of a tile runs the same series with its own tracker.
 
-For each setting a run is reduced to the sums that the criteria need, so memory does not grow with the record:
+Several records are independent: the state begins again with each of them, and their sums are added. For each setting
+the runs are reduced to the sums that the criteria need, so memory does not grow with the records:
 
     log-likelihood   -1/2 (N log 2 pi + sum log s + sum log F + sum e^2 / s) + sum of the model's log Jacobian
     profiled         s = sigma^2 s0:  sigma^2 = mean(e^2 / s0),
@@ -33,22 +34,41 @@ BLOCK = 1024
 
 
 class Task(NamedTuple):
-    """What settings are scored on: a bound model and a checked record."""
+    """The task on which settings are scored: a bound model and checked records; theta is unknown at each start."""
 
     model: Model
-    record: Record
+    records: tuple[Record, ...]
+
+    @property
+    def longest(self) -> int:
+        """Samples of the longest record."""
+        return max(map(len, self.records))
 
 
 class Scores(NamedTuple):
-    """The reduced results of S settings, (S,) each, but power (n, S)."""
+    """The reduced results of S settings: sums over all records, (S,) each, but powers (n, S)."""
 
     used: Array
     log_s: Array
     squares: Array
     more: Array
     """Further terms of the log-likelihood: log Jacobians, or densities that the tracker computes itself."""
-    h_step: Array
-    power: Array
+    errors: Array
+    scored: Array
+    powers: Array
+    samples: Array
+
+    @property
+    def h_step(self) -> Array:
+        """Mean square of the errors h samples ahead."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.errors / self.scored)
+
+    @property
+    def power(self) -> Array:
+        """Mean squares of the regressors, (n, S)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.powers / self.samples)
 
     def sigma2(self) -> Array:
         """The noise variance if P is relative to it: mean(e^2 / s0)."""
@@ -87,24 +107,25 @@ def storing(store: Any) -> Any:
 
 
 def score(task: Task, trackers: Sequence[Tracker], h: int = 1) -> Scores:
-    """Run the record under each tracker (all of one class and one form of settings)."""
+    """Run the records under each tracker (all of one class and one form of settings)."""
     width = trackers[0].width
     parts = []
     for a in range(0, len(trackers), width):
         some = list(trackers[a : a + width])
         full = some + [some[-1]] * (width - len(some))
-        parts.append([value[..., : len(some)] for value in _score_tile(task, full, h)])
+        sums = [_score_tile(task.model, record, full, h) for record in task.records]
+        parts.append([sum(values)[..., : len(some)] for values in zip(*sums, strict=True)])
     return Scores(*(np.concatenate(values, axis=-1) for values in zip(*parts, strict=True)))
 
 
-def _score_tile(task: Task, trackers: Sequence[Tracker], h: int) -> Scores:
-    (model, record), L = task, len(trackers)
+def _score_tile(model: Model, record: Record, trackers: Sequence[Tracker], h: int) -> Scores:
+    L = len(trackers)
     programs = [Program(model, tracker) for tracker in trackers]
     T, tile = len(record), tile_of(programs)
     steps, own = programs[0].steps, trackers[0].outputs if trackers[0].density else ()
     out = np.empty(min(BLOCK, T), output_type(tile, ("scale", "phi", *own)))
     run = programs[0].drivers(steps=steps._replace(store=storing(steps.store) if own else store_inside)).run
-    sums = _Sums(task, trackers[0], tile, h)
+    sums = _Sums(model, record, trackers[0], tile, h)
     for a in range(0, T, BLOCK):
         b = min(a + BLOCK, T)
         run(tile, *spread(record.part(slice(a, b)), L), out[: b - a])
@@ -115,13 +136,13 @@ def _score_tile(task: Task, trackers: Sequence[Tracker], h: int) -> Scores:
 class _Sums:
     """Sums over the blocks of a run, each with the lanes on the last axis."""
 
-    def __init__(self, task: Task, tracker: Tracker, tile: Array, h: int) -> None:
+    def __init__(self, model: Model, record: Record, tracker: Tracker, tile: Array, h: int) -> None:
         n, L = tile["theta"].shape[1:]
-        self.model, self.record, self.tracker, self.h = *task, tracker, h
+        self.model, self.record, self.tracker, self.h = model, record, tracker, h
         self.burn = min(burn_in(n), len(self.record) // 3)
         self.count, self.log_s, self.squares, self.more = np.zeros((4, L))
         self.errors, self.scored, self.used = np.zeros((3, L))
-        self.power = np.zeros((task.model.n, L))
+        self.powers = np.zeros((model.n, L))
         self.scale = np.ones(L) * tile["scale"][0]
         self.past = np.full((h, n, L), np.nan)
 
@@ -133,7 +154,7 @@ class _Sums:
         if self.model.implicit:
             terms = self.model.log_jacobian(np.moveaxis(out["theta"], 1, -1), np.broadcast_to(y, ok.shape))
             self.more += np.sum(np.where(counted, terms, 0.0), axis=0)
-        self.power += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
+        self.powers += np.sum(np.where(ok[:, None], out["phi"] ** 2, 0.0), axis=0)
         self.used += ok.sum(axis=0)
 
     def _likelihood(self, out: Array, ok: Array) -> Array:
@@ -169,6 +190,5 @@ class _Sums:
     def scores(self, tile: Array) -> Scores:
         if "F" in (tile.dtype.names or ()):
             self.log_s += np.sum(np.log(tile["F"][0]), axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            h_step, power = self.errors / self.scored, self.power / self.used
-        return Scores(self.count, self.log_s, self.squares, self.more, h_step, power)
+        sums = (self.count, self.log_s, self.squares, self.more, self.errors, self.scored, self.powers, self.used)
+        return Scores(*sums)

@@ -22,11 +22,14 @@ from driftfit.tune.parametrisation import Knobs, constant
 
 
 def along(task: Task, tracker: Tracker, order_by: Any) -> Task:
-    """The record as a regression with samples sorted by a variable."""
-    walk, _ = ordered(walk_of(run_task(task, constant(task, tracker))), order_by)
+    """The record as a regression with samples sorted by a variable; ValueError for several records."""
+    if len(task.records) > 1:
+        raise ValueError("tune: order_by= sorts the samples of one record; leave out by=.")
+    (run,) = run_task(task, constant(task, tracker))
+    walk, _ = ordered(walk_of(run), order_by)
     with np.errstate(divide="ignore"):
         known = Known.of(noise=1.0 / walk.weight)
-    return Task(Regression(task.model.names), Record(walk.y, walk.phi, known))
+    return Task(Regression(task.model.names), (Record(walk.y, walk.phi, known),))
 
 
 @dataclass(frozen=True)
@@ -53,19 +56,23 @@ class Criterion:
         return np.log(np.where(np.isfinite(squares), np.maximum(squares, tiny), np.inf))
 
 
-def run_task(task: Task, tracker: Tracker) -> Track:
-    """Track the record of a task."""
-    return track_record(Program(task.model, tracker), task.record)
+def run_task(task: Task, tracker: Tracker) -> list[Track]:
+    """Track the records of a task."""
+    program = Program(task.model, tracker)
+    return [track_record(program, record) for record in task.records]
 
 
 def _smoothed_score(task: Task, tracker: Tracker, method: str) -> float:
-    """Mean square of the leave-one-out residuals of the smoothed path, or the rotation-invariant variant of it."""
-    path = Smoothed.of(run_task(task, tracker))
-    weight = path.walk.weight
-    used = weight > 0.0
-    if method == "loo":
-        value = path.press
-    else:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = float(path.measurement_cost / used.sum() / np.mean(1.0 - path.leverage[used]) ** 2)
-    return value if np.isfinite(value) else np.inf
+    """Mean square of the leave-one-out residuals of the smoothed paths, or the rotation-invariant variant of it."""
+    squares, count, free, used = 0.0, 0, 0.0, 0
+    for run in run_task(task, tracker):
+        path = Smoothed.of(run)
+        weight = path.walk.weight
+        terms = weight * path.loo**2 if method == "loo" else np.zeros(0)
+        squares += float(np.nansum(terms)) if method == "loo" else path.measurement_cost
+        count += int(np.isfinite(terms).sum())
+        free += float(np.sum(1.0 - path.leverage[weight > 0.0]))
+        used += int(np.sum(weight > 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.float64(squares) / count if method == "loo" else np.float64(squares) / used / (free / used) ** 2
+    return float(value) if np.isfinite(value) else np.inf

@@ -7,37 +7,20 @@ whose predictions also fill missing lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from driftfit.data.record import Reading
+from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
-from driftfit.run.outputs import Outputs
-from driftfit.run.shared_outputs import Shared
-from driftfit.run.track import track
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task
 from driftfit.tune.tuned import Tuned
 
-STILL = Kalman(q=0.0, r=1.0)
-"""Constant parameters with a diffuse start."""
 
-
-class TunedOutputs(Mapping[str, Tuned]):
+class TunedOutputs(ByOutput[Tuned]):
     """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
-
-    def __init__(self, each: Mapping[str, Tuned]) -> None:
-        self._each = dict(each)
-
-    def __getitem__(self, output: str) -> Tuned:
-        return self._each[output]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._each)
-
-    def __len__(self) -> int:
-        return len(self._each)
 
     def __repr__(self) -> str:
         return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
@@ -59,13 +42,12 @@ class TunedOutputs(Mapping[str, Tuned]):
 
 
 def tune_outputs(
-    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, one: Callable[[Task], Tuned]
-) -> Tuned | TunedOutputs:
+    model: Model, tracker: Any, y: Any, u: Any, known: Mapping[str, Any], data: Any, by: Any,
+    one: Callable[[Task], Tuned],
+) -> Tuned | TunedOutputs:  # fmt: skip
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known), data=data)
-    if isinstance(run, Shared):
-        return one(Task(run.rows.model, run.rows.record))
-    assert isinstance(run, Outputs)
-    return TunedOutputs({name: one(Task(run[name].model, run[name].record)) for name in run.outputs})
+    runs = constant_outputs(model, y, u, Reading(**known), data, by)
+    tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
+    return tuned["rows"] if model.shared else TunedOutputs(tuned)

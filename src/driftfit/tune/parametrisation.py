@@ -125,7 +125,7 @@ def constant(task: Task, tracker: Any) -> Tracker:
 def _range(task: Task, tracker: Tracker, bounds: Bounds, p: int) -> tuple[Array, Array]:
     """Ends of log10 mu, (p,) each; a drift of slopes accumulates twice over the record."""
     times = getattr(tracker, "differences", 1)
-    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(len(task.record))))
+    low, high = _ends(bounds, -4.0, max(5.0, 2.0 * times * np.log10(task.longest)))
     return np.full(p, low), np.full(p, high)
 
 
@@ -252,7 +252,7 @@ def _changes(tracker: Bank, bounds: Bounds) -> Knobs:
 
 def _memory(task: Task, tracker: Any, bounds: Bounds) -> Knobs:
     """forgetting of RLS, as samples of memory 1 / (1 - forgetting); bounds apply to the memory."""
-    low, high = _ends(bounds, float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * len(task.record))))
+    low, high = _ends(bounds, float(np.log10(2.0 * task.model.n)), float(np.log10(100.0 * task.longest)))
 
     def values(x: Array) -> Array:
         return np.asarray(np.maximum(1.0 - 10.0**-x, 0.0))

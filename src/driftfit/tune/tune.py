@@ -35,9 +35,7 @@ from driftfit.tune.objective import Criterion, along
 from driftfit.tune.outputs import TunedOutputs, tune_outputs
 from driftfit.tune.parametrisation import find_knobs
 from driftfit.tune.search import Counted, Search, minimise
-from driftfit.tune.tuned import Tuned
-
-METHODS = ("ml", "h-step", "loo", "gcv")
+from driftfit.tune.tuned import METHODS, Tuned
 
 
 def tune(
@@ -53,6 +51,7 @@ def tune(
     level: float = 0.95,
     order_by: Any = None,
     data: Any = None,
+    by: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
@@ -83,6 +82,9 @@ def tune(
         T^2)), for r in units of the residual variance of constant parameters, for the memory of RLS in samples.
     level : number
         Level of the intervals.
+    by : names of columns, "row" or None
+        As for `track`: several records, which share the settings but not theta. The criterion is that of all of them
+        together, such as the sum of their log-likelihoods, and every record begins with an unknown theta.
     order_by : (T,)
         Tune for ``run.smooth(order_by=...)``: theta is a random walk along this variable instead of time.
 
@@ -103,7 +105,7 @@ def tune(
         everything that `track` does not accept.
     """
     check_roles("tune", model, tracker)
-    one_of("tune", "method", method, METHODS)
+    one_of("tune", "method", method, tuple(METHODS))
     whole("tune", "h", h, 1)
     if not 0.0 < level < 1.0:
         raise ValueError(f"tune: level must be between 0 and 1, such as 0.95; got {level!r}.")
@@ -112,9 +114,9 @@ def tune(
     if len(model.outputs) > 1:
         options = (method, groups, h, bounds, level, order_by)
         known = {"time": time, "dt": dt, "weights": weights, "drift": drift, "limits": limits, "exclude": exclude}
-        return tune_outputs(model, tracker, y, u, known, data, lambda task: _tuned(task, tracker, *options))
+        return tune_outputs(model, tracker, y, u, known, data, by, lambda task: _tuned(task, tracker, *options))
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
-    return _tuned(_task(model, tracker, y, u, reading, data), tracker, method, groups, h, bounds, level, order_by)
+    return _tuned(_task(model, tracker, y, u, reading, data, by), tracker, method, groups, h, bounds, level, order_by)
 
 
 def _tuned(
@@ -159,7 +161,8 @@ def _warn(tuned: Tuned) -> None:
         )
 
 
-def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any) -> Task:
-    records = records_of(model, y, u, reading, data)[1].for_model(model, reading)
+def _task(model: Model, tracker: Tracker, y: Any, u: Any, reading: Reading, data: Any, by: Any) -> Task:
+    records = records_of(model, y, u, reading, data, by)[1].for_model(model, reading)
     bound = model.bind(records.labels.u or records.u.shape[1])
-    return Task(bound, replace(records.for_trackers(bound, [tracker]).part(0), time=None))
+    records = records.for_trackers(bound, [tracker])
+    return Task(bound, tuple(replace(records.part(k), time=None) for k in range(len(records.keys))))

@@ -1,14 +1,17 @@
-"""What tuning found: settings, their intervals, and everything that was tried."""
+"""The result of tuning: settings, their intervals, and everything that was tried."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.text import Text
 
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, RED, new_figure
+from driftfit.show.parts.axes import BLUE, RED, panels
+from driftfit.show.parts.text import Printed, facts, shortened, table_of
 from driftfit.trackers.base import Tracker
 from driftfit.tune.search import Search
 
@@ -17,29 +20,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class Tuned:
-    """The result of `tune`.
+METHODS = {
+    "ml": "maximum likelihood",
+    "h-step": "h-step prediction error",
+    "loo": "leave-one-out error",
+    "gcv": "generalised cross-validation",
+}
+"""The criteria, in words."""
 
-    Attributes
-    ----------
-    tracker : Tracker
-        The tracker with all its settings, ready for `track` and `Live`.
-    method : str
-        The criterion.
-    loglik : float
-        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
-    noise : float
-        Estimated noise variance; unreliable if ``at_bound`` is not empty.
-    at_bound : tuple of str
-        Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
-    interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
-        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
-        other methods.
-    level : float
-        The level of the intervals.
+
+@dataclass(frozen=True)
+class Tuned(Printed):
+    """The result of `tune`; printing it shows the estimates with their intervals.
+
+    Attributes ---------- tracker : Tracker The tracker with all its settings, ready for `track` and `Live`. method :
+    str The criterion. loglik : float Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers
+    without a variance. For trackers that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which
+    had less information at the start. noise : float Estimated noise variance; unreliable if ``at_bound`` is not empty.
+    at_bound : tuple of str Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
+    interval : dict of (low, high) By name of setting, the interval of the likelihood at ``level``: from profiles (for
+    "q[..]/r", "mu", "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated
+    together). NaN for other methods. level : float The level of the intervals.
     """
 
     tracker: Tracker
@@ -68,6 +69,22 @@ class Tuned:
         names, values = self._search.knobs.names, self._search.knobs.values(self._search.x)
         return {name: float(value) for name, value in zip(names, values, strict=True)}
 
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield facts(
+            ("Tracker", shortened(repr(self.tracker))),
+            ("Criterion", METHODS[self.method]),
+            *([("Log-likelihood", f"{self.loglik:.6g}")] if np.isfinite(self.loglik) else []),
+            ("Noise variance", f"{self.noise:.4g}"),
+        )
+        ends = (f"[{0.5 - self.level / 2:.3g}", f"{0.5 + self.level / 2:.3g}]")
+        table = table_of("Settings", "", "estimate", *ends)
+        found = self.chosen | ({"r": self.noise} if "r" in self.interval else {})
+        for name, value in found.items():
+            table.add_row(Text(name), *(f"{number:.4g}" for number in (value, *self.interval[name])))
+        yield table
+        if self.at_bound:
+            yield Text(f" at zero or at a bound of the search: {', '.join(self.at_bound)}")
+
     def _criterion(self, values: Array) -> Array:
         """Values of the objective converted to the criterion."""
         return -values if self.method == "ml" else np.exp(values)
@@ -82,17 +99,20 @@ class Tuned:
             curves.append((self._search.knobs.names[entry], settings, self._criterion(values)))
         return curves
 
-    def plot(self) -> Figure:
-        """The criterion along each setting, with the others optimised if it is a likelihood; a matplotlib figure."""
-        return _plot(self)
+    def plot(self, ax: Any = None) -> Figure:
+        """The criterion along each setting, with the others optimised if it is a likelihood; a matplotlib figure.
+
+        ``ax`` as for `Track.plot`.
+        """
+        return _plot(self, ax)
 
 
-def _plot(tuned: Tuned) -> Figure:
+def _plot(tuned: Tuned, ax: Any) -> Figure:
     """One panel per knob: the criterion over its range, the chosen value, and its interval."""
     curves = tuned.curves()
-    figure = new_figure(4.6 * min(len(curves), 2), 3.2 * -(-len(curves) // 2))
-    panels = figure.subplots(-(-len(curves) // 2), min(len(curves), 2), squeeze=False).ravel()
-    for panel, (name, values, criterion) in zip(panels, curves, strict=False):
+    columns = min(len(curves), 2)
+    figure, axes = panels(ax, (4.6 * columns, 3.2 * -(-len(curves) // 2)), len(curves), columns)
+    for panel, (name, values, criterion) in zip(axes, curves, strict=True):
         memory = name == "forgetting"
         axis = (lambda v: 1.0 / (1.0 - np.asarray(v))) if memory else np.asarray
         best = tuned.chosen[name]
@@ -107,6 +127,4 @@ def _plot(tuned: Tuned) -> Figure:
         panel.set_xlabel("memory 1 / (1 - forgetting)" if memory else name)
         panel.set_ylabel({"ml": "log-likelihood", "h-step": "mean square"}.get(tuned.method, tuned.method))
         panel.grid(alpha=0.25, lw=0.5)
-    for panel in panels[len(curves) :]:
-        panel.set_visible(False)
     return figure

@@ -8,7 +8,7 @@ import numpy as np
 
 from driftfit.data.signals import as_output
 from driftfit.engine.kernel import Array
-from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, new_figure, settled
+from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, panels, settled
 from driftfit.use.simulate import fit, simulate
 from driftfit.use.system import arx_of, dc_gain, frequency_response, input_of, largest_pole, poles, step_response
 
@@ -26,8 +26,9 @@ LONGEST = 200
 
 
 def plot_system(
-    run: Track, input: int | str = 0, at: Any = None, h: int | None = None, level: float = 0.95, dt: float = 1.0
-) -> Figure:
+    run: Track, input: int | str = 0, at: Any = None, h: int | None = None, level: float = 0.95, dt: float = 1.0,
+    ax: Any = None,
+) -> Figure:  # fmt: skip
     """Step and frequency response at some samples, with bands; poles in the plane; gain over time.
 
     Parameters
@@ -44,6 +45,8 @@ def plot_system(
         Level of the bands, which are pointwise, from the covariance of the run.
     dt : number
         Time between samples, for the axes of the responses: frequencies are then in radians per unit of time.
+    ax : axes or None
+        As for `Track.plot`; four panels.
 
     Raises
     ------
@@ -55,8 +58,7 @@ def plot_system(
     first = settled(run).start
     chosen = np.unique(np.linspace(first, len(run) - 1, TIMES).astype(int)) if at is None else np.atleast_1d(at)
     length = _settling(run, chosen) if h is None else h
-    figure = new_figure(10.0, 7.4)
-    (step, magnitude), (plane, gain) = figure.subplots(2, 2)
+    figure, (step, magnitude, plane, gain) = panels(ax, (10.0, 7.4), 4, 2)
     colours = _shades(len(chosen))
     _step(step, run, j, chosen, length, level, dt, colours)
     _frequency(magnitude, run, j, chosen, level, dt, colours)
@@ -166,7 +168,7 @@ def _titled(axis: Axes, title: str) -> None:
     axis.tick_params(labelsize=8)
 
 
-def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95) -> Figure:
+def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.95, ax: Any = None) -> Figure:
     """Free simulation of the model at one sample on data that it has not used, with the measured outputs.
 
     The first outputs, as many as its regressors reach back, are given to the simulation. The fit, in per cent,
@@ -177,8 +179,7 @@ def plot_validation(run: Track, y: Any, u: Any, at: int = -1, level: float = 0.9
     said = simulate(run, u, at, np.nan_to_num(output[:lags]))
     low, high = said.band(level)
     time = np.arange(len(output))
-    figure = new_figure(9.0, 4.2)
-    signal, error = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1.0])
+    figure, (signal, error) = panels(ax, (9.0, 4.2), 2, sharex=True, heights=[2.4, 1.0])
     signal.fill_between(time, low, high, color=BLUE, alpha=0.2, lw=0)
     signal.plot(time, output, color=GREY, lw=1.0, label="measured")
     signal.plot(time, said.y_hat, color=BLUE, lw=1.1, label=f"simulated, parameters of {run.time_text(at)}")

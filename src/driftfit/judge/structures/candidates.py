@@ -4,7 +4,8 @@
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
 them), so all structures use the same rows. Structures with equally many columns have states of the same shape and run
-in parallel, in fleets of up to 32.
+in parallel, in fleets of up to 32. Several records are run separately, each from the start, and written one after the
+other.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ def unscored(T: int, n: int) -> int:
     return max(burn_in(n), min(100, T // 2))
 
 
-def price(n: int, start: int) -> float:
-    """The cost of n parameters in the log-likelihood of the first ``start`` samples, which are not scored."""
-    return 0.5 * n * float(np.log(start))
+def price(n: int, starts: Sequence[int]) -> float:
+    """The cost of n parameters in the log-likelihood of the first samples of every record, which are not scored."""
+    return 0.5 * n * float(np.sum(np.log(np.maximum(starts, 1))))
 
 
 class Predicted(NamedTuple):
@@ -62,17 +63,33 @@ class Predicted(NamedTuple):
 
 @dataclass(frozen=True)
 class Pool:
-    """A record, and the regressors (T, N) of the union of the structures that are made of columns."""
+    """Records of T samples together, and the regressors (T, N) of the union of structures that are made of columns."""
 
-    record: Record
+    records: tuple[Record, ...]
     phi: Array
     names: tuple[str, ...]
     gaps: Array
 
     @property
     def y(self) -> Array:
-        """(T,)"""
-        return self.record.y
+        """(T,): the records one after the other."""
+        return np.concatenate([record.y for record in self.records])
+
+    @property
+    def spans(self) -> list[slice]:
+        """The samples of every record."""
+        ends = np.cumsum([len(record) for record in self.records]).tolist()
+        return [slice(end - len(record), end) for end, record in zip(ends, self.records, strict=True)]
+
+    def starts(self, n: int) -> list[int]:
+        """Number of first samples of every record that are not scored."""
+        return [unscored(len(record), n) for record in self.records]
+
+    def after(self, starts: Sequence[int]) -> Array:
+        """(T,) bool: the samples of every record after its start."""
+        return np.concatenate(
+            [np.arange(len(record)) >= start for record, start in zip(self.records, starts, strict=True)]
+        )
 
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
         """Run structures and return their predictions."""
@@ -83,27 +100,37 @@ class Pool:
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
                 runs = self._lanes(tracker, [structures[k] for k in part])
-                found |= dict(zip(part, map(predicted, runs), strict=True))
+                found |= dict(zip(part, runs, strict=True))
         for k, structure in enumerate(structures):
             if structure.columns is None:
-                found[k] = predicted(self._alone(tracker, structure))
+                found[k] = self._alone(tracker, structure)
         return [found[k] for k in range(len(structures))]
 
-    def _lanes(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Track]:
-        count, T, n = len(structures), len(self.y), structures[0].n
-        columns = [s.columns for s in structures]
-        u = np.concatenate([self.phi[:, list(chosen or ())] for chosen in columns])
-        known = self.record.known.changed(interval=self.gaps)
+    def _lanes(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
+        count, T, n = len(structures), len(self.gaps), structures[0].n
+        u = np.concatenate([self.phi[:, list(s.columns or ())] for s in structures])
+        spans = self.spans
+        first = np.array([k * T + span.start for k in range(count) for span in spans])
+        length = np.array([span.stop - span.start for _ in range(count) for span in spans])
+        rows = [np.broadcast_to(r.known.columns, (len(r), *r.known.columns.shape[1:])) for r in self.records]
+        known = Known(np.concatenate(rows)).changed(interval=self.gaps)
         records = Records(
-            tuple(range(count)), np.arange(count) * T, np.full(count, T), np.tile(self.y, count), u,
+            tuple(range(len(first))), first, length, np.tile(self.y, count), u,
             Known(np.tile(known.columns, (count, 1))),
         )  # fmt: skip
-        fleet = run_fleet([Program(Regression(n), tracker)] * count, records)
-        return [fleet[k] for k in range(count)]
+        fleet = run_fleet([Program(Regression(n), tracker)] * len(first), records)
+        R = len(spans)
+        return [joined([predicted(fleet[k * R + r]) for r in range(R)]) for k in range(count)]
 
-    def _alone(self, tracker: Tracker, structure: Structure) -> Track:
+    def _alone(self, tracker: Tracker, structure: Structure) -> Predicted:
         assert structure.model is not None
-        return track_record(Program(structure.model, tracker), self.record)
+        program = Program(structure.model, tracker)
+        return joined([predicted(track_record(program, record)) for record in self.records])
+
+
+def joined(parts: Sequence[Predicted]) -> Predicted:
+    """The predictions of several records, one after the other."""
+    return Predicted(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def predicted(run: Track) -> Predicted:
@@ -113,17 +140,18 @@ def predicted(run: Track) -> Predicted:
     return Predicted(run.prediction, np.where(known, s, np.nan), run.log_density)
 
 
-def pool_of(models: Sequence[Model], names: Sequence[str], record: Record) -> tuple[Pool, list[Structure]]:
-    """The record with the union of the models' regressors, and the models as structures; models are bound."""
+def pool_of(models: Sequence[Model], names: Sequence[str], records: Sequence[Record]) -> tuple[Pool, list[Structure]]:
+    """The records with the union of the models' regressors, and the models as structures; models are bound."""
     linear = [model for model in models if _terms(model) is not None]
     if not linear:
-        empty = Pool(record, np.zeros((len(record), 0)), (), np.ones(len(record)))
+        T = sum(map(len, records))
+        empty = Pool(tuple(records), np.zeros((T, 0)), (), np.ones(T))
         return empty, [Structure(name, model.n, model, None) for name, model in zip(names, models, strict=True)]
     union = _union(linear)
     order = {term: i for i, term in enumerate(_terms(union) or ())}
-    seen = constant_least_squares(union, record)
+    seen = np.concatenate([constant_least_squares(union, record) for record in records])
     phi = np.where(seen["valid"] > 0.0, seen["phi"][..., 0], np.nan)
-    pool = Pool(record, phi, union.names, seen["dt"][:, 0].copy())
+    pool = Pool(tuple(records), phi, union.names, seen["dt"][:, 0].copy())
     structures = []
     for name, model in zip(names, models, strict=True):
         terms = _terms(model)

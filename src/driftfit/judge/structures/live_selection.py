@@ -1,16 +1,16 @@
-"""Orders and bases chosen on line: candidates followed side by side, each weighed by what it predicted of late.
+"""Orders and bases chosen on line: candidates tracked in parallel, each weighted by its recent predictions.
 
     log w_k <- a log w_k + log p_k(y_t | past),      p_k from before the sample, a just below 1
 
-A candidate that predicts better gains weight; what is long past is forgotten, so that the choice may change: a valve
-that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, as each
-density stands for a prediction that was made before its output was seen. A sample that one candidate cannot use moves
-no weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
+A candidate that predicts better gains weight; old predictions are forgotten, so that the choice may change: a valve
+that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, because each
+density is that of a prediction made before its output was observed. A sample that one candidate cannot use moves no
+weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
 long to come right when a candidate becomes true. Over the same samples the weights are those of
 ``select(..).average(a)``.
 
-Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is what Feng
-and Hong (2021), section 6, leave open. Cost: that of the candidates.
+Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is left open
+by Feng and Hong (2021), section 6. Cost: that of the candidates.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.student import log_student
 
 
 class LiveSelection(Kept):
-    """Follow several models of one stream and say which predicts best now.
+    """Track several models of one stream and choose the one that predicts best at present.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ class LiveSelection(Kept):
     tracker : Tracker
         How their parameters are followed, with a variance; its settings fit every number of parameters.
     forgetting : number in (0, 1]
-        What a log-likelihood is worth one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
+        The weight of a log-likelihood one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
         change sooner and is led astray by noise more often.
     dt : as for `Live`
 
@@ -58,7 +59,8 @@ class LiveSelection(Kept):
             raise ValueError("LiveSelection: takes at least one model, each with one output.")
         if not tracker.covariance or tracker.density:
             raise ValueError(
-                f"LiveSelection: {type(tracker).__name__} has no Gaussian prediction to weigh; use Kalman, RLS or FLS."
+                f"LiveSelection: {type(tracker).__name__} has no prediction with one variance to weigh; use "
+                "Kalman, RLS or FLS."
             )
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")
@@ -66,7 +68,7 @@ class LiveSelection(Kept):
 
     def _follow(self, streams: Sequence[Live], forgetting: float) -> None:
         self.streams, self.forgetting = tuple(streams), float(forgetting)
-        self._logs = np.zeros(len(self.streams))
+        self._logs, self._residuals = np.zeros((2, len(self.streams)))
 
     def update(self, y: float, u: Any = None, **known: Any) -> float:
         """Take one sample in; the prediction of y from before it, averaged over the candidates by their weights.
@@ -75,11 +77,26 @@ class LiveSelection(Kept):
         """
         weights = self.weights
         steps = [live.update(y, u, **known) for live in self.streams]
-        terms = np.array([_log_density(live, y, step) for live, step in zip(self.streams, steps, strict=True)])
+        terms = np.array([self._log_density(k, y, step) for k, step in enumerate(steps)])
         if np.isfinite(terms).all():
             logs = self.forgetting * self._logs + terms
             self._logs = logs - logs.max()
         return float(weights @ [step[0] for step in steps])
+
+    def _log_density(self, k: int, y: float, step: tuple[float, float, float, bool]) -> float:
+        """Log density of a sample under candidate k given those before it, NaN without one; `Track.log_density`."""
+        (_, e, s, ok), live = step, self.streams[k]
+        residuals = self._residuals[k]
+        self._residuals[k] += ok and not np.isinf(s)
+        if not (ok and np.isfinite(s) and s > 0.0):
+            return float("nan")
+        if live.tracker.learns_noise:
+            found = log_student(*np.array([e, s, residuals]))
+        else:
+            found = -0.5 * (np.log(2.0 * np.pi * s) + e * e / s)
+        if live.model.implicit and not live.tracker.output_error:
+            found += live.model.log_jacobian(live.theta[None], np.array([y]))[0]
+        return float(found)
 
     @property
     def weights(self) -> Array:
@@ -97,23 +114,12 @@ class LiveSelection(Kept):
     def _written(self) -> tuple[dict[str, Any], dict[str, Array]]:
         header = {"kind": self._kind, "forgetting": self.forgetting}
         streams = {f"stream{k}": np.frombuffer(live.to_bytes(), np.uint8) for k, live in enumerate(self.streams)}
-        return header, streams | {"logs": self._logs}
+        return header, streams | {"logs": self._logs, "residuals": self._residuals}
 
     @classmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
         found = cls.__new__(cls)
         count = len(arrays["logs"])
         found._follow([Live.from_bytes(arrays[f"stream{k}"].tobytes()) for k in range(count)], header["forgetting"])
-        found._logs = np.array(arrays["logs"])
+        found._logs, found._residuals = np.array(arrays["logs"]), np.array(arrays["residuals"])
         return found
-
-
-def _log_density(live: Live, y: float, step: tuple[float, float, float, bool]) -> float:
-    """Log density of a sample given those before it, NaN where there is none; as `Track.log_density`."""
-    _, e, s, ok = step
-    if not (ok and np.isfinite(s) and s > 0.0):
-        return float("nan")
-    found = -0.5 * (np.log(2.0 * np.pi * s) + e * e / s)
-    if live.model.implicit and not live.tracker.output_error:
-        found += live.model.log_jacobian(live.theta[None], np.array([y]))[0]
-    return float(found)

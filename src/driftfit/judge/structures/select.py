@@ -42,11 +42,13 @@ from driftfit.engine.arrays import factor
 from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price, unscored
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price
+from driftfit.judge.structures.several_outputs import pools_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.run.track import records_of
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -160,12 +162,15 @@ class Selection(Printed):
         yield Text(f" simplest within one standard error: {self.simplest}")
         yield Text(f" on {self.scored} samples that all could predict", "dim")
 
-    def plot(self, most: int = 20) -> Figure:
-        """Distances from the best structure, with standard errors, and where in time the structures lost."""
+    def plot(self, most: int = 20, ax: Any = None) -> Figure:
+        """Distances from the best structure, with standard errors, and where in time the structures lost.
+
+        ``ax`` as for `Track.plot`.
+        """
         rows, order = self.rows[:most], dict(zip([s.name for s in self.structures], self.predictions, strict=True))
         terms = [np.where(self.judged, order[row.name].loglik, 0.0) for row in rows[:6]]
         below, std = (np.array(part) for part in zip(*((row.below, row.std) for row in rows), strict=True))
-        return plot_selection([row.name for row in rows], below, std, terms)
+        return plot_selection([row.name for row in rows], below, std, terms, ax)
 
 
 def grid(kind: type[Model], **choices: Any) -> list[Model]:
@@ -198,13 +203,14 @@ def select(
     keep: Sequence[str] = (),
     most: int | None = None,
     data: Any = None,
+    by: Any = None,
     time: Any = None,
     dt: Any = None,
     weights: Any = 1.0,
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
-) -> Selection:
+) -> Selection | ByOutput[Selection]:
     """Compare structures by predictive likelihood.
 
     Parameters
@@ -213,6 +219,9 @@ def select(
         Candidates; or one model whose regressors are to be selected, at most 30.
     y, u, data, time, dt, weights, drift, limits, exclude
         As for `track`: with ``data`` the others name its columns. One number or (T,) for drift.
+    by : names of columns, "row" or None
+        As for `track`: several records, for which one structure is sought. Parameters are estimated for each of them
+        from the start, the logliks are added, and the first m samples of each are not scored.
     tracker : Tracker
         Estimates their parameters; AdaptiveKalman() by default. Its settings must fit every number of parameters: one
         q, not a vector.
@@ -220,6 +229,10 @@ def select(
         Regressors that every subset contains, such as ("intercept",).
     most : int or None
         Largest number of regressors in a subset.
+
+    Returns
+    -------
+    Selection. Models with several outputs give one for each, by name (if they share one theta, one for all).
 
     Raises
     ------
@@ -237,24 +250,33 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    search = (keep, most) if isinstance(models, Model) else None
     if any(len(model.outputs) > 1 for model in candidates):
-        raise ValueError("select: structures are compared for one output at a time.")
-    _, records, _ = records_of(candidates[0], y, u, reading, data)
-    if data is None:
+        pools = pools_of(candidates, y, u, reading, data, by)
+        found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
+        return found["rows"] if candidates[0].shared else ByOutput(found)
+    _, records, _ = records_of(candidates[0], y, u, reading, data, by)
+    if data is None and by is None:
         factor("drift", drift, len(records.y))
     elif records.drifts is not None:
         raise ValueError("select: drift is one number or one column: candidates have different numbers of parameters.")
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
-    if isinstance(models, Model) and bound[0].n > MOST:
-        raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
     names = [repr(model) for model in candidates]
-    pool, structures = pool_of(bound, names, replace(records.part(0), time=None))
-    if isinstance(models, Model):
-        structures, predictions = subsets(pool, tracker, structures[0], keep, most)
-    else:
-        predictions = pool.predict(tracker, structures)
+    pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
+    return _selected(pool, structures, tracker, search)
+
+
+def _selected(
+    pool: Pool, structures: list[Structure], tracker: Tracker, search: tuple[Sequence[str], int | None] | None
+) -> Selection:
+    """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
+    if search is None:
+        return _judged(pool, tracker, structures, pool.predict(tracker, structures))
+    if structures[0].n > MOST:
+        raise ValueError(f"select: at most {MOST} regressors can be searched; there are {structures[0].n}.")
+    structures, predictions = subsets(pool, tracker, structures[0], *search)
     return _judged(pool, tracker, structures, predictions)
 
 
@@ -273,17 +295,20 @@ def _bound(model: Model, inputs: int | Sequence[str]) -> Model:
 
 def _judged(pool: Pool, tracker: Tracker, structures: list[Structure], predictions: list[Predicted]) -> Selection:
     """Rank structures on the samples that all could predict."""
-    start = unscored(len(pool.y), max(s.n for s in structures))
-    judged = np.arange(len(pool.y)) >= start
+    y, starts = pool.y, pool.starts(max(s.n for s in structures))
+    judged = pool.after(starts)
     for prediction in predictions:
         judged &= np.isfinite(prediction.loglik)
     terms = [prediction.loglik[judged] for prediction in predictions]
-    totals = np.array([float(np.sum(term)) - price(s.n, start) for s, term in zip(structures, terms, strict=True)])
+    totals = np.array([float(np.sum(term)) - price(s.n, starts) for s, term in zip(structures, terms, strict=True)])
     top, count = int(np.argmax(totals)), int(judged.sum())
     rows = []
-    for structure, prediction, term, total in zip(structures, predictions, terms, totals, strict=True):
-        spread = float(np.sqrt(count * max(newey_west(terms[top] - term), 0.0))) if count > 10 else float("nan")
-        error = (pool.y - prediction.y_hat)[judged]
+    for structure, prediction, total in zip(structures, predictions, totals, strict=True):
+        lost = predictions[top].loglik - prediction.loglik
+        parts = [lost[span][judged[span]] for span in pool.spans]  # records are independent: their variances add up
+        variance = sum(len(part) * max(newey_west(part), 0.0) for part in parts if len(part) > 1)
+        spread = float(np.sqrt(variance)) if count > 10 else float("nan")
+        error = (y - prediction.y_hat)[judged]
         rms = float(np.sqrt(np.mean(error * error))) if count else float("nan")
         rows.append(Row(structure.name, structure.n, float(total), float(totals[top] - total), spread, rms))
     rows.sort(key=lambda row: -row.loglik)

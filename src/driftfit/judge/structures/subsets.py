@@ -14,7 +14,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
-from driftfit.judge.structures.candidates import Pool, Predicted, Structure, price, unscored
+from driftfit.judge.structures.candidates import Pool, Predicted, Structure, price
 from driftfit.trackers.base import Tracker
 
 ALL = 5
@@ -51,7 +51,9 @@ class Tried:
         self.structures: list[Structure] = []
         self.predictions: list[Predicted] = []
         self._place: dict[frozenset[int], int] = {}
-        self._start = min(unscored(len(pool.y), len(pool.names)), len(pool.y) // 2)
+        starts = zip(pool.starts(len(pool.names)), pool.records, strict=True)
+        self._starts = [min(start, len(record) // 2) for start, record in starts]
+        self._scored = pool.after(self._starts)
 
     def __call__(self, subsets: Sequence[frozenset[int]]) -> Array:
         """logliks of subsets, after the start, (k,)."""
@@ -63,8 +65,8 @@ class Tried:
             self._place[subset] = len(self.structures)
             self.structures.append(structure)
             self.predictions.append(found)
-        terms = [self.predictions[self._place[frozenset(s)]].loglik[self._start :] for s in subsets]
-        costs = [price(len(s), max(self._start, 1)) for s in subsets]
+        terms = [self.predictions[self._place[frozenset(s)]].loglik[self._scored] for s in subsets]
+        costs = [price(len(s), self._starts) for s in subsets]
         return np.array([float(np.nansum(term)) - cost for term, cost in zip(terms, costs, strict=True)])
 
 

@@ -30,7 +30,7 @@ Steps = tuple[Array, Array, Array, Array]
 
 
 class LiveOutputs(Stream):
-    """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
+    """Track a stream with several outputs; `Live` returns it for a model with ``ny`` above 1.
 
     ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
     mapping from the name of each output to its tracker. Times and drifts are those of `Live`; so are weights, or there
@@ -45,7 +45,6 @@ class LiveOutputs(Stream):
     ) -> None:  # fmt: skip
         self._begin(model, tracker, dt, lag, warm_start, limits)
         self._out = self.programs[0].written(self._tile, 1)
-        self._run = self.programs[0].drivers().run
         rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
         self._windows = [Window(Regression(self._rows.n), one, rows) for one in self.trackers] if lag else []
 
@@ -88,7 +87,7 @@ class LiveOutputs(Stream):
         return given.reshape(shape)
 
     def _factors(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
-        """What the driver knows of one sample, (k, ny)."""
+        """The known numbers of one sample, (k, ny)."""
         ny = len(self.model.outputs)
         each = np.ndim(drift) == 1
         known = np.ones((3, ny))
@@ -96,13 +95,13 @@ class LiveOutputs(Stream):
         known[2] = 1.0 if each else factor("drift", drift)
         if not each:
             return known
-        columns = self.trackers[0].beside(self._rows, 1, None, np.asarray(drift)[None])
+        columns = self.trackers[0].extra_columns(self._rows, 1, None, np.asarray(drift)[None])
         return np.vstack([known, np.repeat(columns.T, ny, axis=1)])
 
     def predict(self, u: Any = None) -> tuple[Array, Array]:
-        """(y_hat, s), each (ny,): what the next outputs are expected to be; the state stays as it is.
+        """(y_hat, s), each (ny,): the forecast of the next outputs; the state does not change.
 
-        While `apply` is outstanding u stands for what it would bring.
+        While `apply` is outstanding, u is the input that it would receive.
         """
         missing, tile = np.full(len(self.model.outputs), np.nan), self._tile.copy()
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
@@ -113,7 +112,7 @@ class LiveOutputs(Stream):
     def detect(self, rules: Mapping[str, AlarmRule] | AlarmRule, wait: int | None = None) -> dict[str, LiveAlarm]:
         """Watch outputs by the rules of reference runs, by name: ``{"flow": run["flow"].detect(...).rule}``.
 
-        One rule per output, a later one in the place of an earlier; ``wait`` and the alarms are those of `Live.detect`.
+        One rule per output; a later rule replaces an earlier one; ``wait`` and the alarms are those of `Live.detect`.
         Outputs that share one theta have one rule, of ``run.detect(...)``, and ``wait`` counts their rows. ValueError
         for an unknown name.
         """
@@ -142,7 +141,7 @@ class LiveOutputs(Stream):
         self._driven(self._tile, y, self._inputs(u), self._factors(weight=0.0))
 
     def _step(self, y: Array, u: Array, known: Array, time: Any) -> Steps:
-        return self._driven(self._tile, y, u, known, lambda known: self._keep(known, time))
+        return self._driven(self._tile, y, u, known, lambda known: self._keep(self._out[0], known, time))
 
     def _driven(
         self, tile: Array, y: Array, u: Array, known: Array, after: Callable[[Array], None] | None = None
@@ -154,12 +153,12 @@ class LiveOutputs(Stream):
             for j, row in enumerate(u):
                 same = known[None, :, j : j + 1].copy()
                 same[0, 0] *= j == 0
-                self._run(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
+                self._loop(tile, y[None, j : j + 1], row[None, :, None], same, self._out)
                 results.append(self._result())
                 if after is not None:
                     after(same[0])
         else:
-            self._run(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
+            self._loop(tile, y[None], np.repeat(u.reshape(1, m, 1), ny, axis=2), known[None], self._out)
             results.append(self._result())
             if after is not None:
                 after(known)
@@ -167,25 +166,21 @@ class LiveOutputs(Stream):
         y_hat, e, s, ok = (np.concatenate(values) for values in zip(*results, strict=True))
         return y_hat, e, s, ok
 
-    def _keep(self, known: Array, time: Any) -> None:
-        """Give what the driver has just processed to alarms and windows."""
-        for lane, alarm in self._watching:
-            alarm.take(self._tile, lane, self._out[0]["e"][lane], self._out[0]["s"][lane], time)
-        for lane, window in enumerate(self._windows):
-            window.push(self._tile, (known[0, lane], known[1, lane], known[2, lane]), lane)
-
     def _rest(self, tile: Array) -> None:
-        """Reset what was known of one sample, because it does not hold for the next."""
-        if "each" in storage.fields(tile):
-            tile["each"] = 1.0
+        """Reset the drift factors of one sample, which do not apply to the next."""
+        if "drift_root" in storage.fields(tile):
+            tile["drift_root"] = 1.0
+
+    def _settle(self, held: bool, told: bool) -> None:
+        self._rest(self._tile)
 
     def _result(self) -> Steps:
-        """What the driver wrote, one number per lane."""
+        """The results of the driver, one number per lane."""
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
 
     def alone(self) -> list[tuple[Program, Array]]:
-        """Each output with its state as a tile of its own; none where outputs are regressors of each other."""
+        """Each output with its state in a separate tile; none where outputs are regressors of each other."""
         found = [(one.alone, lane) for lane, one in enumerate(self.programs)]
         return [(one, one.resting(state_of(self._tile, lane))) for one, lane in found if one is not None]
 
@@ -226,8 +221,9 @@ class LiveOutputs(Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations."""
-        std: Array = np.sqrt(np.einsum("...ii->...i", self.cov))
-        return std
+        var: Array = self._tile["var"][0].T
+        std = np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
+        return std[0] if self.model.shared else std
 
     @property
     def names(self) -> tuple[Any, ...]:

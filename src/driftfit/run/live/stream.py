@@ -1,4 +1,4 @@
-"""What streams of one and of several outputs have in common: time, limits, late inputs, windows, alarms, files."""
+"""The common part of streams with one and with several outputs: time, limits, late inputs, windows, alarms, files."""
 
 from __future__ import annotations
 
@@ -11,24 +11,26 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.limits import Gate
+from driftfit.engine.drivers import as_compiled
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm, check_rule
+from driftfit.run.live.batch import Batched
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.late_input import IGNORED, INPUT, LATER, NOTHING, applier, check_applied, check_expected
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import End, Run, carried
+from driftfit.run.warm_start import UNSAID, End, Run, by_output, carried, ended, read, restore, written
 from driftfit.trackers.base import Tracker
 
 
-class Stream(Plain, storage.Kept):
+class Stream(Batched, Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
-    A class of streams says how a sample goes through the tile (`_step`), and what a sample that is ignored returns.
+    Subclasses define how a sample is processed (`_step`), and what an ignored sample returns.
     """
 
     def _begin(
@@ -45,7 +47,7 @@ class Stream(Plain, storage.Kept):
         self.lag = whole("Live", "lag", lag, 0)
         if lag and warm_start is not None:
             raise ValueError("Live: lag= and warm_start= cannot be combined; give one of them.")
-        before = None if warm_start is None else warm_start.end()
+        before = None if warm_start is None else ended(warm_start)
         self._last: Any = None if before is None else before.last
         self._awaits = NOTHING if before is None else before.awaits
         self._cold = before is None
@@ -54,6 +56,11 @@ class Stream(Plain, storage.Kept):
         self._windows: list[Window] = []
         self._watching: list[tuple[int, LiveAlarm]] = []
         self._tile = tile_of(self.programs, carried(warm_start, self.programs))
+
+    def __repr__(self) -> str:
+        settings = ", ".join(dict.fromkeys(map(repr, self.trackers)))
+        last = "" if self._last is None else f" at {self._last}"
+        return f"{type(self).__name__}{last}: {self.model!r}, {settings}"
 
     @property
     def trackers(self) -> tuple[Tracker, ...]:
@@ -66,7 +73,7 @@ class Stream(Plain, storage.Kept):
 
     @abstractmethod
     def _factors(self, interval: float, weight: Any, drift: Any) -> Any:
-        """What is known of a sample."""
+        """The known numbers of a sample."""
 
     @abstractmethod
     def _checked(self, y: Any, u: Any) -> tuple[Any, Array]:
@@ -74,7 +81,7 @@ class Stream(Plain, storage.Kept):
 
     @abstractmethod
     def _nothing(self) -> Any:
-        """What a sample returns that is ignored."""
+        """The result of a sample that is ignored."""
 
     @abstractmethod
     def _fields(self) -> Mapping[str, Array]:
@@ -113,7 +120,7 @@ class Stream(Plain, storage.Kept):
         return self._place
 
     def _expect(self, what: int) -> None:
-        """Note whether an input is outstanding."""
+        """Record whether an input is outstanding."""
         self._awaits = what
 
     def apply(self, u: Any) -> None:
@@ -140,7 +147,7 @@ class Stream(Plain, storage.Kept):
     def _put(self, tile: Array, inputs: Array) -> None:
         """Store the outstanding input in a tile."""
         if self._awaits == INPUT:
-            self._placing()(tile, inputs)
+            self._placing()(as_compiled(tile), inputs)
 
     def _within(self, inputs: Array) -> Array:
         """Inputs with NaN outside their limits, which are counted."""
@@ -175,7 +182,7 @@ class Stream(Plain, storage.Kept):
         """The present state of the stream, from which another run can continue (`warm_start`)."""
         lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
         states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
-        return End(self.programs, states, self._last, self._awaits)
+        return End(self.programs, states, self._last, self._awaits, self.dt, self._clock.zone)
 
     def _windowed(self) -> Iterator[tuple[int, Window]]:
         """The lanes and their windows; ValueError if no samples are kept."""
@@ -187,36 +194,32 @@ class Stream(Plain, storage.Kept):
         extra = {
             "dt": self.dt, "zone": self._clock.zone, "limits": None if self._gate is None else self._gate.plain(),
             "last": self._last, "ignored": self._ignored, "lag": self.lag, "awaits": self._awaits,
-            "cold": self._cold, "windows": [window.plain() for window in self._windows],
-            "alarms": [[lane, alarm.plain()] for lane, alarm in self._watching],
+            "cold": self._cold, "windows": tuple(window.plain() for window in self._windows),
+            "alarms": tuple([lane, alarm.plain()] for lane, alarm in self._watching),
         }  # fmt: skip
-        described = [storage.describe(one) for one in self.trackers]
-        tracker = described[0] if len(described) == 1 else described
-        header = {"kind": self._kind, "model": storage.describe(self.model), "tracker": tracker, "extra": extra}
-        return header, {f"state_{name}": value for name, value in self._fields().items()}
+        return written(self.programs, [one.pack(self._tile, lane) for lane, one in enumerate(self.programs)], extra)
 
     @classmethod
     def _read(cls, source: str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> Self:
-        described = header["tracker"]
-        trackers = tuple(
-            storage.rebuild(one, Tracker) for one in (described if isinstance(described, list) else [described])
-        )
-        return cls._again(source, storage.rebuild(header["model"], Model), trackers, header["extra"], arrays)
+        model, trackers, extra = read(header)
+        return cls._again(source, (model, trackers), {**header, "extra": extra}, arrays)
 
     def __reduce__(self) -> Any:
         header, arrays = self._written()
-        return type(self)._again, ("the copy", self.model, self.trackers, header["extra"], arrays)
+        header["extra"] = {**UNSAID, **header["extra"]}
+        return type(self)._again, ("the copy", (self.model, self.trackers), header, arrays)
 
     @classmethod
     def _again(
-        cls, source: str, model: Model, trackers: tuple[Tracker, ...], extra: Mapping[str, Any],
+        cls, source: str, settings: tuple[Model, tuple[Tracker, ...]], header: Mapping[str, Any],
         arrays: Mapping[str, Array],
     ) -> Self:  # fmt: skip
         """The stream from its state."""
-        tracker = trackers[0] if len(trackers) == 1 else dict(zip(model.outputs, trackers, strict=True))
+        (model, trackers), extra = settings, header["extra"]
         limits, outside = extra["limits"] or ([], [])
         make: Any = cls
-        live: Self = make(model, tracker, Clock.of(extra["dt"], extra["zone"]), extra["lag"], limits=dict(limits))
+        clock = Clock.of(extra["dt"], extra["zone"])
+        live: Self = make(model, by_output(model, trackers), clock, extra["lag"], limits=dict(limits))
         if live._gate is not None:
             live._gate.restore(outside)
         live._last, live._ignored, live._cold = extra["last"], extra["ignored"], extra["cold"]
@@ -225,6 +228,9 @@ class Stream(Plain, storage.Kept):
         live._watching = [
             (lane, LiveAlarm.of(state, trackers[lane], live.programs[lane].names)) for lane, state in extra["alarms"]
         ]
-        storage.restore(source, trackers[0], arrays, "state_", live._fields())
+        if "fields" in header:
+            restore(source, live.programs, header, arrays, live._tile)
+        else:  # an .npz of arrays, as states were before they had bytes of their own
+            storage.restore(source, trackers[0], arrays, "state_", live._fields())
         live._expect(extra["awaits"])
         return live

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import NormalDist
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -25,6 +26,50 @@ def new_figure(width: float, height: float) -> Figure:
     except ImportError:
         raise ImportError('plots need matplotlib: pip install "driftfit[plot]"') from None
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def panels(
+    ax: Any, size: tuple[float, float], count: int = 1, columns: int = 1, *, sharex: bool = False,
+    sharey: bool = False, heights: Sequence[float] | None = None, wide: int = 0,
+) -> tuple[Figure, list[Axes]]:  # fmt: skip
+    """The figure of a picture and its ``count`` panels, row by row.
+
+    ``ax`` is what users pass: None for a new figure of this size in inches; axes, whose place the panels share (a
+    single panel is the axes themselves); or as many axes as the picture has panels. Each of the last ``wide`` panels
+    has a row. ValueError for another number of axes.
+    """
+    if ax is not None:
+        given = list(np.ravel(ax))
+        if len(given) == count:
+            return given[0].figure, given
+        if len(given) != 1:
+            raise ValueError(f"plot: ax= must be one axes, or {count} of them, one for each panel; got {len(given)}.")
+    narrow = count - wide
+    rows = -(-narrow // columns)
+    figure, grid = _grid(ax, size, rows + wide, columns, heights)
+    axes: list[Axes] = []
+    for i in range(count):
+        cell = grid[divmod(i, columns)] if i < narrow else grid[rows + i - narrow, :]
+        first = axes[0] if axes else None
+        axes.append(figure.add_subplot(cell, sharex=first if sharex else None, sharey=first if sharey else None))
+        below = i + columns < narrow or (i < narrow and wide and columns == 1) or narrow <= i < count - 1
+        axes[-1].tick_params(labelbottom=not (sharex and below), labelleft=not (sharey and i % columns))
+    return figure, axes
+
+
+def _grid(ax: Any, size: tuple[float, float], rows: int, columns: int, heights: Sequence[float] | None) -> Any:
+    """(figure, grid of cells): in a new figure, or in the place of the axes, which are hidden."""
+    if ax is None:
+        figure = new_figure(*size)
+        return figure, figure.add_gridspec(rows, columns, height_ratios=heights)
+    (axes,) = np.ravel(ax)
+    axes.set_axis_off()
+    spec = axes.get_subplotspec()
+    if spec is not None:
+        return axes.figure, spec.subgridspec(rows, columns, height_ratios=heights)
+    box = axes.get_position()
+    edges = {"left": box.x0, "right": box.x1, "bottom": box.y0, "top": box.y1}
+    return axes.figure, axes.figure.add_gridspec(rows, columns, height_ratios=heights, **edges)
 
 
 def named(name: str, unit: str) -> str:

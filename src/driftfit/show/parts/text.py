@@ -18,7 +18,7 @@ WIDTH = 96
 
 
 def printed(*parts: Any) -> str:
-    """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
+    """The output of a console of `WIDTH` columns as plain text, the same wherever Python runs.
 
     By default rich sends output to the display of a notebook, and takes colours and widths from the environment.
     """
@@ -31,11 +31,26 @@ def printed(*parts: Any) -> str:
     return text.getvalue()
 
 
+def html_of(*parts: Any) -> str:
+    """The same text as HTML, with its bold and dim letters."""
+    console = Console(
+        file=StringIO(), width=WIDTH, height=100, record=True, force_jupyter=False, force_terminal=False,
+        legacy_windows=False,
+    )  # fmt: skip
+    console.print(*parts)
+    style = "white-space:pre;overflow-x:auto;line-height:normal;font-family:Menlo,Consolas,monospace"
+    return console.export_html(inline_styles=True, code_format=f'<pre style="{style}">{{code}}</pre>')
+
+
 class Printed(JupyterMixin):
     """A result that rich draws: ``str`` returns it as plain text, and a notebook shows it as the value of a cell."""
 
     def __str__(self) -> str:
         return printed(self)
+
+    def _repr_html_(self) -> str:
+        """What notebooks ask for that do not ask rich."""
+        return html_of(self)
 
 
 def key_text(key: Hashable) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
-from driftfit.show.parts.axes import date_axis, frame, new_figure, settled, time_label
+from driftfit.show.parts.axes import date_axis, frame, panels, settled, time_label
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 POINTS = 200
 
 
-def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | None = None) -> Figure:
+def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | None = None, ax: Any = None) -> Figure:
     """Input and output curve at samples ``times`` (four by default), and a, b, c, d over time."""
     from matplotlib import colormaps
 
@@ -27,9 +27,7 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
     T = len(run)
     chosen = [T // 4, T // 2, 3 * T // 4, T - 1] if times is None else [range(T)[t] for t in times]
     colours = colormaps["viridis"](np.linspace(0.0, 0.85, len(chosen)))
-    figure = new_figure(9.0, 6.6)
-    grid = figure.add_gridspec(3, 2, height_ratios=[1.4, 1.0, 1.0])
-    left, right = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    figure, (left, right, *below) = panels(ax, (9.0, 6.6), 6, 2, heights=[1.4, 1.0, 1.0])
     u, y = (_points(signal) for signal in (run.u[:, 0], run.y))
     for t, colour in zip(chosen, colours, strict=True):
         label = run.time_text(t) if run.timed else f"sample {t}"
@@ -38,12 +36,10 @@ def plot_blocks(run: Track, method: str = "svd-joint", times: Sequence[int] | No
     left.set(xlabel=run.labels.u[0] if run.labels.u else "u", ylabel="v", title="input block")
     right.set(xlabel="w", ylabel=run.labels.y, title="output block")
     left.legend(fontsize=8, frameon=False)
-    for place, (group, names, std) in enumerate(
-        zip((found.a, found.b, found.c, found.d), found.names, found.std, strict=True)
-    ):
-        axis = figure.add_subplot(grid[1 + place // 2, place % 2])
+    groups = zip(below, "abcd", (found.a, found.b, found.c, found.d), found.names, found.std, strict=True)
+    for place, (axis, letter, group, names, std) in enumerate(groups):
         _paths(axis, run, group, names, std)
-        axis.set_ylabel("abcd"[place])
+        axis.set_ylabel(letter)
         if place > 1:
             axis.set_xlabel(time_label(run))
         date_axis(axis, run)

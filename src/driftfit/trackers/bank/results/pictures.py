@@ -9,7 +9,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.run.result import Track
-from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, new_figure, time_label
+from driftfit.show.parts.axes import BLUE, GREY, RED, date_axis, draw_parameter, panels, time_label
 from driftfit.trackers.bank.layout import LEAVES
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, WEIGHT
 from driftfit.trackers.bank.reduction import GPB, Decide
@@ -23,11 +23,12 @@ COLOURS = ("#e8e8e8", "#c23b22", "#1f5fa8", "#e0a030", "#4f8f5b", "#7a5195", "#8
 """Colours of events, the normal course first."""
 
 
-def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: list[Event], level: float) -> Figure:
+def plot_hypotheses(
+    run: Track, latest: Array, names: tuple[str, ...], events: list[Event], level: float, ax: Any = None
+) -> Figure:
     """Parameters with bands; under them the probabilities (T, H) of events; changes as lines, faults as shades."""
     n = run.model.n
-    figure = new_figure(9.0, 1.4 * n + 2.6)
-    axes = figure.subplots(n + 1, 1, sharex=True, height_ratios=[*[1.4] * n, 1.6])
+    figure, axes = panels(ax, (9.0, 1.4 * n + 2.6), n + 1, sharex=True, heights=[*[1.4] * n, 1.6])
     for i in range(n):
         draw_parameter(axes[i], run, i, level)
     stack(axes[n], run.time, np.nan_to_num(latest), names)
@@ -41,7 +42,7 @@ def plot_hypotheses(run: Track, latest: Array, names: tuple[str, ...], events: l
                 axis.axvspan(event.first, run.time[last], color=GREY, alpha=0.25, linewidth=0)
     axes[n].set_xlabel(time_label(run))
     date_axis(axes[n], run)
-    figure.align_ylabels()
+    figure.align_ylabels(axes)
     return figure
 
 
@@ -54,10 +55,11 @@ def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=min(len(names), 4), fontsize=8, frameon=False)
 
 
-def plot_tree(live: Live, floors: int = 3) -> Figure:
+def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:
     """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
 
     The newest levels are drawn, with the oldest on the left; each leaf is labelled with its weight and its mean.
+    ``ax``: the axes to draw in; None for a new figure.
     """
     bank: Any = live.tracker
     lane = live.lane()
@@ -66,9 +68,8 @@ def plot_tree(live: Live, floors: int = 3) -> Figure:
     H = len(bank.event_names)
     B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     means = mixture_of(bank, live, lane).means
-    depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
-    figure = new_figure(2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8))
-    axis = figure.subplots()
+    depth = min(levels, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
+    figure, (axis,) = panels(ax, (2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8)))
     axis.set_axis_off()
     codes, weights = B[CODE].astype(int) % H**depth, B[WEIGHT]
     height: dict[tuple[int, ...], float] = {(): (H**depth - 1) / 2.0}

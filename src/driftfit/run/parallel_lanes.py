@@ -22,15 +22,13 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 
 from driftfit.data.record import Records
 from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.program import Program, State, tile_of
+from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
-from driftfit.trackers.base import Tracker
+from driftfit.run.states.layout import words_of
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
@@ -49,27 +47,31 @@ _thread = threading.local()
 
 
 def run_lanes(
-    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State]
+    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State], dtype: Any = np.float64
 ) -> list[Lane | None]:
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
     ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
-    that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
-    ny = records.ny
-    jobs = [job for group in _groups(programs[::ny]) for job in _jobs(programs, records, group, keep)]
+    jobs = prepare(programs, records, keep, dtype)
     for job in jobs:
         for lane, k in enumerate(job.lanes.tolist()):
             for name, value in starts.get(k, {}).items():
                 job.tile[name][0, ..., lane] = value
-    jobs.sort(key=lambda job: -len(job.out))
-    _run_jobs(jobs, records)
+    run_jobs(jobs, records)
     for job in jobs:
         if job.done:
             for lane in np.flatnonzero(job.live).tolist():
                 lanes[job.lanes[lane]] = Lane(job.out, job.tile, lane)
     return lanes
+
+
+def prepare(programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64) -> list[Job]:
+    """Tiles at their start for all series, the longest first."""
+    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep, dtype)]
+    return sorted(jobs, key=lambda job: -len(job.out))
 
 
 class Job:
@@ -87,11 +89,12 @@ class Job:
 def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
-    kinds: dict[Tracker, Any] = {}
+    kinds: dict[int, list[int]] = {}  # most series share one program, and its steps take 100 us to compare
     for k, program in enumerate(programs):
-        if program.tracker not in kinds:
-            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
-        groups[kinds[program.tracker]].append(k)
+        group = kinds.get(id(program))
+        if group is None:
+            group = kinds[id(program)] = groups[program.steps, program.tracker.outputs, program.shapes]
+        group.append(k)
     return list(groups.values())
 
 
@@ -101,7 +104,7 @@ def width_of(program: Program, count: int, ny: int = 1) -> int:
     return ny if wide < 2 * ny else wide
 
 
-def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str) -> Iterator[Job]:
+def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str, dtype: Any) -> Iterator[Job]:
     """Tiles for the series of one group, longest first."""
     ny, program = records.ny, programs[group[0] * records.ny]
     L = width_of(program, len(group), ny)
@@ -114,11 +117,10 @@ def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], k
     longest = records.length[padded[:, 0]]
     ends = np.cumsum(longest)
     # one allocation for all tiles, so that it is large enough for huge pages
-    out = program.written(tiles[:1], int(ends[-1]), keep)
-    run = program.drivers(keep).run
+    out = program.written(tiles[:1], int(ends[-1]), keep, dtype)
     for k, some in enumerate(lanes):
         live = (np.arange(L) < ny * G) & (place < len(order) - k * G)
-        yield Job(run, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
+        yield Job(program.fill, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
 
 
 def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
@@ -134,22 +136,26 @@ def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
     return tiles
 
 
-def _run_jobs(jobs: Sequence[Job], records: Records) -> None:
-    """Run all jobs on a pool of threads and mark those that are done."""
+def run_jobs(jobs: Sequence[Job], records: Records, threads: int | None = None) -> None:
+    """Run all jobs on a pool of threads, one for each core unless their number is given, and mark those that are done.
+
+    On a single thread they run in the calling one.
+    """
     for job in {(job.run, job.tile.dtype, job.out.dtype): job for job in jobs}.values():
         _drive(job, records, 0)  # compiles, so that threads do not wait for each other
+    if threads == 1:
+        for job in jobs:
+            _drive(job, records, len(job.out))
+            job.done = True
+        return
     total = sum(len(job.out) * int(job.live.sum()) for job in jobs)
-    with (
-        Progress(console=Console(stderr=True), transient=True, disable=total <= SHOWN) as progress,
-        ThreadPoolExecutor(cores()) as pool,
-    ):
-        task = progress.add_task("tracking", total=total)
+    with progress("tracking", total, total > SHOWN) as advance, ThreadPoolExecutor(threads or cores()) as pool:
         waiting = {pool.submit(_drive, job, records, len(job.out)): job for job in jobs}
         try:
             for future in as_completed(waiting):
                 future.result()
                 waiting[future].done = True
-                progress.advance(task, len(waiting[future].out) * int(waiting[future].live.sum()))
+                advance(len(waiting[future].out) * int(waiting[future].live.sum()))
         except KeyboardInterrupt:
             pool.shutdown(wait=True, cancel_futures=True)
             for future, job in waiting.items():
@@ -178,9 +184,9 @@ def _drive(job: Job, records: Records, stop: int) -> None:
         _gather_factors(factors, start, column, known if len(known) == 1 else known[:size])
         job.run(job.tile, y[:size], u[:size], known if len(known) == 1 else known[:size], job.out[a:b])
         for lane in np.flatnonzero(length == b).tolist():
-            finals[lane] = _words(job.tile, L)[:, lane].copy()
+            finals[lane] = words_of(job.tile)[:, lane].copy()
     for lane, words in finals.items():
-        _words(job.tile, L)[:, lane] = words
+        words_of(job.tile)[:, lane] = words
 
 
 def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:
@@ -190,12 +196,6 @@ def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Ar
         _thread.shapes, _thread.block = shapes, tuple(np.empty(shape) for shape in shapes)
     block: tuple[Array, Array, Array] = _thread.block
     return block
-
-
-def _words(tile: Array, L: int) -> Array:
-    """The fields of a tile as (words, L): one column is the whole state of one lane."""
-    flat = tile.view(np.int64).reshape(-1)
-    return flat[: len(flat) // L * L].reshape(-1, L)
 
 
 @Driver
@@ -216,7 +216,8 @@ def _gather_signals(y: Array, u: Array, start: Array, column: Array, to_y: Array
 
 @Driver
 def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) -> None:
-    """The same for what is known of the samples (one row if it is the same for all); dt = 0 for a lane that has ended.
+    """The same for the known numbers of the samples (one row if they are equal for all); dt = 0 for a lane that has
+    ended.
 
     ``known`` is (T, k, ny).
     """

@@ -1,0 +1,1 @@
+"""States as bytes, and many of them continued in parallel."""

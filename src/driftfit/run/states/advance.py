@@ -1,0 +1,78 @@
+"""Many series continued from their states, in the lanes of tiles; results as columns in the order of their samples.
+
+What a process does that is given some samples of many series, their states, and no time: no `Track` is made for each
+of them. The samples, results and states of a series are those of its record, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from driftfit.data.record import Records
+from driftfit.engine.kernel import Array, Driver
+from driftfit.run.parallel_lanes import Job, prepare, run_jobs
+from driftfit.run.program import Program
+
+
+class Advanced:
+    """The results of a driver for all series of ``records``, and their final states."""
+
+    def __init__(self, programs: Sequence[Program], records: Records, jobs: Sequence[Job]) -> None:
+        self.programs, self.records, self.jobs = programs, records, jobs
+
+    def column(self, name: str) -> Array:
+        """A field of the output at every sample of every series, (N,) or (N, n)."""
+        shape = self.jobs[0].out[name].shape[1:-1]
+        into = np.empty((len(self.records.y), int(np.prod(shape))))
+        for job in self.jobs:
+            lanes = np.flatnonzero(job.live)
+            series = job.lanes[lanes]
+            field = job.out[name].reshape(len(job.out), -1, len(job.lanes))
+            _natural(field, lanes, self.records.first[series], self.records.length[series], into)
+        return into.reshape(-1, *shape)
+
+    def lanes(self) -> list[tuple[Job, int]]:
+        """The job and the lane of each series."""
+        found: list[tuple[Job, int]] = [(self.jobs[0], 0)] * len(self.programs)
+        for job in self.jobs:
+            for lane in np.flatnonzero(job.live).tolist():
+                found[job.lanes[lane]] = job, lane
+        return found
+
+    def states(self) -> list[Array]:
+        """The words of each series after its last sample, as `driftfit.run.states.layout.Layout.pack` takes them."""
+        found: list[Array] = [np.zeros(0)] * len(self.programs)
+        for job in self.jobs:
+            words = self.programs[job.lanes[0]].layout.taken(job.tile)
+            for lane in np.flatnonzero(job.live).tolist():
+                found[job.lanes[lane]] = words[lane]
+        return found
+
+
+def advance(
+    programs: Sequence[Program], records: Records, states: Mapping[int, Array], threads: int | None = None
+) -> Advanced:
+    """Run every series of one output by its program, from its state if there is one.
+
+    ``states`` maps the number of a series to the words of its state (`Layout.unpack`); the others begin at their start.
+    """
+    jobs = prepare(programs, records, "std")
+    for job in jobs:
+        begun = np.array([k in states for k in job.lanes.tolist()])
+        if begun.any():
+            words = np.stack([states[k] for k in job.lanes[begun].tolist()])
+            programs[job.lanes[0]].layout.put(job.tile, np.flatnonzero(begun), words)
+    run_jobs(jobs, records, threads)
+    return Advanced(programs, records, jobs)
+
+
+@Driver
+def _natural(field: Array, lanes: Array, first: Array, length: Array, into: Array) -> None:
+    """Copy lanes of a field (T, k, L) to their rows of (N, k)."""
+    for j in range(len(lanes)):
+        l = lanes[j]
+        for t in range(length[j]):
+            for i in range(field.shape[1]):
+                into[first[j] + t, i] = field[t, i, l]

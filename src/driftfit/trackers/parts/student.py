@@ -1,0 +1,38 @@
+"""The predictive density where the noise variance is estimated: Student's t.
+
+    y_t | past ~ t_nu(y_hat_t, s_t),   s_t = scale s0_t,   scale = sum(e^2 / s0) / nu over the nu samples before
+    log p = lgamma((nu + 1) / 2) - lgamma(nu / 2) - 1/2 log(pi nu s_t) - (nu + 1) / 2 log(1 + e^2 / (nu s_t))
+
+This is exact for constant parameters with the improper prior 1 / sigma^2 of the noise variance: the sum is the log
+evidence given the samples that determined the parameters and the first residual, since no density of the first
+residual exists (nu = 0: NaN). A Gaussian density with an estimated variance instead counts an innovation of ten
+estimated standard deviations as fifty nats, where after one residual it is a matter of course. The degrees of freedom
+are the number of residuals, also while parameters drift or are forgotten.
+
+Source: Gelman et al., Bayesian Data Analysis (2013), section 14.2; West and Harrison (1997), section 4.5. Cost: O(1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy
+
+from driftfit.engine.kernel import Array
+
+
+def log_student(e: Array, s: Array, nu: Array) -> Array:
+    """Log densities of innovations e whose squares are about s, with nu degrees of freedom; NaN where nu is 0."""
+    known = np.where(nu > 0.0, nu, np.nan)
+    gamma = scipy.special.gammaln
+    ratio = gamma(0.5 * (known + 1.0)) - gamma(0.5 * known)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        far = 0.5 * (known + 1.0) * np.log1p(e * e / (known * s))
+        return np.asarray(ratio - 0.5 * np.log(np.pi * known * s) - far)
+
+
+def residuals_before(ok: Array, s: Array, first: float) -> Array:
+    """The number of residuals before each sample (T,), ``first`` before all of them: of used samples that did not
+    determine a new direction (s = inf).
+    """
+    counted = ok & ~np.isinf(s)
+    return np.asarray(first + np.cumsum(counted) - counted)
