@@ -15,7 +15,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.conformal import quantile, widened
+from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
