@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from river import datasets, dummy, evaluate, linear_model, metrics, optim, preprocessing, stats
 
-from driftfit import RLS, AdaptiveKalman, Kalman
+from driftfit import RLS, Kalman
 from driftfit.bridges.river import TrackedRegressor
 
 Stream = list[tuple[dict[str, float], float]]

@@ -89,7 +89,7 @@ def test_a_unit_is_run_in_parts(monkeypatch):
     """A piece ends where a unit ends; a longer unit is cut, and goes on from its state."""
     import pyarrow as pa
 
-    from driftfit.bridges.spark.batch import Partition, _schema
+    from driftfit.bridges.spark.batch import Partition, schema_of
 
     monkeypatch.setattr(tasks, "ROWS", 100)
     rows = pl.concat([rows_of(6, 1, 60), rows_of(1, 2, 900).with_columns(unit=pl.lit("z"))]).sort("unit", "t")
@@ -99,7 +99,7 @@ def test_a_unit_is_run_in_parts(monkeypatch):
     batches = rows.to_arrow().cast(types).to_batches(30)
     sizes, tables = [], {kind: [] for kind in ("samples", "states")}
     for kind, parts in tables.items():
-        part = Partition(task, kind, _schema(task, kinds, kind))
+        part = Partition(task, kind, schema_of(task, kinds, kind))
         for table, more in tasks.chunks(iter(batches), ("unit",), parts=True):
             sizes.append(table.num_rows)
             parts += part.run(table, more)
@@ -243,3 +243,46 @@ def test_a_flow_is_pickled_without_what_it_has_made():
     again = pickle.loads(pickle.dumps(Flow(task, {}, 0.0)))
     assert again.task == task
     assert "program" not in vars(again.task)
+
+
+def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_path):
+    """The step by itself, numbers and dates; and the stream, where PySpark has row-based keyed state."""
+    from pyspark.sql.group import GroupedData
+
+    from driftfit.bridges.spark.keyed import Unit
+
+    rows = rows_of(1, 3, 80)
+    y, u, t = (rows[name].to_numpy() for name in "yut")
+    for dated in (False, True):
+        hold = np.timedelta64(4, "s") if dated else HOLD
+        task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t", "1s" if dated else None)
+        time = (t * 1e6).astype("M8[us]") if dated else t
+        unit, state, found = Unit(task, hold, dated), None, []
+        order = np.argsort(t + np.random.default_rng(1).uniform(0.0, 3.5, len(t)), kind="stable")
+        for part in np.array_split(order, 12):
+            stamps = time[part].astype(int) if dated else time[part]
+            given = [("a", *row) for row in zip(stamps.tolist(), y[part].tolist(), u[part].tolist(), strict=True)]
+            state, some = unit.step(state, [*given, given[0], ("a", None, 1.0, 1.0)])
+            found += some
+        run = fleet_of(rows)["0"]
+        good = [one for one in found if "failed" not in one]
+        assert len(good) > len(run) - 6
+        for name, path in (("prediction", run.prediction), ("theta_b1[u]", run.theta[:, 2]), ("std_a1", run.std[:, 0])):
+            assert same([one[name] for one in good], path[: len(good)])
+        assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
+        assert len(state) < 1100
+    if not hasattr(GroupedData, "transformWithState"):
+        return
+    session.conf.set("spark.sql.streaming.stateStore.providerClass",
+                     "org.apache.spark.sql.execution.streaming.state.RocksDBStateStoreProvider")  # fmt: skip
+    few = rows_of(3, 3, 60)
+    keyed = spark.follow_keyed(stream_of(session, tmp_path / "in", few, files=2), MODEL, K, hold=HOLD, **COLUMNS)
+    query = (
+        keyed.writeStream.format("parquet").option("path", str(tmp_path / "out"))
+        .option("checkpointLocation", str(tmp_path / "check")).trigger(availableNow=True).start()
+    )  # fmt: skip
+    query.awaitTermination()
+    due = few.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
+    expected = fleet_of(due).to_table().sort("unit", "t")
+    good = pl.read_parquet(tmp_path / "out" / "*.parquet").filter(pl.col("failed").is_null()).sort("unit", "t")
+    assert good.select(expected.columns).equals(expected)

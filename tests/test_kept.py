@@ -1,6 +1,9 @@
 """What a run keeps of every sample, and in which precision: the rest of the results is the same, from a second pass."""
 
+import sys
+
 import numpy as np
+import polars as pl
 import pytest
 from support import arx_record, damaged, same
 from test_bank import N, R, changes
@@ -68,6 +71,25 @@ def test_fleets(tmp_path):
     for fleet in (lean, Fleet.load(tmp_path / "fleet")):
         assert same(fleet[17].theta, full[17].theta.astype(np.float32))
         assert same(fleet[17].std, full[17].std)
+
+
+def test_a_fleet_is_written_part_by_part(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules["driftfit.run.track"], "PART", 30_000)
+    rng = np.random.default_rng(0)
+    table = pl.DataFrame({"pump": np.repeat(np.arange(40), rng.integers(5, 40, 40)).astype(str)})
+    table = table.with_columns(y=rng.standard_normal(len(table)), u=rng.standard_normal(len(table)))
+    given = {"y": "y", "u": "u", "data": table, "by": "pump"}
+    written = track(ARX(2, 2), K, **given, to=tmp_path / "all")
+    assert (written.series, written.rows) == (40, len(table))
+    files = sorted((tmp_path / "all").iterdir())
+    assert len(files) > 2
+    assert pl.read_parquet(files).equals(track(ARX(2, 2), K, **given).to_table())
+    grid = track(ARX(2, 2), [K, K], *rng.standard_normal((2, 500)), to=tmp_path / "grid", keep="theta")
+    assert (grid.series, grid.rows) == (2, 1000)
+    with pytest.raises(ValueError, match="exists and is not empty"):
+        track(ARX(2, 2), K, **given, to=tmp_path / "all")
+    with pytest.raises(ValueError, match="to= is for many series"):
+        track(ARX(2, 2), K, *rng.standard_normal((2, 50)), to=tmp_path / "one")
 
 
 def test_what_is_refused():

@@ -9,6 +9,7 @@ from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
     DeadZone,
@@ -76,6 +77,7 @@ __all__ = [
     "DataWarning",
     "DeadZone",
     "Decide",
+    "Equation",
     "ExtendedKalman",
     "FirstFloor",
     "Fleet",

@@ -137,7 +137,7 @@ def test_operations_are_typed_once(monkeypatch):
     plus = cpu_target.typing_context.resolve_value_type(operator.add)
     pair = types.float64, types.float64
     implementation = plus._impl_keys[pair]
-    plus._impl_keys[pair] = "of a function with other options"
+    monkeypatch.setitem(plus._impl_keys, pair, "of a function with other options")
     tried = []
     monkeypatch.setattr(
         AbstractTemplate,

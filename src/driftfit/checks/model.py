@@ -15,7 +15,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.results import Track
-from driftfit.run.lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.smooth.problem import replay
 from driftfit.streams import Live
 from driftfit.trackers.kalman import Kalman

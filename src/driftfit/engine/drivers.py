@@ -32,7 +32,9 @@ WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
 LARGEST = 1e38
-"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+"""Signals at least this large are not used: about the largest number in single precision, and more than any
+measurement.
+"""
 
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
@@ -54,9 +56,9 @@ def no_preparation(L: int) -> None:
 
 
 class ModelSteps(NamedTuple):
-    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
+    """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` brings what they call by symbol within reach, before a tile of L lanes is driven for the first time.
+    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
     """
 
     regress: Step
@@ -66,7 +68,7 @@ class ModelSteps(NamedTuple):
 
 @kernel
 def clean(s: State, l: int) -> None:
-    """Decide what can be used, and make everything that trackers read finite.
+    """Decide which data can be used, and make everything that trackers read finite.
 
     Entries of phi and y are cleaned by themselves: zeroing all of phi when only y is missing would make an ARX model's
     own prediction zero and so bias its lags.
@@ -101,26 +103,26 @@ def unknown(s: State, l: int) -> None:
 
 @kernel
 def nothing_more(o: State, s: State, l: int) -> None:
-    """Store nothing beside the common fields."""
+    """Store nothing but the common fields."""
 
 
 @kernel
-def nothing_told(s: State, known: Array, t: int, l: int) -> None:
-    """Take nothing from further columns of what is known."""
+def nothing_extra(s: State, known: Array, t: int, l: int) -> None:
+    """Ignore extra columns."""
 
 
 class TrackerSteps(NamedTuple):
-    """What a tracker compiles.
+    """The steps of a tracker.
 
-    ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
-    happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
-    that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
-    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
-    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
-    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
-    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
+    ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change), ``correct`` the
+    measurement update. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use ``s.ok`` (0 or 1)
+    as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that start from no
+    knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are the routines that it calls by symbol;
+    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
+    tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
+    columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
+    ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -128,8 +130,8 @@ class TrackerSteps(NamedTuple):
     report: Step = diagonal
     begin: Step | None = None
     store: Any = nothing_more
-    told: Any = nothing_told
-    note: Any = nothing_more
+    read_extra: Any = nothing_extra
+    store_for_smoother: Any = nothing_more
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
@@ -313,8 +315,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
-    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
+    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does
+    one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     regress, push, ready = model
@@ -323,10 +325,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
     sample = _sample(regress, push, _advance(tracker))
-    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+    run = _run(driver, sample, tracker.read_extra, tracker.store, covariance if keep == "cov" else nothing_more)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
         y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
         _check_shapes(tile, len(out), y, u, known)
         ready(tile["theta"].shape[2])
@@ -356,7 +358,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: Any, keep_more: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
@@ -374,7 +376,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, ke
                 s.drift[l] = known[t * changing, 2, l]
             if known.shape[1] > 3:
                 for l in range(L):
-                    told(s, known, t, l)
+                    read_extra(s, known, t, l)
             if given:
                 for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
                     for l in range(L):
@@ -450,4 +452,4 @@ def tile_type(tile: Array) -> types.Type:
 
 
 _TILE_TYPES: dict[Any, types.Type] = {}
-"""Types by what they depend on, one for each kind of tile that was compiled."""
+"""Record types by their fields, one for each kind of tile that was compiled."""

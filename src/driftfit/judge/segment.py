@@ -32,8 +32,8 @@ from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import regressors
-from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.segments.joint import jointly
+from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
 from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
 from driftfit.judge.statistics.robust import orthonormal, robust_fit

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.record import Records
-from driftfit.run.lanes import run_lanes
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
+from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
-class Fleet(Many):
+class Fleet(KeyedResults):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.

@@ -23,14 +23,14 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
 
-class Outputs(Many):
+class Outputs(KeyedResults):
     """A record with several outputs, each with its own theta.
 
     Attributes

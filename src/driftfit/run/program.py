@@ -217,7 +217,7 @@ def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
     return "cov" if "P" in names else "std" if "var" in names else "theta", rows["theta"].base
 
 
-STANDING = ("interval", "noise", "drift", "each")
+STANDING = ("interval", "noise", "drift", "drift_root")
 """Fields with the known factors of one sample."""
 
 

@@ -121,7 +121,8 @@ class Track(Plain):
     @property
     def undetermined(self) -> Array:
         """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""
-        return np.isinf(self._lane.tile["var"][0, :, self._lane.lane])
+        var: Array = self._lane.tile["var"][0, :, self._lane.lane]
+        return np.isinf(var)
 
     def written(self, name: str) -> Array:
         """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example.

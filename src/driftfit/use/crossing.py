@@ -55,7 +55,7 @@ class Crossing:
     Attributes
     ----------
     name, limit, side
-        What crosses which limit, and whether it is then "below" or "above" it.
+        Which quantity crosses which limit, and whether it is then "below" or "above" it.
     probability : float
         Probability that it crosses within ``horizon`` samples.
     median, low, high : float

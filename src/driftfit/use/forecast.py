@@ -72,7 +72,7 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
 
 
 def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
-    """`forecast` from where a stream stands; while `apply` is outstanding the first row of u is what that brings."""
+    """`forecast` from the present state of a stream; while `apply` is outstanding, the first row of u is its input."""
     return forecast_from(live.program, *live.driven_on(future(live.model, h, u)))
 
 

@@ -94,11 +94,11 @@ def track(
     rows = rows_of(df, task, settings)
     order = [*task.by, task.time, task.y, *task.u]
     sorted_rows = rows.repartition(*task.by).sortWithinPartitions(*order)
-    made = _schema(task, dict(rows.dtypes), outputs)
+    made = schema_of(task, dict(rows.dtypes), outputs)
     return sorted_rows.mapInArrow(_worker(task, outputs, made), ", ".join(f"`{n}` {kind}" for n, kind in made.items()))
 
 
-def _schema(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, str]:
+def schema_of(task: Task, kinds: Mapping[str, str], outputs: str) -> dict[str, str]:
     """Columns and types of a result, before any data."""
     own = {name: kinds[name] for name in (*task.by, task.time)}
     if outputs == "samples":

@@ -83,13 +83,13 @@ def follow(
         raise ValueError(f"spark.follow: a rule of kind {rule.kind!r} is not for Spark; use 'innovation' or 'band'.")
     schema = _schema(task, kinds, rule is not None)
     store = Store(stream.sparkSession, path)
-    flow = Flow(task, schema, _duration("hold", hold, dated), rule, _before(store, task, schema, migrate))
-    run = _Batches(store, flow, settings, initial, None if expire is None else _duration("expire", expire, dated), sink)
+    flow = Flow(task, schema, duration("hold", hold, dated), rule, _before(store, task, schema, migrate))
+    run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
     writer = stream.writeStream.foreachBatch(run).option("checkpointLocation", f"{store.path}/checkpoint")
     return writer.trigger(**(trigger or {"processingTime": "0 seconds"})).start()
 
 
-def _duration(name: str, value: Any, dated: bool) -> Any:
+def duration(name: str, value: Any, dated: bool) -> Any:
     """A span of time in the type of times."""
     span = value if isinstance(value, int | float) and not dated else Clock.of(value).duration if value else 0
     if dated and not value:

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array, Driver
-from driftfit.judge.statistics.break_dates import add, dated, whiten
 from driftfit.judge.segments.thresholds import thresholds
+from driftfit.judge.statistics.break_dates import add, dated, whiten
 from driftfit.judge.statistics.noise import Noise, Search, whitened
 from driftfit.judge.statistics.partition import partition
 from driftfit.judge.statistics.robust import cholesky, deviation, solved

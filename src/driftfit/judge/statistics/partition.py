@@ -8,7 +8,7 @@ counts as one, whatever its value is.
 
 A start s with F(s) + C(s, t) - p >= F(t) can never be the last break of a longer record and is dropped (as soon as
 segments from t on are long enough to be allowed), so that the cost is O(T) if breaks occur regularly, and O(T^2) in the
-number of blocks if there are none. Breaks may lie between blocks only. Source: Killick, Fearnhead and Eckley (2012),
+number of blocks if there are none. Breaks can only be between blocks. Source: Killick, Fearnhead and Eckley (2012),
 PELT.
 """
 
@@ -95,7 +95,7 @@ class Space(NamedTuple):
 def _partition(G: Array, ends: Array, penalty: float, least: int, p: int, F: Array, last: Array, space: Space) -> None:
     """F (m + 1,), and the start of the last segment of the first t blocks, last (m + 1,).
 
-    The cost of a segment never falls as it grows, so what it was at an earlier end is a bound, and where that exceeds
+    The cost of a segment never falls as it grows, so its value at an earlier end is a bound, and where that exceeds
     the best total so far it is not computed again.
     """
     total, M, seen, alive, expired, value = space

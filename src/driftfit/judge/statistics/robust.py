@@ -3,7 +3,7 @@
     theta solves sum phi_t psi(e_t) = 0,    e_t = y_t - phi_t' theta,    psi(e) = e clipped at 1.5 scales of the noise
 
 solved by iteratively reweighted least squares. The scale is 1.4826 times the median of the absolute residuals. Normal
-equations are solved in an orthonormal basis of the regressors, so that their conditioning is that of what changes
+equations are solved in an orthonormal basis of the regressors, so that their conditioning is that of the variation
 within the record; a direction that a part of the record does not excite stays at zero there. Source: Huber (1964).
 Cost: O(N n^2) per iteration, usually ten.
 """

@@ -24,7 +24,9 @@ class _Later:
 LATER: Any = _Later()
 
 NOTHING, INPUT, IGNORED = 0, 1, 2
-"""What `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored sample."""
+"""The input that `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored
+sample.
+"""
 
 
 def applier(model: Model, tracker: Tracker, tile: Array) -> Any:

@@ -130,14 +130,14 @@ class Live(Operated, Stream):
         (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
-            return self._update_told(y, u, time, weight, drift, prob)
+            return self._update_with_extra(y, u, time, weight, drift, prob)
         if weight != 1.0 or drift != 1.0 or self._careful:
             return self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
         if type(u) is not float or self._m != 1:
             if u is LATER and self._m:
-                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
+                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
             u = self._floats(u)
         if time is None:
             return self._update(self._seen, y, u)  # type: ignore[no-any-return]
@@ -174,16 +174,16 @@ class Live(Operated, Stream):
         self._interval[0] = resting
         return step
 
-    def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
-            self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
+            self.tracker.set_extra(self.lane(), self.model, prob, drift if each else None)
         try:
             return self._sample(y, u, time, weight, 1.0 if each else float(drift))  # type: ignore[no-any-return]
         finally:
             if each or prob is not None:
-                self.tracker.tell(self.lane(), self.model, None, None)
+                self.tracker.set_extra(self.lane(), self.model, None, None)
 
     def _factors(self, interval: float, weight: Any, drift: Any) -> tuple[float, float, float]:
         noise = 1.0 if weight == 1.0 else float(noise_of(weight))
@@ -213,7 +213,7 @@ class Live(Operated, Stream):
     def _settle(self, held: bool, told: bool) -> None:
         self._rest(HELD if held else ORDINARY)
         if told:
-            self.tracker.tell(self.lane(), self.model, None, None)
+            self.tracker.set_extra(self.lane(), self.model, None, None)
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
@@ -236,7 +236,7 @@ class Live(Operated, Stream):
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
 
-        Row 0 is what `Track.smooth` would give for that sample of a record that ends now.
+        Row 0 equals the result of `Track.smooth` at that sample for a record that ends now.
         """
         ((_, window),) = self._windowed()
         return window.smooth(self._tile)

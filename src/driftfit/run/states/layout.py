@@ -36,7 +36,7 @@ from driftfit.engine.kernel import Array
 MAGIC, FORMAT = b"DFst", 1
 HEAD = Struct("<4sHHI8sI")
 CHECKED = 12
-"""Where that begins which the CRC covers."""
+"""The first byte that the CRC covers."""
 MANY = 512
 """From this number of words on, zeros are left out where that makes the bytes fewer."""
 WORD = np.dtype("<i8")

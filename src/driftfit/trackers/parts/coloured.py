@@ -33,7 +33,7 @@ SURE = 5.0
 MOST = 0.95
 """Largest size of c: the past is forgotten at this rate at least."""
 GAP = 1.5
-"""A longer interval, in nominal ones, separates a sample from its past."""
+"""Intervals longer than this, in nominal ones, separate a sample from its past."""
 
 
 def white(n: int) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def whiten_noise(s: State, l: int) -> None:
 
 @kernel
 def learn_colour(s: State, l: int) -> None:
-    """c, and the past of the next sample; s.theta is still what was predicted."""
+    """Update c, and store the past of the next sample; s.theta is still the prediction."""
     c, v = s.colour_used[l], s.past_y[l]
     ordinary = s.weighed[l] * (1.0 - s.odd[l])
     for i in range(s.theta.shape[0]):

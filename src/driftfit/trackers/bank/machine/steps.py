@@ -6,7 +6,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
-from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.adaptive_kalman import RESIDUALS
 from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
@@ -49,13 +49,14 @@ from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 
 
 @kernel
 def keep(o: State, s: State, l: int) -> None:
-    """Store what tells of events."""
+    """Store the report of events."""
     size, L = o.report.shape
     said = floats(report_at(s), size, L)
     for k in range(size):
@@ -64,7 +65,7 @@ def keep(o: State, s: State, l: int) -> None:
 
 @kernel
 def only_drift(s: State, l: int) -> None:
-    """The first change, for the one filter before the bank starts."""
+    """The time update by the first change, for the single filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
     keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
     at = 0
@@ -97,7 +98,7 @@ def only_drifted(s: State, l: int) -> None:
 
 @kernel
 def point(s: State) -> None:
-    """Write where the arrays are into the table."""
+    """Write the addresses of the arrays into the table."""
     framed = s.framed[0] > 0
     s.table[MEMORY_AT, 0, 0] = memory_at(s)
     s.table[REPORT_AT, 0, 0] = report_at(s)
@@ -118,7 +119,7 @@ def report(s: State, l: int) -> None:
 
 @kernel
 def among(s: State, l: int) -> None:
-    """The same for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
+    """The same for one of several outputs: the numbers of one lane are not contiguous, so it works on copies."""
     n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
     N, size = s.table[MEMORY_AT, 2, 0], s.table[REPORT_AT, 2, 0]
     own_memory, own_report = floats(memory_at(s), N, L), floats(report_at(s), size, L)
@@ -167,7 +168,7 @@ def among(s: State, l: int) -> None:
 
 @kernel
 def run(s: State, l: int) -> None:
-    """The compiled routine; addresses are no part of the state."""
+    """Call the compiled routine; addresses are not part of the state."""
     if s.theta.shape[1] > 1:
         among(s, l)
     else:
@@ -180,7 +181,7 @@ def run(s: State, l: int) -> None:
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """The numbers of this sample, for the compiled routine."""
+    """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
@@ -190,11 +191,11 @@ def hand_over(s: State, l: int) -> None:
 
 @kernel
 def alone(s: State, l: int, counts: bool) -> None:
-    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     s.sample[FREEDOM, l] = s.count[l] if s.unknown[l] > 0 else np.inf
     if counts:
-        learn_start(s, l)
+        learn_scale(s, l)
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
@@ -226,7 +227,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def in_coordinates(s: State, l: int) -> None:
-    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
+    """Process one sample in the coordinates of the start; a sample outside the span changes no weight."""
     column, y_hat = whiten_within(s, l), prediction(s, l)
     write_walks(s, l)
     hand_over(s, l)
@@ -264,7 +265,7 @@ def begin(s: State, l: int) -> None:
 
 @kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
+    """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
     row, column = t if known.shape[0] > 1 else 0, 3
     memory = floats(memory_at(s), s.table[MEMORY_AT, 2, 0], s.theta.shape[1])
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):

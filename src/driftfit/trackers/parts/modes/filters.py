@@ -5,7 +5,7 @@
     a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
+with v_j the noise of level j (`driftfit.trackers.parts.modes.noise_levels`), c and nu the probabilities of filters and
 levels. An outlier's level is as wide as the innovation if that is larger than the level itself: its influence does not
 grow with its distance. The filters use the coordinates z = M theta of their start, in which the regressor is x
 (`driftfit.trackers.parts.coordinates`): any units, any offset, and directions without information. A regressor
@@ -27,7 +27,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
-from driftfit.trackers.parts.noise_levels import OUTLIER
+from driftfit.trackers.parts.modes.noise_levels import OUTLIER
 from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
@@ -137,7 +137,7 @@ def as_predicted(s: State, nearest: float, l: int) -> None:
 
 @kernel
 def predictive_density(s: State, nearest: float, l: int) -> None:
-    """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
+    """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
     repeat, and with a tail that integrates to 1."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
@@ -182,7 +182,7 @@ def weigh(s: State, l: int) -> None:
         for k in range(K):
             s.nu[j, l] += s.joint[j, k, l]
     s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
-    # an outlier says nothing about the level: the chain keeps what it was
+    # an outlier says nothing about the level: the chain keeps its state
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
 
@@ -217,7 +217,7 @@ def update_filters(s: State, l: int) -> None:
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The first coordinate of which this sample tells `OUTGROWN` times as much as all before it, or -1."""
+    """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1."""
     others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
     for j in range(s.theta.shape[0]):
         own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
@@ -229,7 +229,7 @@ def outgrown(s: State, l: int) -> int:
 
 @kernel
 def enter_filters(s: State, j: int, l: int) -> None:
-    """Row j of M becomes what is left of phi; all filters take in z_j from what is left of the innovation."""
+    """Row j of M becomes the rest of phi; all filters are updated in z_j by the rest of the innovation."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     y_hat, e, v = s.y_hat[l], s.e[l], s.s[l]
     for i in range(j, n):

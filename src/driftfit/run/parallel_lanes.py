@@ -29,7 +29,6 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
 from driftfit.run.states.layout import words_of
-from driftfit.trackers.base import Tracker
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
@@ -53,7 +52,7 @@ def run_lanes(
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
     ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
-    that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
     jobs = prepare(programs, records, keep, dtype)
@@ -90,11 +89,12 @@ class Job:
 def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
-    kinds: dict[Tracker, Any] = {}
+    kinds: dict[int, list[int]] = {}  # most series share one program, and its steps take 100 us to compare
     for k, program in enumerate(programs):
-        if program.tracker not in kinds:
-            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
-        groups[kinds[program.tracker]].append(k)
+        group = kinds.get(id(program))
+        if group is None:
+            group = kinds[id(program)] = groups[program.steps, program.tracker.outputs, program.shapes]
+        group.append(k)
     return list(groups.values())
 
 
@@ -216,7 +216,8 @@ def _gather_signals(y: Array, u: Array, start: Array, column: Array, to_y: Array
 
 @Driver
 def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) -> None:
-    """The same for what is known of the samples (one row if it is the same for all); dt = 0 for a lane that has ended.
+    """The same for the known numbers of the samples (one row if they are equal for all); dt = 0 for a lane that has
+    ended.
 
     ``known`` is (T, k, ny).
     """

@@ -1,7 +1,7 @@
 """Changing noise and outliers: levels f_j r of the noise variance are modes of a Markov chain.
 
 The last level is for outliers: it has probability 0.02 at every sample and does not affect the other levels, which form
-a persistent chain (stay, or one rung up or down). r itself adapts to what the levels do not explain,
+a persistent chain (stay, or one rung up or down). r itself adapts to changes that the levels do not explain,
 
     log r <- log r + (sum_j p_j (e^2 / s_j - 1) + sum_j nu_j log f_j) / memory
 
@@ -28,11 +28,11 @@ OUTLIER = 0.02
 START = 0.7
 """Probability of the first level before the first sample; the others are equally likely."""
 MEMORY = 70.0
-"""Samples over which r is remembered."""
+"""Memory of r, in samples."""
 IN_A_ROW, RISE = 4.0, 0.3
 """From the third outlier in a row on (`driftfit.trackers.parts.outlying_readings`), log r rises by this with each."""
 FINEST = 1e-12
-"""r is never below this share of the mean square of y: the data's own rounding."""
+"""r is never below this share of the mean square of y: the rounding of the data."""
 
 
 def any_level() -> dict[str, Any]:
@@ -59,7 +59,7 @@ def level_chain() -> Array:
 
 @kernel
 def finest(s: State, l: int) -> float:
-    """What r is never below."""
+    """The lower bound of r."""
     return max(FINEST * s.power[l], s.coarse[l])  # type: ignore[no-any-return]
 
 
@@ -79,7 +79,9 @@ def noise_prior(s: State, l: int) -> None:
 
 @kernel
 def learn_noise(s: State, l: int) -> None:
-    """r follows what the ordinary levels leave unexplained, and moves towards the level in use."""
+    """r follows the part of the innovations that the ordinary levels do not explain, and moves towards the level in
+    use.
+    """
     K, J = s.mu.shape[0], s.nu.shape[0]
     surprise, level = 0.0, 0.0
     more = lasting(s, l)
