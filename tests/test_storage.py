@@ -231,9 +231,10 @@ def test_a_failure_while_writing_leaves_the_old_file(saved, monkeypatch):
 
 
 def test_a_failure_at_the_first_writing_leaves_nothing(tmp_path, monkeypatch):
+    run = track(ARX(2, 2), RLS(0.9), Y, U)
     monkeypatch.setattr(os, "replace", lambda *paths: (_ for _ in ()).throw(OSError("busy")))
     with pytest.raises(OSError, match="busy"):
-        track(ARX(2, 2), RLS(0.9), Y, U).save(tmp_path / "run")
+        run.save(tmp_path / "run")
     assert os.listdir(tmp_path) == []
 
 
