@@ -155,9 +155,10 @@ def test_a_stream_gives_what_the_sorted_table_gives(session, tmp_path):
     unit = max(fleet, key=lambda key: len(fleet[key]))
     alarms = Live(MODEL, K)
     watch = alarms.detect(rule)
-    on = [(alarms.update(*row), watch.active)[1] for row in due.filter(pl.col("unit") == unit).select("y", "u").rows()]
-    if (due.filter(pl.col("unit") == unit)["t"].diff().drop_nulls() == 1.0).all():
-        assert found.filter(pl.col("unit") == unit)["alarm"].to_list() == on
+    own = due.filter(pl.col("unit") == unit).select("y", "u", "t").rows()
+    on = [(alarms.update(y, u, time=t), watch.active)[1] for y, u, t in own]
+    assert len(on) > 60  # alarms are judged after fifty samples
+    assert found.filter(pl.col("unit") == unit)["alarm"].to_list() == on
     states = {unit: state for unit, state in store.states().select("unit", "state").collect()}
     for key, one in fleet.items():
         assert bytes(states[key])[24:] == one.program.pack(one._lane.tile, one._lane.lane)[24:]
@@ -205,7 +206,7 @@ def test_a_stream_begins_with_states_and_ends_silent_units(session, tmp_path):
     found = polars(store.results())
     assert found.filter(pl.col("unit") != "new").select(expected.columns).equals(expected)
     assert [row[0] for row in store.states().select("unit").collect()] == ["new"]
-    assert store.read("expired").count() == len(first["unit"].unique() if False else rows["unit"].unique())
+    assert store.read("expired").count() == rows["unit"].n_unique()
 
 
 def test_what_cannot_run_is_said_before_any_job(session):
@@ -245,10 +246,8 @@ def test_a_flow_is_pickled_without_what_it_has_made():
     assert "program" not in vars(again.task)
 
 
-def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_path):
-    """The step by itself, numbers and dates; and the stream, where PySpark has row-based keyed state."""
-    from pyspark.sql.group import GroupedData
-
+def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
+    """The step by itself, with numbers and dates."""
     from driftfit.bridges.spark.keyed import Unit
 
     rows = rows_of(1, 3, 80)
@@ -271,18 +270,3 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_
             assert same([one[name] for one in good], path[: len(good)])
         assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
         assert len(state) < 1100
-    if not hasattr(GroupedData, "transformWithState"):
-        return
-    session.conf.set("spark.sql.streaming.stateStore.providerClass",
-                     "org.apache.spark.sql.execution.streaming.state.RocksDBStateStoreProvider")  # fmt: skip
-    few = rows_of(3, 3, 60)
-    keyed = spark.follow_keyed(stream_of(session, tmp_path / "in", few, files=2), MODEL, K, hold=HOLD, **COLUMNS)
-    query = (
-        keyed.writeStream.format("parquet").option("path", str(tmp_path / "out"))
-        .option("checkpointLocation", str(tmp_path / "check")).trigger(availableNow=True).start()
-    )  # fmt: skip
-    query.awaitTermination()
-    due = few.filter(pl.col("t") <= pl.col("t").max().over("unit") - HOLD)
-    expected = fleet_of(due).to_table().sort("unit", "t")
-    good = pl.read_parquet(tmp_path / "out" / "*.parquet").filter(pl.col("failed").is_null()).sort("unit", "t")
-    assert good.select(expected.columns).equals(expected)

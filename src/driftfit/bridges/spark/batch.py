@@ -209,7 +209,8 @@ class Partition:
     def _verdicts(self, piece: Piece, which: list[int]) -> dict[str, Any]:
         found, place = piece.found, {int(k): j for j, k in enumerate(piece.some.keys)}
         assert found is not None
-        lanes, columns = found.lanes(), {name: [] for name in VERDICT}  # type: dict[str, list[Any]]
+        lanes = found.lanes()
+        columns: dict[str, list[Any]] = {name: [] for name in VERDICT}
         for k in which:
             j = place[k]
             job, lane = lanes[j]

@@ -72,7 +72,7 @@ class Flow:
         known.newest[good] = fates.newest[good]
         released = order[right & (fates.fate == late.RELEASED)]
         some = series_of(task, table, known.code, released, known.time, good)
-        found = continued(task, table, some, known.programs, known.words, known.last) if len(released) else None  # type: ignore[arg-type]
+        found = continued(task, table, some, known.programs, known.words, known.last) if len(released) else None
         if found is not None:
             yield self._results(known, some, found)
         yield from self._left_out(known, order[right], fates.fate[right])
@@ -164,7 +164,7 @@ class Known(NamedTuple):
     settings: list[str | None]
     programs: list[Program | str]
     words: dict[int, Array]
-    bytes: dict[int, bytes]
+    arrived: dict[int, bytes]
     """States as they came, of units that go on unchanged."""
     last: Array
     newest: Array
@@ -217,4 +217,4 @@ class Known(NamedTuple):
         assert isinstance(program, Program)
         if k in self.words:
             return program.layout.pack(self.words[k])
-        return self.bytes[k] if k in self.bytes else program.pack(program.tile())
+        return self.arrived[k] if k in self.arrived else program.pack(program.tile())

@@ -82,7 +82,7 @@ def _processor(unit: Unit, names: Sequence[str]) -> Any:
     from pyspark.sql import Row
     from pyspark.sql.streaming import StatefulProcessor
 
-    class Processor(StatefulProcessor):  # type: ignore[misc]
+    class Processor(StatefulProcessor):
         def init(self, handle: Any) -> None:
             self.state = handle.getValueState("state", "state binary")
 

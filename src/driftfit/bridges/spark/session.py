@@ -68,6 +68,7 @@ def session(master: str = "local[2]", **settings: Any) -> Any:
         "spark.ui.showConsoleProgress": "false",
         "spark.sql.shuffle.partitions": "8",
         "spark.sql.execution.arrow.maxRecordsPerBatch": "32000",
+        "spark.sql.maxConcurrentOutputFileWriters": "8",  # a batch is written by kind without being sorted again
     }
     for name, value in {**usual, **given}.items():
         builder = builder.config(name, value)

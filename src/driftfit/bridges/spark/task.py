@@ -107,7 +107,10 @@ def _task(fields: Mapping[str, Any]) -> Task:
 
 def _with(tracker: Tracker, settings: str | None) -> Tracker:
     """A tracker with the settings of a unit."""
-    return tracker if settings is None else replace(tracker, **json.loads(settings))
+    if settings is None:
+        return tracker
+    changed: Tracker = replace(tracker, **json.loads(settings))  # type: ignore[type-var]
+    return changed
 
 
 class Units(NamedTuple):
@@ -139,7 +142,8 @@ def times(column: pa.ChunkedArray) -> Array:
     """Floats, or datetime64 in UTC; NaN or NaT where there is none."""
     if not pa.types.is_timestamp(column.type):
         return numbers(column)
-    return column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]")
+    instants: Array = column.cast(pa.timestamp("us")).to_numpy().astype("M8[us]")
+    return instants
 
 
 def chunks(batches: Iterator[pa.RecordBatch], by: Sequence[str], parts: bool) -> Iterator[tuple[pa.Table, bool]]:
@@ -186,9 +190,12 @@ def series_of(task: Task, table: pa.Table, code: Array, rows: Array, time: Array
 
 
 def continued(
-    task: Task, table: pa.Table, some: Series, programs: Sequence[Program], states: Mapping[int, Array], last: Array
+    task: Task, table: pa.Table, some: Series, programs: Sequence[Any], states: Mapping[int, Array], last: Array
 ) -> Advanced:
-    """Run the series from their states, by the number of the unit; ``last`` (U,) are times of their last samples."""
+    """Run the series from their states, by the number of the unit; ``last`` (U,) are times of their last samples.
+
+    ``programs`` has an entry for each unit; those of the series are programs.
+    """
     before = np.roll(some.time, 1)
     before[some.first] = last[some.keys]
     new = some.first[np.isnat(before[some.first]) if before.dtype.kind == "M" else np.isnan(before[some.first])]

@@ -182,7 +182,7 @@ class Stream(Batched, Plain, storage.Kept):
         """The present state of the stream, from which another run can continue (`warm_start`)."""
         lanes = (state_of(self._tile, lane) for lane in range(len(self.programs)))
         states = tuple({name: np.array(value) for name, value in lane.items()} for lane in lanes)
-        return End(self.programs, states, self._last, self._awaits, self.dt, self._clock.zone)
+        return End(tuple(self.programs), states, self._last, self._awaits, self.dt, self._clock.zone)
 
     def _windowed(self) -> Iterator[tuple[int, Window]]:
         """The lanes and their windows; ValueError if no samples are kept."""
