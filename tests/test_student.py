@@ -58,7 +58,13 @@ def test_so_it_has_from_a_given_prior_and_after_an_interruption():
     run = track(Regression(N), RLS(1.0, p0=4.0), y, u)
     exact = log_evidence(y[seen], u[seen], 0.25) - log_evidence(y[:1], u[:1], 0.25)
     assert run.loglik == pytest.approx(exact, abs=1e-9)
-    later = track(Regression(N), RLS(1.0, p0=4.0), y[30:], u[30:], warm_start=track(Regression(N), RLS(1.0, p0=4.0), y[:30], u[:30]))
+    later = track(
+        Regression(N),
+        RLS(1.0, p0=4.0),
+        y[30:],
+        u[30:],
+        warm_start=track(Regression(N), RLS(1.0, p0=4.0), y[:30], u[:30]),
+    )
     np.testing.assert_allclose(later.log_density, run.log_density[30:], rtol=1e-12)
 
 
