@@ -1,8 +1,8 @@
 """A hook of mkdocs: pages that the repository writes itself.
 
 The gallery shows every figure of the chapters, with a link to its chapter and the code of its script. The page of the
-algorithms holds the docstring of every module with equations or a source: what is computed, cost, departures. The changelog is
-that of the repository. A new figure, algorithm or version appears by existing.
+algorithms holds the docstring of every module with equations or a source: what is computed, cost, departures. The
+changelog is that of the repository. A new figure, algorithm or version appears by existing.
 """
 
 import ast
@@ -54,24 +54,22 @@ def algorithms():
             if re.search(r"\bSources?:|^    \S", said, re.M):
                 module = path.relative_to(SOURCE).with_suffix("").as_posix()
                 head, _, text = said.partition("\n")
-                parts.append(f"### {plain(head.rstrip('.'))} {{#{place_of(module)}}}")
-                parts.append(f"`driftfit.{module.replace('/', '.')}`\n\n{plain(text.strip())}")
+                parts.append(f"### {module.replace('/', '.')} {{#{place_of(module)}}}")
+                parts.append(f"**{plain(head)}**\n\n{plain(text.strip(chr(10)))}")
     return "\n\n".join(parts)
 
 
+SIGN = re.compile(r"`[^`]*`|(?<![\w*])\*[A-Za-z][^*]*[A-Za-z]\*(?!\w)|[*\[<]")
+"""Code and emphasis, which stay, and letters that would mean something in Markdown."""
+
+
 def plain(text):
-    """A docstring as Markdown: its letters mean nothing else, except for lists, code and indented equations."""
+    """A docstring as Markdown: lists, code, emphasis and indented equations stay, other letters mean themselves."""
     lines = []
     for line in text.splitlines():
-        if not line.startswith("    "):
-            bullet = "* " if line.startswith("* ") else ""
-            line = bullet + re.sub(r"[*\[<]", lambda found: f"&#{ord(found[0])};", line[len(bullet) :])
-            line = re.sub(
-                r"`[^`]*`",
-                lambda found: found[0].replace("&#42;", "*").replace("&#91;", "[").replace("&#60;", "<"),
-                line,
-            )
-        lines.append(line)
+        bullet = "* " if line.startswith("* ") else ""
+        escaped = SIGN.sub(lambda found: f"&#{ord(found[0])};" if len(found[0]) == 1 else found[0], line[len(bullet) :])
+        lines.append(line if line.startswith("    ") else bullet + escaped)
     return "\n".join(lines)
 
 
