@@ -254,6 +254,8 @@ def fuzz(seeds: range, quick: bool, noted: Any, sites: list[str]) -> int:
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)
+        if (seed + 1) % 10 == 0:
+            print(f"banks {seeds[0]} to {seed}, {bad} at fault", flush=True)
     return bad
 
 

@@ -1,7 +1,7 @@
 /* The filter that driftfit's record mode is measured against: a random-walk Kalman filter on the lags of an ARX model,
    written for one size. NA and NB come from the compiler's command line, so every loop has a constant length.
 
-       gcc -O3 -march=native -shared -fPIC -DNA=2 -DNB=2 filter.c -o filter.so
+       gcc -O3 -march=native -shared -fPIC -DNA=2 -DNB=2 [-DTHETA_ALONE] [-DREAL=float] filter.c -o filter.so
 
    It applies the same rules to missing data as driftfit (a missing output is filled with its own prediction, at most NA
    times in a row; a missing input makes the samples that need it unusable) and writes the same fields. It knows neither
@@ -16,8 +16,16 @@ typedef struct {
     double theta[N], P[N][N], q[N], r, y_lag[NA], u_lag[NB], filled;
 } filter;
 
+#ifndef REAL
+#define REAL double /* float: results in single precision */
+#endif
+
 typedef struct {
-    double theta[N], var[N], y_hat, e, s, ok;
+#ifdef THETA_ALONE
+    REAL theta[N];
+#else
+    REAL theta[N], var[N], y_hat, e, s, ok;
+#endif
 } row;
 
 void run(filter *f, long T, const double *y, const double *u, row *out)
@@ -68,13 +76,15 @@ void run(filter *f, long T, const double *y, const double *u, row *out)
         f->u_lag[0] = u[t];
 
         row *o = out + t;
-        for (int i = 0; i < N; i++) {
+        for (int i = 0; i < N; i++)
             o->theta[i] = f->theta[i];
+#ifndef THETA_ALONE
+        for (int i = 0; i < N; i++)
             o->var[i] = f->P[i][i];
-        }
         o->y_hat = valid ? y_hat : NAN;
         o->s = valid ? s : NAN;
         o->e = ok ? e : NAN;
         o->ok = ok;
+#endif
     }
 }

@@ -22,7 +22,7 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman, track
 from driftfit.run.fleet import Fleet
-from driftfit.run.lanes import cores
+from driftfit.run.parallel_lanes import cores
 
 T, DRIFTING = 400, 0.1
 

@@ -26,7 +26,7 @@ from rich.table import Table
 from driftfit import ARX, Kalman, Regression, track
 from driftfit.engine.kernel import Array
 from driftfit.fleets import Fleet
-from driftfit.run.lanes import cores
+from driftfit.run.parallel_lanes import cores
 
 Q, R, P0 = 1e-4, 0.01, 10.0
 TRACKER = Kalman(q=Q, r=R, p0=P0)

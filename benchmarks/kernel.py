@@ -32,7 +32,7 @@ from rich.table import Table
 from driftfit import ARX, Kalman, Live
 from driftfit.data.known import Known
 from driftfit.engine.drivers import drivers, make_tile, output_type
-from lab.bench.machine import installed, machine, times
+from lab.bench.computer import computer, installed, times
 
 HERE = Path(__file__).parent
 SEED = 1
@@ -221,7 +221,7 @@ def setting() -> str:
     """What this ran on."""
     packages = ("driftfit", "numba", "llvmlite", "numpy", "padasip", "filterpy")
     versions = ", ".join(f"{name} {installed(name) or 'absent'}" for name in packages)
-    return f"{machine()}, {llvm.get_host_cpu_name()}; {versions}; seed {SEED}"
+    return f"{computer()}, {llvm.get_host_cpu_name()}; {versions}; seed {SEED}"
 
 
 def table(title: str, rows: Iterator[Row]) -> Table:

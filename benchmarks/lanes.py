@@ -16,7 +16,7 @@ from rich.table import Table
 
 from driftfit import ARX, Kalman
 from driftfit.engine.drivers import WIDTH, drivers, make_tile, output_type
-from driftfit.run.lanes import BLOCK, width_of
+from driftfit.run.parallel_lanes import BLOCK, width_of
 from driftfit.run.program import Program
 
 TRACKER = Kalman(q=1e-4, r=0.01)

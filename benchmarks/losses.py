@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from driftfit import AdaptiveKalman
-from driftfit.trackers.parts import noise_levels
-from driftfit.trackers.parts.modes import ladder
+from driftfit.trackers.parts.modes import ladder, noise_levels
 from lab.bench.contestants import run
 from lab.bench.records import simulated
 from lab.bench.scores import parameter_error

@@ -1,12 +1,11 @@
 """A bad reading of every size at every position of a record, for every tracker and model (about half an hour).
 
     python benchmarks/readings.py            every position
-    python benchmarks/readings.py --quick    a position in ten
+    python benchmarks/readings.py --quick    two positions, of the first model
     python benchmarks/readings.py cubic      the models whose name contains the word
 
 Prints how many records ended with something that is neither finite nor marked, or had not recovered a hundred samples
-after the reading. tests/test_readings.py keeps a few thousand of them. The table in docs/units.md is the last line of
-each model and tracker.
+after the reading; the table at the end is that of docs/units.md. tests/test_readings.py keeps a few thousand of them.
 """
 
 import sys
@@ -36,8 +35,9 @@ MODELS = {
 
 def main() -> None:
     warnings.simplefilter("ignore")  # raw powers of such records are badly scaled, which is the point
-    T, step = 60, 10 if "--quick" in sys.argv else 1
-    words = [word for word in sys.argv[1:] if word != "--quick"]
+    T, quick = 60, "--quick" in sys.argv
+    totals = {name: [0, 0, 0] for name in MODELS}
+    words = [word for word in sys.argv[1:] if word != "--quick"] or ["ARX(2, 2)"][: int(quick)]
     for name, one in MODELS.items():
         if words and not any(word in name for word in words):
             continue
@@ -53,10 +53,15 @@ def main() -> None:
                     print(f"{name:25} {kind:22} {str(why).split(',')[0]}", flush=True)
                     continue
                 began = time.perf_counter()
-                wrong, count = failures(model, this, range(0, T, step), T + AFTER + 10)
+                wrong, count = failures(model, this, range(0, T, 30 if quick else 1), T + AFTER + 10)
+                totals[name] = [a + b for a, b in zip(totals[name], (1, count, len(wrong)), strict=True)]
                 what = sorted({(value, signal, said) for _, value, signal, said in wrong}, key=str)
                 print(f"{name:25} {kind:22} {form or ''!s:20} {count:6} records, {len(wrong)} wrong, "
                       f"{time.perf_counter() - began:.0f} s", *what[:6], sep="\n    ", flush=True)  # fmt: skip
+    print(f"{'':25} trackers and forms   records   neither finite nor marked, or not recovered")
+    for name, (cases, count, wrong) in totals.items():
+        if cases:
+            print(f"{name:25} {cases:18} {count:9} {wrong:9}")
 
 
 if __name__ == "__main__":

@@ -31,10 +31,10 @@ from pathlib import Path
 import numpy as np
 
 from driftfit.service.core.engine import Engine
-from driftfit.service.runners import SinkRunner, SourceRunner
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.threads import SinkThread, SourceThread
 
 UNIT = """
 [[unit]]
@@ -260,7 +260,7 @@ def served(broker, folder, messages, size, units, rate=1_000_000):
     config = parse(source + UNIT + sink)
     one = Engine(config, folder)
     warm(one, units)
-    runners = [SourceRunner(one, config.sources[0]), SinkRunner(one, config.sinks[0])]
+    runners = [SourceThread(one, config.sources[0]), SinkThread(one, config.sinks[0])]
     worker = threading.Thread(target=one.run)
     for thread in (*runners, worker):
         thread.start()
@@ -295,7 +295,7 @@ def http(options, folder):
     rng, config = np.random.default_rng(0), parse(HTTP + UNIT)
     one = Engine(config, folder)
     warm(one, options.units)
-    runner, worker = SourceRunner(one, config.sources[0]), threading.Thread(target=one.run)
+    runner, worker = SourceThread(one, config.sources[0]), threading.Thread(target=one.run)
     runner.start()
     worker.start()
     bodies = []

@@ -25,7 +25,7 @@ from scipy import signal
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.statistics.constancy import constancy
-from driftfit.run.lanes import cores
+from driftfit.run.parallel_lanes import cores
 
 LEVEL = 0.05
 BEFORE = 200

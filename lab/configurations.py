@@ -218,7 +218,7 @@ def of_output_fleet(
 
 
 def of_output_stream(model: Any, tracker: Any, seed: int) -> Configuration:
-    """A stream with several outputs that is stored, loaded and continued halfway, with factors of its own."""
+    """A stream with several outputs that is stored, loaded and continued halfway, with separate factors."""
 
     def run() -> Arrays:
         y, u = signals(seed, m=2, ny=2)

@@ -1,4 +1,4 @@
-"""The command line of the laboratory: ``python -m lab bench``, ``reproduce`` and ``same-numbers``."""
+"""The command line of the laboratory: ``python -m lab bench``, ``reproduce``, ``same-numbers``, ``structure``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from driftfit.cli.parts.program import helpful
 from driftfit.engine.settings import near
-from lab import same_numbers
+from lab import same_numbers, structure
 from lab.bench import commands as bench
 from lab.reproduce import found as reproductions
 
@@ -24,6 +24,7 @@ app.add_typer(bench.app, name="bench", help="Compare accuracy and speed with oth
 app.add_typer(
     same_numbers.app, name="same-numbers", help="Compare random configurations bit for bit, before and after."
 )
+app.command(name="structure")(structure.show)
 out = Console(highlight=False)
 
 

@@ -5,8 +5,8 @@ import time
 
 from driftfit import ARX, Kalman, Live
 from driftfit.service.core.engine import Engine
-from driftfit.service.runners import SinkRunner, SourceRunner
 from driftfit.service.settings.config import parse
+from driftfit.service.threads import SinkThread, SourceThread
 
 Live(ARX(1, 1), Kalman(q=1e-4, r=0.1), dt=1.0)  # compiled once for all processes
 
@@ -15,7 +15,7 @@ def work(text, folder, count):
     """A service in a process of its own, from the file to the sinks."""
     config = parse(text)
     engine = Engine(config, folder)
-    runners = [SourceRunner(engine, one) for one in config.sources] + [SinkRunner(engine, one) for one in config.sinks]
+    runners = [SourceThread(engine, one) for one in config.sources] + [SinkThread(engine, one) for one in config.sinks]
     for runner in runners:
         runner.start()
     threading.Thread(target=stop_at_the_end, args=(engine, runners, count), daemon=True).start()
@@ -29,6 +29,6 @@ def work(text, folder, count):
 
 def stop_at_the_end(engine, runners, count):
     """Stop once everything is tracked and written."""
-    while engine.next <= count or engine._pending or any(one.at < engine.told for one in runners[1:]):
+    while engine.next <= count or engine._pending or any(one.at < engine.last_stored for one in runners[1:]):
         time.sleep(0.05)
     engine.stop()

@@ -55,7 +55,7 @@ def settled(engine):
         engine.step(0.0)
 
 
-def told(engine):
+def results_of(engine):
     """All stored results, as rows."""
     settled(engine)
     return [row for _, rows, _ in engine.journal.outcomes(0, 10**6) for row in rows]

@@ -42,8 +42,8 @@ PRIORS = {
 }
 
 
-def told(run, name):
-    return run.tracker.told(run.written("report"), name)
+def reported(run, name):
+    return run.tracker.reported(run.written("report"), name)
 
 
 def state(run, name):
@@ -55,9 +55,9 @@ def compare(run, twin, y, u, atol=1e-10, lags=1):
     for t in range(len(y)):
         total += twin.see(u[t], y[t])
         np.testing.assert_allclose(run.theta[t], twin.mean, atol=atol)
-        np.testing.assert_allclose(told(run, "evidence")[: t + 1].sum(), total, atol=1e-8)
+        np.testing.assert_allclose(reported(run, "evidence")[: t + 1].sum(), total, atol=1e-8)
         for k in range(min(lags, t + 1)):
-            np.testing.assert_allclose(told(run, "lag_prob")[t, k], twin.lag(k, len(twin.initial)), atol=atol)
+            np.testing.assert_allclose(reported(run, "lag_prob")[t, k], twin.lag(k, len(twin.initial)), atol=atol)
     np.testing.assert_allclose(run.cov(-1), twin.cov, atol=atol)
 
 
@@ -94,7 +94,7 @@ def test_without_reduction_it_is_the_joint_gaussian_of_every_sequence(prior):
         dense = naive_bank.evidence_of([e // 2 for e in events], U[:K], Y[:K], Q, noise, np.zeros(N), 2.0 * np.eye(N))
         logs.append(prior_log + dense)
     evidence = np.logaddexp.reduce(logs)
-    assert told(run, "evidence").sum() == pytest.approx(evidence, abs=1e-10)
+    assert reported(run, "evidence").sum() == pytest.approx(evidence, abs=1e-10)
     got = state(run, "leaves")[0, : 6**K]
     np.testing.assert_allclose(np.sort(got), np.sort(np.array(logs) - evidence), atol=1e-10)
 
@@ -106,7 +106,7 @@ def test_unlimited_beam_is_the_full_tree_is_gpb():
     ]
     for run in runs[1:]:
         np.testing.assert_allclose(run.theta, runs[0].theta, atol=1e-12)
-        np.testing.assert_allclose(told(run, "evidence"), told(runs[0], "evidence"), atol=1e-12)
+        np.testing.assert_allclose(reported(run, "evidence"), reported(runs[0], "evidence"), atol=1e-12)
 
 
 def test_imm_is_gpb1_for_independent_events():
@@ -116,7 +116,7 @@ def test_imm_is_gpb1_for_independent_events():
     ]
     np.testing.assert_allclose(runs[0].theta, runs[1].theta, atol=1e-10)
     np.testing.assert_allclose(runs[0].std, runs[1].std, atol=1e-10)
-    np.testing.assert_allclose(told(runs[0], "evidence"), told(runs[1], "evidence"), atol=1e-10)
+    np.testing.assert_allclose(reported(runs[0], "evidence"), reported(runs[1], "evidence"), atol=1e-10)
 
 
 def test_imm_mixes_as_in_the_book():
@@ -141,7 +141,7 @@ def test_imm_mixes_as_in_the_book():
             C[j] = Cj - np.outer(Cj @ U[t], U[t] @ Cj) / s
         mu = np.exp(logs - np.logaddexp.reduce(logs))
         np.testing.assert_allclose(run.theta[t], mu @ m, atol=1e-10)
-        np.testing.assert_allclose(told(run, "lag_prob")[t, 0], mu, atol=1e-10)
+        np.testing.assert_allclose(reported(run, "lag_prob")[t, 0], mu, atol=1e-10)
 
 
 @pytest.mark.parametrize("form", [{"p0": 2.0}, {}])
@@ -167,7 +167,7 @@ def test_first_floor_with_prior_weights_is_one_kalman_filter():
 
 def test_first_floor_remembers_what_its_tree_says():
     run = track(Regression(N), Bank(changes(), [Sensor.nominal(R)], reduce=FirstFloor(3), p0=2.0), Y, U)
-    p = told(run, "lag_prob")
+    p = reported(run, "lag_prob")
     np.testing.assert_allclose(p[3:].sum(axis=2), 1.0, atol=1e-12)
     assert p[47, 1, 1:].sum() > 0.5  # the second jump, one sample later
 

@@ -5,7 +5,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 from support import same
-from test_bank import N, R, told
+from test_bank import N, R, reported
 
 from driftfit import Bank, Live, Regression, track
 from driftfit.trackers.bank.change import Change
@@ -74,9 +74,9 @@ def test_a_gap_is_weighed_as_all_courses_of_the_chain(name, reduce, form):
             exact = every_course(P, bank.event_probabilities[1], q, z, y)
             for k in (-2, -1):
                 log_p, modes, mean = exact[k]
-                assert told(run, "evidence")[k] == pytest.approx(log_p, abs=close)
+                assert reported(run, "evidence")[k] == pytest.approx(log_p, abs=close)
                 np.testing.assert_allclose(
-                    told(run, "lag_prob")[k, 0], modes, atol=close / (2.0 if len(q) == 2 else 1.0)
+                    reported(run, "lag_prob")[k, 0], modes, atol=close / (2.0 if len(q) == 2 else 1.0)
                 )
                 np.testing.assert_allclose(run.theta[k], mean, atol=close / 4.0)
 
@@ -87,9 +87,9 @@ def test_an_interval_is_a_gap_of_the_chain():
     interval = track(Regression(N), bank, y, z, time=[0.0, 1.0, 11.0, 12.0])
     gap = track(Regression(N), bank, np.r_[y[:2], np.full(9, np.nan), y[2:]], np.tile(Z, (13, 1)))
     np.testing.assert_allclose(interval.theta[-2:], gap.theta[-2:], atol=1e-12)
-    np.testing.assert_allclose(told(interval, "evidence")[-2:], told(gap, "evidence")[-2:], atol=1e-12)
-    assert told(interval, "window")[-1] > 0.9
-    assert told(gap, "window")[-1] > 0.9
+    np.testing.assert_allclose(reported(interval, "evidence")[-2:], reported(gap, "evidence")[-2:], atol=1e-12)
+    assert reported(interval, "window")[-1] > 0.9
+    assert reported(gap, "window")[-1] > 0.9
 
 
 def test_a_gap_is_reported_as_it_widens():
@@ -98,12 +98,12 @@ def test_a_gap_is_reported_as_it_widens():
     (P, q), bank = CHAINS[name], bank_of(name, GPB(2))
     y, z = np.r_[0.1, np.full(8, np.nan)], np.tile(Z, (9, 1))
     run = track(Regression(N), bank, y, z)
-    p = told(run, "lag_prob")[0, 0]
+    p = reported(run, "lag_prob")[0, 0]
     C = run.cov(0)[0, 0]
     for t in range(1, 9):
         p = p @ P
         C += p @ q
-        np.testing.assert_allclose(told(run, "lag_prob")[t, 0], p, atol=1e-12)
+        np.testing.assert_allclose(reported(run, "lag_prob")[t, 0], p, atol=1e-12)
         assert run.cov(t)[0, 0] == pytest.approx(C, rel=1e-9)
         assert run.innovation_std[t] ** 2 == pytest.approx(R + Z @ run.cov(t) @ Z, rel=1e-9)
         np.testing.assert_allclose(run.hypotheses.mixture(t).cov, run.cov(t), rtol=1e-9)
@@ -123,8 +123,8 @@ def test_a_stream_with_gaps_says_what_the_record_says(reduce):
     run, live = track(Regression(N), bank, y, z, time=time), Live(Regression(N), bank)
     assert not run.ok[40]
     assert np.isfinite(run.theta).all()
-    np.testing.assert_allclose(told(run, "lag_prob")[:, 0].sum(axis=1), 1.0, atol=1e-9)
-    assert (told(run, "window") > -1e-9).all()
+    np.testing.assert_allclose(reported(run, "lag_prob")[:, 0].sum(axis=1), 1.0, atol=1e-9)
+    assert (reported(run, "window") > -1e-9).all()
     for t in range(80):
         live.update(y[t], z[t], time=time[t])
         assert same(live.theta, run.theta[t]), t
@@ -138,10 +138,10 @@ def test_gaps_one_after_the_other_stay_within_the_table(reduce):
     y[100:] += 20.0 * z[100:, 0]
     y[rng.random(200) < 0.4] = np.nan
     run, room = track(Regression(N), bank_of("both", reduce), y, z), 2 * reduce.shape(3, 1).parents
-    lane, leaves = run.state, told(run, "leaves")
+    lane, leaves = run.state, reported(run, "leaves")
     assert lane["table"][ROW["parents"], 2] >= room
     assert leaves.max() == 3 * room  # as many as there may be, and no more
-    p = told(run, "lag_prob")
+    p = reported(run, "lag_prob")
     assert p.min() >= 0.0
     np.testing.assert_allclose(p[30:].sum(axis=2), 1.0, atol=1e-9)
 
@@ -174,7 +174,7 @@ def test_transitions_that_vary_in_time_are_summed_over():
     bank = bank_of("both", Beam(1200))
     run = track(Regression(N), bank, y, z, prob=Pt)
     exact = every_course(Pt, bank.event_probabilities[1], q, z, y)
-    assert told(run, "evidence").sum() == pytest.approx(sum(one[0] for one in exact), abs=0.02)
-    np.testing.assert_allclose(told(run, "lag_prob")[-1, 0], exact[-1][1], atol=0.01)
+    assert reported(run, "evidence").sum() == pytest.approx(sum(one[0] for one in exact), abs=0.02)
+    np.testing.assert_allclose(reported(run, "lag_prob")[-1, 0], exact[-1][1], atol=0.01)
     constant = track(Regression(N), bank, y, z)
-    assert abs(told(constant, "evidence").sum() - sum(one[0] for one in exact)) > 0.1
+    assert abs(reported(constant, "evidence").sum() - sum(one[0] for one in exact)) > 0.1

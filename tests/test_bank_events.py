@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support import arx_record, same
-from test_bank import N, R, changes, record, told
+from test_bank import N, R, changes, record, reported
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track
 from driftfit.trackers.bank.change import Change
@@ -21,18 +21,18 @@ def run():
 
 
 def test_probabilities_are_probabilities(run):
-    told = run.hypotheses
-    there = ~np.isnan(told.lag_prob[..., 0])
-    np.testing.assert_allclose(told.lag_prob[there].sum(axis=1), 1.0, atol=1e-12)
-    assert told.lags == (0, 1, 2, 3, 4, 5, 6, 23)
-    assert there.sum(axis=1).tolist() == [min(t + 1, 7) + (t >= 23) for t in range(150)]  # one more floor a sample
+    hypotheses = run.hypotheses
+    there = ~np.isnan(hypotheses.lag_prob[..., 0])
+    np.testing.assert_allclose(hypotheses.lag_prob[there].sum(axis=1), 1.0, atol=1e-12)
+    assert hypotheses.lags == (0, 1, 2, 3, 4, 5, 6, 23)
+    assert there.sum(axis=1).tolist() == [min(t + 1, 7) + (t >= 23) for t in range(150)]  # one more level a sample
     with pytest.raises(ValueError, match="one of 0, 1, 2, 3, 4, 5, 6, 23"):
-        told.prob(7)
-    assert same(told.prob(3)[40], told.lag_prob[43, 3])
-    assert same(told.mode_prob, told.lag_prob[:, 0])
-    assert ((told.window >= -1e-12) & (told.window <= 1.0)).all()
-    assert told.log_evidence == pytest.approx(told.evidence.sum())
-    assert told.kept.min() > 0.8
+        hypotheses.prob(7)
+    assert same(hypotheses.prob(3)[40], hypotheses.lag_prob[43, 3])
+    assert same(hypotheses.mode_prob, hypotheses.lag_prob[:, 0])
+    assert ((hypotheses.window >= -1e-12) & (hypotheses.window <= 1.0)).all()
+    assert hypotheses.log_evidence == pytest.approx(hypotheses.evidence.sum())
+    assert hypotheses.kept.min() > 0.8
 
 
 def test_jumps_are_found_and_dated(run):
@@ -90,9 +90,9 @@ def test_a_stream_says_what_the_record_says(run, tmp_path):
     live, found = Live(Regression(N), BANK), []
     for t in range(150):
         live.update(y[t], u[t])
-        told = live.hypotheses
-        assert same(told.lag_prob[0], np.nan_to_num(run.hypotheses.lag_prob[t, 0])), t
-        found += [(t, event) for event in told.events()]
+        hypotheses = live.hypotheses
+        assert same(hypotheses.lag_prob[0], np.nan_to_num(run.hypotheses.lag_prob[t, 0])), t
+        found += [(t, event) for event in hypotheses.events()]
         if t == 70:
             live.save(tmp_path / "state")
             live = Live.load(tmp_path / "state")
@@ -163,12 +163,12 @@ def test_an_impossible_sample_is_survived():
     prob[0] = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0]
     run = track(Regression(N), bank, y, u, prob=prob)
     with pytest.warns(UserWarning, match="1 samples were impossible"):
-        told = run.hypotheses
-    assert told.impossible == 1
+        hypotheses = run.hypotheses
+    assert hypotheses.impossible == 1
     with pytest.warns(UserWarning, match="probability above 0"):
         assert "1 samples that every hypothesis ruled out" in str(run.summary())
     assert np.isfinite(run.theta).all()
-    assert told.prob()[0, 0] == pytest.approx(0.0, abs=1e-12)
+    assert hypotheses.prob()[0, 0] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_frozen_sensor_is_named():
@@ -257,7 +257,7 @@ def test_waiting_pays_if_some_number_of_samples_does(ahead, decided):
         leaves = [(w / total, m, C) for w, m, C in leaves]
         risk = min(leaf[0] for leaf in leaves)
         gains = [risk - k * cost - expected(leaves, p, k, r) for k in range(1, ahead + 1)]
-        said.append(bool(told(run, "decided")[0, 0, 0] >= 0.0))
+        said.append(bool(reported(run, "decided")[0, 0, 0] >= 0.0))
         rule.append(max(gains) <= 0.0)
         near.append(abs(max(gains)) < 1e-5)
     assert [a == b or c for a, b, c in zip(said, rule, near, strict=True)] == [True] * 41

@@ -1,4 +1,4 @@
-"""Outages and long intervals are floors of the tree; loglik is the log evidence; fault codes are survived."""
+"""Outages and long intervals are levels of the tree; loglik is the log evidence; fault codes are survived."""
 
 from itertools import product
 from math import comb
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 from support import same
-from test_bank import N, R, changes, record, told
+from test_bank import N, R, changes, record, reported
 
 from driftfit import ARX, Bank, Kalman, Live, Regression, track, tune
 from driftfit.trackers.bank.change import Change
@@ -56,8 +56,8 @@ def test_a_gap_is_weighed_as_all_that_may_have_happened(reduce, times, gap, clos
     log_p, changed = enumerated(gap)
     if isinstance(reduce, IMM):
         close = max(close, 0.05)  # it merges the two leaves from before the gap
-    assert told(run, "evidence")[-1] == pytest.approx(log_p, abs=close)
-    assert told(run, "lag_prob")[-1, 0, 1] == pytest.approx(changed, abs=close / 5.0)
+    assert reported(run, "evidence")[-1] == pytest.approx(log_p, abs=close)
+    assert reported(run, "lag_prob")[-1, 0, 1] == pytest.approx(changed, abs=close / 5.0)
     assert changed > (0.3 if gap > 1 else 0.1)
 
 
@@ -75,7 +75,7 @@ def test_what_is_reported_in_a_gap_is_all_that_may_have_happened():
         run.std[1:-1] ** 2 - start, t[:, None] * ((1.0 - P) * DRIFT + P * JUMP) * np.ones(N), rtol=1e-3
     )
     assert same(run.theta[1:-1], np.repeat(run.theta[:1], 29, axis=0))
-    np.testing.assert_allclose(told(run, "lag_prob")[1:-1, 0, 1], P, rtol=1e-12)
+    np.testing.assert_allclose(reported(run, "lag_prob")[1:-1, 0, 1], P, rtol=1e-12)
     mixture = run.hypotheses.mixture(20)
     np.testing.assert_allclose(mixture.cov, run.cov(20), rtol=1e-12)
     np.testing.assert_allclose(run.prediction[1:], Z @ run.theta[0], rtol=1e-12)
@@ -218,7 +218,7 @@ def test_a_chain_goes_on_over_an_interval():
     u[:] = 0.0
     time = np.array([0.0, 1.0, 2.0, 7.0, 8.0, 9.0])
     run = track(Regression(N), Bank(changes(), KNOWN, Pm, GPB(2), p0=2.0), y, u, time=time)
-    p = told(run, "lag_prob")[:, 0]
+    p = reported(run, "lag_prob")[:, 0]
     np.testing.assert_allclose(p[3], p[2] @ np.linalg.matrix_power(Pm, 5), atol=1e-12)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy import integrate, special, stats
-from test_bank import P3, PROBS, N, Q, R, changes, record, state, told
+from test_bank import P3, PROBS, N, Q, R, changes, record, reported, state
 
 from driftfit import Bank, Regression, track
 from driftfit.trackers.bank.change import Change
@@ -52,7 +52,7 @@ def test_the_predictive_density_is_the_integral_over_the_noise_variance():
         return prior * stats.norm.pdf(Y[0], 0.0, math.sqrt(s2 * q))
 
     value, _ = integrate.quad(joint, 0.0, 50.0, limit=500, points=[0.05, 0.2, 1.0])
-    assert told(run, "evidence")[0] == pytest.approx(math.log(value), abs=1e-6)
+    assert reported(run, "evidence")[0] == pytest.approx(math.log(value), abs=1e-6)
 
 
 def test_evidence_with_unknown_noise_knows_no_scale():
@@ -62,7 +62,7 @@ def test_evidence_with_unknown_noise_knows_no_scale():
     bank = Bank(wide, [Sensor.nominal(guess=0.09 * a * a)], p0=2.0 * a * a)
     other = track(Regression(N), bank, a * Y, U)
     np.testing.assert_allclose(other.theta, a * one.theta, atol=1e-10 * a)
-    np.testing.assert_allclose(told(other, "evidence"), told(one, "evidence") - math.log(a), atol=1e-10)
+    np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(a), atol=1e-10)
 
 
 def test_scale_with_known_noise():
@@ -71,7 +71,7 @@ def test_scale_with_known_noise():
     wide = [Change(q * a * a, prob=p) for q, p in zip(Q, PROBS, strict=True)]
     other = track(Regression(N), Bank(wide, [Sensor.nominal(R * a * a)], reduce=GPB(2), p0=2.0 * a * a), a * Y, U)
     np.testing.assert_allclose(other.theta, a * one.theta, atol=1e-10)
-    np.testing.assert_allclose(told(other, "evidence"), told(one, "evidence") - math.log(a), atol=1e-10)
+    np.testing.assert_allclose(reported(other, "evidence"), reported(one, "evidence") - math.log(a), atol=1e-10)
 
 
 @pytest.mark.parametrize("reduce", [GPB(2), IMM()], ids=str)
@@ -91,7 +91,7 @@ def test_the_order_of_changes_does_not_matter(reduce):
     bank = Bank(turned, [Sensor.nominal(R)], P3[np.ix_(order, order)], reduce, p0=2.0)
     other = track(Regression(N), bank, Y, U)
     np.testing.assert_allclose(other.theta, one.theta, atol=1e-10)
-    np.testing.assert_allclose(told(other, "lag_prob")[:, 0], told(one, "lag_prob")[:, 0][:, order], atol=1e-10)
+    np.testing.assert_allclose(reported(other, "lag_prob")[:, 0], reported(one, "lag_prob")[:, 0][:, order], atol=1e-10)
 
 
 def leaves(seed, count, known):

@@ -6,7 +6,7 @@ import naive_bank
 import numpy as np
 import pytest
 from support import same
-from test_bank import N, Q, R, changes, told
+from test_bank import N, Q, R, changes, reported
 
 from driftfit import ARX, Bank, Live, Regression, track
 from driftfit.trackers.bank.reduction import GPB, Beam, Decide
@@ -93,7 +93,7 @@ def test_own_likelihoods_are_what_the_twin_says(reduce, naive, form):
     for t in range(len(y)):
         total += twin.see(np.array([0.0, u[t - 1] if t else 0.0]), y[t])
         np.testing.assert_allclose(run.theta[t], twin.mean, atol=1e-9)
-        np.testing.assert_allclose(told(run, "lag_prob")[t, 0], twin.lag(0, 9), atol=1e-9)
+        np.testing.assert_allclose(reported(run, "lag_prob")[t, 0], twin.lag(0, 9), atol=1e-9)
     assert run.loglik == pytest.approx(total, abs=1e-7)
     clips = run.hypotheses.mode_prob.reshape(-1, 3, 3)[..., 2].sum(axis=1)
     assert clips[y == LIMIT].max() > 0.9

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from driftfit import RLS, Bank, Live, Regression, track
+from driftfit.engine.drivers import as_compiled, tile_type
+from driftfit.run.program import Program
 from driftfit.trackers.bank.change import Change
 from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor, Hybrid
 from driftfit.trackers.bank.sensor import Sensor
@@ -99,3 +101,18 @@ def test_settings_survive_being_written_down(bank):
 def test_events_have_names():
     bank = Bank(TWO, [*KNOWN, Sensor.outlier()])
     assert bank.event_names == ("none, nominal", "none, outlier", "change 1, nominal", "change 1, outlier")
+
+
+def test_banks_of_all_shapes_have_one_driver():
+    """Compiling it takes seconds; what differs lies behind what the compiler knows."""
+    three = [*TWO, Change(0.1, prob=0.01)]
+    banks = [Bank(TWO, KNOWN, reduce=Beam(3)), Bank(three, [*KNOWN, Sensor.outlier()], reduce=Beam(100))]
+    tiles = [Program(Regression(2).bind(2), bank).tile() for bank in banks]
+    assert tiles[0]["memory"].shape != tiles[1]["memory"].shape
+    assert tiles[0]["report"].shape != tiles[1]["report"].shape
+    assert tile_type(tiles[0]) == tile_type(tiles[1])
+    for tile in tiles:
+        memory, table = as_compiled(tile)["report"].ctypes.data + 8 * tile["report"].size, tile["table"]
+        assert memory == tile["memory"].ctypes.data
+        assert memory % 64 == 0
+        assert {tile["memory"].size, tile["report"].size} <= set(table[0, :, 2, 0].tolist())

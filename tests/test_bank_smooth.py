@@ -72,7 +72,11 @@ def test_segments_are_the_limit_of_large_jumps():
     segments = piecewise(run, breaks)
     np.testing.assert_allclose(theta, segments.path, atol=1e-5)
     assert segments.table().height == 3
-    assert len(segments.plot().axes) == N
+    for i, axis in enumerate(segments.plot().axes):
+        tracked, *lines = (line.get_ydata() for line in axis.lines)
+        assert (tracked == run.theta[:, i]).all()
+        assert [line[0] for line in lines] == segments.theta[:, i].tolist()
+    assert i == N - 1
     with pytest.raises(ValueError, match="within 1"):
         piecewise(run, [0])
 

@@ -59,11 +59,16 @@ def assert_close(one, other, rtol=1e-9):
         np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=1e-10, err_msg=name)
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
-@pytest.mark.parametrize("reduce", REDUCTIONS, ids=str)
+PAIRS = [
+    pytest.param(reduce, kind, id=f"{reduce}-{kind}")
+    for reduce in REDUCTIONS
+    for kind in KINDS
+    if not isinstance(reduce, FirstFloor) or kind not in ("two sensors", "forgetting")  # which it refuses
+]
+
+
+@pytest.mark.parametrize(("reduce", "kind"), PAIRS)
 def test_both_forms_say_the_same(reduce, kind):
-    if isinstance(reduce, FirstFloor) and kind in ("two sensors", "forgetting"):
-        return
     one, other = both(Regression(N), Bank(**KINDS[kind], reduce=reduce), Y, U, time=TIME, dt=1.0)
     assert_close(one, other)
     np.testing.assert_allclose(other.cov(-1), one.cov(-1), rtol=1e-9)

@@ -88,7 +88,10 @@ def test_cusum_leaves_its_limits_when_a_coefficient_jumps():
         result.cusum_limits(0.2)
     with pytest.raises(ValueError, match="tabulated"):
         result.cusum_squares_limits(0.3)
-    assert len(result.plot_cusum().axes[0].lines) == 4
+    drawn = [line.get_ydata() for line in result.plot_cusum().axes[0].lines]
+    assert drawn[0] == pytest.approx(result.cusum, nan_ok=True)
+    limits = result.cusum_limits(0.05)
+    assert np.stack(drawn[1:3]) == pytest.approx(limits.to_numpy().T, nan_ok=True)
 
 
 def test_cusum_of_squares_leaves_its_limits_when_the_noise_grows():

@@ -11,7 +11,7 @@ import pytest
 
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Live, track
 from driftfit.checks import check_tracker
-from driftfit.engine.drivers import TrackerSteps, nothing_told, unknown
+from driftfit.engine.drivers import TrackerSteps, nothing_extra, unknown
 from driftfit.engine.kernel import kernel, nothing
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.kalman import INDEPENDENT
@@ -119,7 +119,7 @@ class Deaf(Kalman):
 
     @property
     def steps(self) -> TrackerSteps:
-        return INDEPENDENT._replace(told=nothing_told)
+        return INDEPENDENT._replace(read_extra=nothing_extra)
 
 
 @dataclass
@@ -152,7 +152,7 @@ def test_trackers_that_keep_their_promises(tracker):
         (Bold(), ["make theta not finite"]),
         (Hindsight(), ["depends on that output", "s.e is not", "with s.dt[l] = 0 predict must change nothing"]),
         (Boastful(), ["It does not run"]),
-        (Deaf(q=1e-4, r=0.01), ["drift_each = True"]),
+        (Deaf(q=1e-4, r=0.01), ["drift_per_parameter = True"]),
         (Loose(), ["frozen=True"]),
         (NLMS(gain=0.0), ["does not follow a constant system"]),
     ],

@@ -163,7 +163,7 @@ def test_without_matplotlib_the_numbers_stay(tmp_path, monkeypatch):
 
 def test_what_the_tracker_without_settings_finds(record, found):
     adaptive = demo.free(record)
-    said = demo.beside(found, adaptive)
+    said = demo.adaptive_estimate(found, adaptive)
     move = demo.largest_move(adaptive.theta[:, demo.INCOME])
     for t in (move.before, move.after):
         assert f"{adaptive.theta[t, demo.INCOME]:.3f}" in said

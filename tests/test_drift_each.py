@@ -87,7 +87,7 @@ def test_kalman_takes_it_for_variances_and_for_a_matrix(form, p0):
         np.testing.assert_allclose(run.smooth("cov").cov(-1), run.cov(-1), rtol=1e-9)
 
 
-@pytest.mark.parametrize("tracker", [ready(kind) for kind in found().values() if kind.drift_each], ids=repr)
+@pytest.mark.parametrize("tracker", [ready(kind) for kind in found().values() if kind.drift_per_parameter], ids=repr)
 def test_every_tracker_that_takes_columns_knows_one_column_for_all(tracker):
     y, u = arx_record(120, 3)
     model, d = model_of(tracker, ARX(2, 2)), np.random.default_rng(3).uniform(0.0, 9.0, 120)
@@ -162,6 +162,6 @@ def test_what_does_not_fit_is_named():
         live.update(1.0, 1.0, drift=[1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="u has shape"):
         live.update(1.0, [1.0, 2.0], drift=[9.0, 9.0])
-    assert (live.lane()["each"] == 1.0).all()
+    assert (live.lane()["drift_root"] == 1.0).all()
     with pytest.raises(ValueError, match=r'by="row": drift .* must be \(2, 3, n\)'):
         track(Regression(1), FLS(1.0), np.ones((2, 3)), np.ones((2, 3)), by="row", drift=np.ones((3, 3, 1)))

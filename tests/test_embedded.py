@@ -200,8 +200,8 @@ def test_what_no_step_writes_is_left_out_of_the_structure(tmp_path):
     assert "refresh" not in source
     assert re.search(r"s->P\[.*\] \+ \(s->q\[i\] \* time\)", source)  # no factors of one
     assert "s->r * s->noise" in source  # settings and known factors may change on the controller
-    given.lane()["each"][:] = 1.5
-    with pytest.raises(ValueError, match=r"to_struct: the field 'each' is \[1.5, 1.5"):
+    given.lane()["drift_root"][:] = 1.5
+    with pytest.raises(ValueError, match=r"to_struct: the field 'drift_root' is \[1.5, 1.5"):
         to_struct(given)
 
 

@@ -93,10 +93,10 @@ def test_statistics_are_those_of_a_naive_twin(ar):
     rows[[30, 31, 90], n + 1] = 0.0
     rows[40:60, n + 2] = 4.0
     rows[120, n + 3], rows[150, n + 3] = 0.0, 3.0
-    told = np.empty((T, CUSUM + n + 1))
+    findings = np.empty((T, CUSUM + n + 1))
     memory = memory_of(n, len(ar))
-    scan(rows[:100], model, memory, told[:100])
-    scan(rows[100:], model, memory, told[100:])  # in two parts, as a stream
+    scan(rows[:100], model, memory, findings[:100])
+    scan(rows[100:], model, memory, findings[100:])  # in two parts, as a stream
     scores, best = naive_scores(rows, model), {}
     up, down = np.zeros(n + 1), np.zeros(n + 1)
     for count, (phi, _, g, t) in enumerate(scores, start=1):
@@ -110,16 +110,16 @@ def test_statistics_are_those_of_a_naive_twin(ar):
         mean[n], var[n] = SHIFT * numbers[V], numbers[KAPPA]
         up = np.maximum(0.0, up + (mean * z - 0.5 * mean**2 * power) / var)
         down = np.maximum(0.0, down + (-mean * z - 0.5 * mean**2 * power) / var)
-        assert told[t, CUSUM:] == pytest.approx(np.sqrt(2.0 * np.maximum(up, down)))
+        assert findings[t, CUSUM:] == pytest.approx(np.sqrt(2.0 * np.maximum(up, down)))
         if not best:
-            assert np.isnan(told[t, ONE])
+            assert np.isnan(findings[t, ONE])
             continue
         one = max(best.values())
-        assert told[t, [ONE, WHICH, SIZE]] == pytest.approx(one[:3])
-        assert told[t, JOINT] == pytest.approx(max(found[3] for found in best.values()))
-        assert told[t, NOISE] == pytest.approx(np.nanmax([found[4] for found in best.values()]))
-    assert np.array_equal(told[30], told[29])
-    assert np.array_equal(told[120], told[119])
+        assert findings[t, [ONE, WHICH, SIZE]] == pytest.approx(one[:3])
+        assert findings[t, JOINT] == pytest.approx(max(found[3] for found in best.values()))
+        assert findings[t, NOISE] == pytest.approx(np.nanmax([found[4] for found in best.values()]))
+    assert np.array_equal(findings[30], findings[29])
+    assert np.array_equal(findings[120], findings[119])
 
 
 def noise_of(kind, T, rng):

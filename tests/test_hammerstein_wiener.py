@@ -134,12 +134,14 @@ def test_the_regression_is_exact_without_noise(na, nb, n_in, n_out, nk):
 
 
 def test_walking_parameters_need_lagged_products():
-    s = example(1, 0, T=600)
-    phi, z = rows(s.model, s.y, s.u)
-    assert np.abs(np.sum(phi * s.theta, axis=1) - z)[2:].max() <= 1e-12
-    now = s.model.structure.products(s.xi)
-    error = (np.sum(phi * now, axis=1) - z)[2:]
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(0.008, rel=0.4)  # section 3, over 5000 samples
+    squares = []
+    for seed in range(6):
+        s = example(1, seed, T=600)
+        phi, z = rows(s.model, s.y, s.u)
+        assert np.abs(np.sum(phi * s.theta, axis=1) - z)[2:].max() <= 1e-12
+        now = s.model.structure.products(s.xi)
+        squares.append(np.mean((np.sum(phi * now, axis=1) - z)[2:] ** 2))
+    assert np.sqrt(np.mean(squares)) == pytest.approx(0.008, abs=0.0005)  # the digit that section 3 gives
 
 
 def test_the_signs_of_the_input_columns_matter():
@@ -229,7 +231,7 @@ def test_the_prediction_is_the_root_of_the_equation():
     assert inside.mean() > 0.9
     level = root + theta[:, 4] * root**2 + theta[:, 5] * root**3
     np.testing.assert_allclose(level[inside], right[inside], atol=1e-9)
-    assert np.sqrt(np.mean((s.y - run.prediction)[t] ** 2)) < 0.05 * s.y.std()
+    assert np.sqrt(np.mean((s.y - run.prediction)[t] ** 2)) == pytest.approx(0.0323 * s.y.std(), rel=0.01)
     equation = -s.y[t] - np.sum(phi[t] * theta, axis=1)
     np.testing.assert_allclose(run.innovation[t], equation, rtol=1e-7, atol=1e-12)
 
@@ -244,8 +246,9 @@ def test_a_missing_value_makes_the_samples_it_touches_unusable():
         assert np.flatnonzero(~run.ok)[2:].tolist() == needed == list(s.model.touched(100, signal))
         assert same(run.theta[:100], clean.theta[:100])
         assert same(run.theta[needed], np.repeat(run.theta[needed[0] - 1][None], len(needed), axis=0))
-        np.testing.assert_allclose(run.std[102], np.sqrt(run.std[99] ** 2 + 1e-5 * (needed[-1] - 99)), rtol=0.2)
-        np.testing.assert_allclose(run.theta[-1], clean.theta[-1], atol=0.02)
+        before = run.std[needed[0] - 1]
+        np.testing.assert_allclose(run.std[102], np.sqrt(before**2 + 1e-5 * len(needed)), rtol=1e-12)
+        np.testing.assert_allclose(run.theta[-1], clean.theta[-1], atol=3e-5)
     hole = s.y.copy()
     hole[100] = np.nan
     assert np.isfinite(track(s.model, K, hole, s.u).prediction[100])  # its lags are there
@@ -297,10 +300,16 @@ def test_other_trackers_follow_it_too():
     u = rng.uniform(-1.5, 1.5, 800)
     s = simulate(SMALL, [-0.5], [0.5], [RandomWalk(0.3, 2e-3)], [0.1], T=800, rng=rng, u=u)
     run = track(SMALL, RLS(0.95), s.y, s.u)
-    assert np.median(np.abs(run.theta[100:, :2] - s.theta[100:, :2])) < 0.02
+    phi, z = rows(SMALL, s.y, s.u)
+    for t in (100, 799):  # least squares with weights 0.95^(t - k)
+        k = np.arange(1, t + 1)
+        root = 0.95 ** (0.5 * (t - k))
+        least = np.linalg.lstsq(phi[k] * root[:, None], z[k] * root, rcond=None)[0]
+        np.testing.assert_allclose(run.theta[t], least, atol=1e-12)
+    assert np.median(np.abs(run.theta[100:, :2] - s.theta[100:, :2])) == pytest.approx(7.25e-4, rel=0.01)
     scored = run.summary().comparison
-    assert scored.tracked < 0.1 * scored.persistence
-    assert scored.tracked < 0.5 * scored.constant_ls
+    assert scored.tracked == pytest.approx(0.00656 * scored.persistence, rel=0.01)
+    assert scored.tracked == pytest.approx(0.4247 * scored.constant_ls, rel=0.01)
 
 
 def test_noise_aware_variances():
@@ -385,7 +394,7 @@ def test_the_likelihood_of_y_integrates_to_one():
     theta = np.concatenate([np.zeros((len(y), 1)), after], axis=1)
     assert np.trapezoid(density * model.slope(theta, y), y) == pytest.approx(1.0, abs=1e-4)
     theta[:, 1:] = d
-    assert 1.004 < np.trapezoid(density * model.slope(theta, y), y) < 1.02
+    assert np.trapezoid(density * model.slope(theta, y), y) == pytest.approx(1.01369, abs=1e-4)
 
 
 def test_an_absurd_output_spoils_no_prediction():
@@ -407,22 +416,27 @@ def test_an_absurd_output_spoils_no_prediction():
 
 
 def test_forecasts_have_the_unit_of_the_output():
-    """The spread of what came, h samples ahead, is what the forecast said: constants known, equation noise."""
+    """The spread of what came, h samples ahead, is what the forecast said: constants known, equation noise.
+
+    Of records whose future stays in the range of their past: nothing is believed of the curve beyond it.
+    """
     rng = np.random.default_rng(11)
     model, e = HammersteinWiener(1, 1, output=Polynomial(3)), 0.02
     weights = (-0.8, 0.5, 0.4, 0.6)
     errors, said = [], []
-    for _ in range(150):
+    for _ in range(500):
         u = np.concatenate([rng.normal(size=40), np.zeros(5)])
         s = simulate(model, [weights[0]], [weights[1]], [], weights[2:], T=45, rng=rng, u=u, equation_noise=e)
         theta0 = (*weights, weights[0] * weights[2], weights[0] * weights[3])
         run = track(model, Kalman(q=0.0, r=e * e, p0=1e-12, theta0=theta0), s.y[:40], s.u[:40])
         ahead = run.forecast(5, s.u[40:])
-        errors.append(s.y[40:] - ahead.y_hat)
-        said.append(ahead.y_std)
+        if s.y[:40].min() < s.y[40:].min() and s.y[40:].max() < s.y[:40].max():
+            errors.append(s.y[40:] - ahead.y_hat)
+            said.append(ahead.y_std)
+    assert len(errors) > 440
     ratio = np.sqrt(np.mean((np.array(errors) / np.array(said)) ** 2, axis=0))
-    assert (np.abs(ratio - 1.0) < 0.2).all()
-    assert np.mean(said, axis=0)[4] > 1.5 * np.mean(said, axis=0)[0]
+    assert (np.abs(ratio - 1.0) < 0.1).all()  # three standard errors
+    assert np.mean(said, axis=0)[4] == pytest.approx(1.97 * np.mean(said, axis=0)[0], rel=0.02)
 
 
 def test_a_run_goes_on_with_its_own_model_only():

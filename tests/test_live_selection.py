@@ -64,7 +64,7 @@ def test_it_finds_the_structure_and_finds_it_again_after_a_change():
 def test_what_cannot_be_weighed_is_said():
     for arguments, says in (
         (([], K), "at least one model"), ((CANDIDATES, K, 0.0), "forgetting must be in"),
-        ((CANDIDATES, AugmentedFLS(mu=1.0)), "no prediction with one"), ((CANDIDATES, Bank()), "no prediction with one"),
+        ((CANDIDATES, AugmentedFLS(mu=1.0)), "with one variance"), ((CANDIDATES, Bank()), "with one variance"),
         (([HammersteinWiener(1, 1, ny=2)], AdaptiveKalman()), "one output"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=says):

@@ -9,7 +9,7 @@ from scipy import stats
 from support import THETA, arx_record, rows_of
 
 from driftfit import ARX, Kalman, Regression, track
-from driftfit.judge import fleet_verdict
+from driftfit.judge import on_all_cores
 from driftfit.judge.fleet_verdict import discoveries, verdicts
 
 K = Kalman(q=1e-4, r=0.01)
@@ -93,8 +93,8 @@ def test_a_share_of_almost_nothing_is_one_of_its_error(fleet):
 @pytest.mark.parametrize(("patience", "shown"), [(0.0, 1), (1e9, 0)])
 def test_progress_is_shown_where_it_takes_long(fleet, monkeypatch, patience, shown):
     started = []
-    monkeypatch.setattr(fleet_verdict.Progress, "start", lambda bar: started.append(bar))
-    monkeypatch.setattr(fleet_verdict, "PATIENCE", patience)
+    monkeypatch.setattr(on_all_cores.Progress, "start", lambda bar: started.append(bar))
+    monkeypatch.setattr(on_all_cores, "PATIENCE", patience)
     assert len(fleet.verdict()) == 7
     assert len(started) == shown
 

@@ -98,7 +98,10 @@ def test_rows_of_one_instant_are_one_vector_measurement():
     np.testing.assert_allclose(path.theta[-1], run.theta[-1], rtol=1e-9)  # all has been seen there
     low, high = path.band()
     assert low.shape == high.shape == (60, 2)
-    assert len(path.plot().axes[0].lines[0].get_xdata()) == 60
+    for i, axis in enumerate(path.plot().axes):
+        smoothed, filtered = (line.get_ydata() for line in axis.lines)
+        assert (smoothed == path.theta[:, i]).all()
+        assert (filtered == run.theta[:, i]).all()
 
 
 def test_a_missing_row_leaves_the_other():

@@ -1,6 +1,7 @@
 """Several outputs wherever a single one goes: tables, fleets, files, warm starts, forecasts, tuning, windows."""
 
 from copy import copy
+from dataclasses import replace
 
 import naive_smoother as naive
 import numpy as np
@@ -25,7 +26,10 @@ from driftfit import (
     tune,
 )
 from driftfit.fleets import Outputs, Shared
+from driftfit.judge.compare import persistence
+from driftfit.judge.structures.candidates import price, unscored
 from driftfit.streams import LiveOutputs
+from driftfit.tune.frontier import Frontier
 
 JOINT = ARX(1, 1, ny=NAMES)
 SHARED = Regression(2, ny=2, shared=True)
@@ -249,8 +253,6 @@ def test_tuning_is_output_by_output_or_of_all_rows():
     assert low < 25.0 < high < 3.0 * shared.tracker.mu
     one = frontier(SHARED, z, rows, mu=[25.01, 24.99])
     assert np.diff(one.measurement) / np.diff(one.dynamic) == pytest.approx(-25.0, rel=1e-3)
-    with pytest.raises(ValueError, match="one output at a time"):
-        frontier(model, y, phi)
 
 
 def test_what_is_of_one_output_says_so():
@@ -303,12 +305,37 @@ def test_summaries_are_objects():
     assert said["flow"].rows[0].name == "a1[flow<-level]"
     assert str(said["flow"]) in str(said)
     run = track(shared, TRACKER, z, phi)
-    assert run.summary().rows[0][1] == run.theta[-1, 0]
+    said = run.summary()
+    assert said.rows[0].theta == run.theta[-1, 0]
     late = run.innovation[max(50, 5 * run.model.n) :]
-    for k, (name, error) in enumerate(run.summary().errors.items()):
-        assert name == run.outputs[k]
-        assert error == pytest.approx(np.sqrt(np.nanmean(late[:, k] ** 2)))
-        assert f"{error:.5g}" in str(run.summary())
+    errors = np.sqrt(np.nanmean(late**2, axis=0))
+    assert ", ".join(f"{name} {one:.5g}" for name, one in zip(run.outputs, errors, strict=True)) in str(said)
+    last = np.stack([persistence(one) for one in run.y.T], axis=1)  # of the same output, not of the row before
+    assert said.comparison.persistence == pytest.approx(np.sqrt(np.nanmean((run.y - last)[25:] ** 2)), rel=0.02)
+
+
+def test_frontier_and_select_give_a_result_for_each_output():
+    (joint, y, u, _), (shared, z, phi, _) = records()
+    run = track(joint, Kalman(q=0.0, r=1.0), y, u)
+    found = frontier(joint, y, u, mu=[1.0, 100.0])
+    assert list(found) == ["level", "flow"]
+    alone = frontier(run["flow"].model, run["flow"].y, run["flow"].u, mu=[1.0, 100.0])
+    for name in Frontier._fields:
+        np.testing.assert_allclose(getattr(found["flow"], name), getattr(alone, name), rtol=1e-6)
+    assert isinstance(frontier(shared, z, phi, mu=[1.0]), Frontier)
+    chosen = select([joint, replace(joint, nb=2)], y, u, tracker=TRACKER)
+    assert list(chosen) == ["level", "flow"]
+    for name, one in chosen.items():
+        again = {row.name: row.loglik for row in one.rows}[repr(joint)]
+        terms = track(Regression(run[name].names), TRACKER, y[:, run.outputs.index(name)], run[name].u).log_density
+        assert again == pytest.approx(terms[one.judged].sum() - price(3, unscored(80, 4)), rel=1e-3)
+        assert set(one.regressors(repr(joint))) == set(run[name].names)
+        assert name in str(chosen)
+    best = select(joint, y, u, tracker=TRACKER)["level"].best.split()
+    assert set(best) <= set(run["level"].names)
+    assert select([shared], z, phi, tracker=TRACKER).best == repr(shared)
+    with pytest.raises(ValueError, match="with the same outputs"):
+        select([joint, replace(joint, ny=("level", "other"))], y, u, tracker=TRACKER)
 
 
 @pytest.mark.filterwarnings("ignore:tune")

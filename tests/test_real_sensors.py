@@ -27,7 +27,7 @@ from driftfit import (
 from driftfit.smooth.parts.pooled_drift import pooled
 from driftfit.systems import scenarios
 from driftfit.systems.arc_furnace import switching
-from driftfit.trackers.parts.noise_levels import OUTLIER, level_chain
+from driftfit.trackers.parts.modes.noise_levels import OUTLIER, level_chain
 from driftfit.trackers.parts.outlying_readings import LEVERAGE
 
 T = 1500

@@ -118,7 +118,13 @@ def test_parameters_and_standard_errors_of_segments():
         assert part.std == pytest.approx(0.3 / np.sqrt(count), rel=3.5 / np.sqrt(count))  # of two standard deviations
     assert said.theta.shape == (500, 2)
     assert str(only.date)[:13].replace("T", " ") in said.summary()
-    assert len(said.plot().axes) == 3
+    top, *panels = said.plot().axes
+    np.testing.assert_array_equal(top.lines[0].get_ydata(), run.y)
+    for i, panel in enumerate(panels):
+        drawn = [line.get_ydata()[0] for line in panel.lines[: len(said.segments)]]
+        assert drawn == [part.theta[i] for part in said.segments]
+        assert panel.lines[-1].get_xdata()[0] == only.date
+    assert i == 1
     large = segment(1000.0 * y, u, Regression(2))
     assert [one.at for one in large.breaks] == [only.at]
     assert large.segments[0].theta == pytest.approx(1000.0 * said.segments[0].theta)

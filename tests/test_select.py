@@ -149,7 +149,13 @@ def test_damaged_records_and_the_table(said):
     shown = [line for line in lines if line.startswith(" ARX(")]
     assert [float(line.split()[-3]) for line in shown[:4]] == pytest.approx([row.below for row in said.rows], abs=0.06)
     assert f" best: {said.best}" in lines
-    assert len(said.plot().axes) == 2
+    distances, losses = said.plot(4).axes
+    assert distances.lines[0].get_xdata() == pytest.approx([-row.below for row in said.rows[:4]])
+    drawn = {line.get_label(): line.get_ydata()[-1] for line in losses.lines[:3]}
+    order = {
+        one.name: found.loglik[said.judged].sum() for one, found in zip(said.structures, said.predictions, strict=True)
+    }
+    assert drawn == pytest.approx({row.name: order[row.name] - order[said.best] for row in said.rows[1:4]})
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import shutil
 import sqlite3
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ from service_support import (
     message,
     opened,
     record,
+    results_of,
     settled,
-    told,
 )  # fmt: skip
 
 from driftfit import track
@@ -48,7 +49,7 @@ def test_states_and_results_are_those_of_track(engine):
         for pump in "ab":
             assert feed(engine, message(f"plant/{pump}", range(k, k + 50), y[k : k + 50], u[k : k + 50]))
     run = run_of(y, u)
-    rows = [row for row in told(engine) if row[1] == 2]
+    rows = [row for row in results_of(engine) if row[1] == 2]
     assert np.array_equal(engine.units.get(1).live.theta, run.theta[-1])
     assert np.array_equal([row[5] for row in rows], run.innovation, equal_nan=True)
     assert np.array_equal([row[8] for row in rows], run.theta)
@@ -68,7 +69,7 @@ def test_a_new_process_continues_with_the_same_bits(tmp_path):
         engine.journal.close()
     engine = opened(config, tmp_path)
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
-    assert [row[0] for row in told(engine)] == list(range(1, 401))
+    assert [row[0] for row in results_of(engine)] == list(range(1, 401))
     blocks = engine.journal.db.execute("select sum(count), count(*) from block").fetchone()
     assert blocks[0] <= 400
     assert engine.journal.rows_of(1)[0] == list(range(400))
@@ -205,26 +206,30 @@ def test_alarms_from_a_frozen_reference(tmp_path):
     engine.close()
 
 
-def test_a_full_disk_holds_back_and_loses_nothing(tmp_path):
+def test_a_full_disk_holds_back_and_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("driftfit.service.core.engine.RETRY", 0.2)
     y, u = record(100)
     engine = opened(configured(), tmp_path)
     feed(engine, message("plant/a", range(50), y[:50], u[:50]))
     settled(engine)
     pages = engine.journal.db.execute("pragma page_count").fetchone()[0]
     engine.journal.db.execute(f"pragma max_page_count = {pages}")
-    waits = []
+    problems = []
 
-    def waited(seconds):
-        waits.append(engine.problem)
+    def make_room():
+        while not engine.problem:
+            time.sleep(0.01)
+        problems.append(engine.problem)
         engine.journal.db.execute("pragma max_page_count = 1000000")
-        return False
 
-    engine._stop.wait = waited
+    helper = threading.Thread(target=make_room)
+    helper.start()
     wide = message("plant/a", range(50, 100), y[50:], u[50:], other=["x" * 200] * 50)
     for k in range(40):  # other units until the file is full
         engine.intake.put("web", message(f"plant/x{k}", range(50), y[:50], u[:50]))
     assert feed(engine, wide)
-    assert "full" in waits[0]
+    helper.join()
+    assert "full" in problems[0]
     assert engine.problem == ""
     assert np.array_equal(engine.units.get(1).live.theta, run_of(y, u).theta[-1])
     engine.close()
@@ -297,23 +302,22 @@ def test_topics_that_no_unit_has(engine):
     assert engine.units.refused["too many units"] == 3
 
 
-def test_old_journals_become_parquet(tmp_path):
+def test_old_journals_become_parquet(tmp_path, monkeypatch):
     import polars as pl
 
     y, u = record(100)
-    engine = opened(configured(), tmp_path)
+    config = configured()
+    engine = opened(replace(config, service=replace(config.service, keep=-1.0)), tmp_path)
     for k in range(0, 100, 10):
         feed(engine, message("plant/a", range(k, k + 10), y[k : k + 10], u[k : k + 10]))
     engine.act("a", {"do": "hold", "on": True, "who": "me", "why": "test"})
     engine.step(0.0)
-    assert export(tmp_path, engine.journal.floor(), time.time() + 1) == 0  # the states are not stored
+    assert export(tmp_path, engine.journal.first_needed(), time.time() + 1) == 0  # the states are not stored
     engine._store_states(everything=True)
     engine._commit()
-    engine._archive.options = engine.config.service.__class__(keep=-1.0)
-    engine._archive._looked = -1e9
+    monkeypatch.setattr("driftfit.service.core.archive.EVERY", -1.0)
     for _ in range(100):
-        engine._archive.forget(engine._pending, engine.journal, engine.next)
-        engine._commit()
+        engine.step(0.0)
         if not engine.journal.rows_of(1)[0]:
             break
         time.sleep(0.05)

@@ -22,11 +22,11 @@ from service_support import HTTP, MODEL, TRACKER, UNIT, configured, feed, messag
 
 from driftfit import track
 from driftfit.service.core.journal import Names
-from driftfit.service.runners import SinkRunner, SourceRunner
 from driftfit.service.sinks.contract import Event, Outcome, Result
 from driftfit.service.sinks.webhook import Webhook
 from driftfit.service.sources.replay import Replay
 from driftfit.service.sources.tail import Tail
+from driftfit.service.threads import SinkThread, SourceThread
 
 
 def needs(package):
@@ -124,7 +124,7 @@ def test_mqtt_through_an_absence_of_the_broker(tmp_path):
         for t in ts:
             sender.publish("plant/7", json.dumps({"t": t, "y": y[t], "u": u[t]}), qos=1)
 
-    with running(engine, SourceRunner(engine, config.sources[0]), SinkRunner(engine, config.sinks[0])):
+    with running(engine, SourceThread(engine, config.sources[0]), SinkThread(engine, config.sinks[0])):
         until(lambda: _subscribed(sender, engine))
         sender.publish("plant/7", b"{poison", qos=1)
         send(range(150))
@@ -312,7 +312,7 @@ class Receiver(http.server.BaseHTTPRequestHandler):
 
 
 def test_webhook_tries_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("driftfit.service.runners.FIRST_PAUSE", 0.05)
+    monkeypatch.setattr("driftfit.service.threads.FIRST_PAUSE", 0.05)
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Receiver)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     Receiver.answers[:] = [503, 503]
@@ -321,12 +321,12 @@ def test_webhook_tries_again(tmp_path, monkeypatch):
     engine = opened(config, tmp_path)
     y, u = record(20)
     feed(engine, message("plant/a", range(20), y, u))
-    runner = SinkRunner(engine, config.sinks[0])
+    runner = SinkThread(engine, config.sinks[0])
     runner.start()
     engine.act("a", {"do": "hold", "on": True, "who": "Ann", "why": "a test"})
     engine.step(0.0)
     settled(engine)
-    until(lambda: len(Receiver.got) >= 3 and runner.at >= engine.told)
+    until(lambda: len(Receiver.got) >= 3 and runner.at >= engine.last_stored)
     runner.stop()
     runner.join(10)
     server.shutdown()
@@ -384,7 +384,7 @@ def test_http_samples_are_answered_when_they_are_in_the_journal(tmp_path):
 
     config = configured(source=HTTP)
     engine = opened(config, tmp_path)
-    with running(engine, SourceRunner(engine, config.sources[0])):
+    with running(engine, SourceThread(engine, config.sources[0])):
         body = json.dumps({"plant/a": {"t": [1.0, 2.0], "y": [1.0, 2.0]}, "plant/b": {"x": {}}}).encode()
         answer = INCOMING.offer("", body)
         assert answer["received"] == 2

@@ -12,8 +12,8 @@ from driftfit.show.parts.axes import BLUE, GREY, RED, new_figure
 from driftfit.systems import scenarios
 from lab.bench.accuracy import HINDSIGHT, ORACLE, TUNING_SEED, Cell, Size
 from lab.bench.causes import CAUSES, REAL_CAUSES
+from lab.bench.computer import computer, markdown, versions
 from lab.bench.contestants import own
-from lab.bench.machine import machine, markdown, versions
 from lab.bench.real import REFERENCE, Result
 from lab.bench.records import simulated
 
@@ -35,7 +35,7 @@ def figures(value: float, digits: int = 2) -> str:
     return "diverged" if value > ERA else f"{value:.{digits}f}"
 
 
-def told(setting: Any) -> str:
+def setting_text(setting: Any) -> str:
     """A setting as a reader would write it."""
     if isinstance(setting, tuple):
         return f"q = {setting[0]:.2g} r{' / mean(phi²)' if setting[1] else ''}"
@@ -56,7 +56,7 @@ def table(cell: Cell) -> str:
     for name in cell.scores:
         rmse, error = (float(np.median(v)) for v in (cell.values(name, "rmse"), cell.ratio(name, "error")))
         theta, y = (float(np.mean(cell.values(name, what))) for what in ("theta", "y"))
-        row = [name, told(cell.settings.get(name)), f"{rmse:.4g}", spread(list(cell.ratio(name)))]
+        row = [name, setting_text(cell.settings.get(name)), f"{rmse:.4g}", spread(list(cell.ratio(name)))]
         row += [figures(error, 3), figures(theta, 3), figures(y, 3)]
         if jumps:
             row += detection(cell, name)
@@ -65,7 +65,7 @@ def table(cell: Cell) -> str:
 
 
 def detection(cell: Cell, name: str) -> list[str]:
-    """Jumps found, median delay, false alarms per 1000 samples; the oracle is told."""
+    """Jumps found, median delay, false alarms per 1000 samples; the oracle knows them."""
     found = cell.detections.get(name)
     if found is None:
         return ["–"] * 3
@@ -126,7 +126,8 @@ def lost_table(cells: Sequence[Cell]) -> str:
 def real_table(result: Result) -> str:
     """One real record."""
     rows = [
-        [row.name, told(row.setting), f"{row.error:.4g}", figures(row.y, 3), f"{row.t:+.1f}"] for row in result.rows
+        [row.name, setting_text(row.setting), f"{row.error:.4g}", figures(row.y, 3), f"{row.t:+.1f}"]
+        for row in result.rows
     ]
     title = f"### {result.title} ({result.samples} samples scored)"
     return f"{title}\n\n{markdown(['', 'setting', 'one-step error', 'y in band', 't'], rows)}"
@@ -138,7 +139,7 @@ def page(cells: Sequence[Cell], real: tuple[Sequence[Result], Sequence[str]], si
     parts = [
         "# Scoreboard: accuracy",
         INTRODUCTION,
-        f"{machine()}. {versions()}. {size.note}; seeds 0 to {size.runs - 1} are scored, {TUNING_SEED} to "
+        f"{computer()}. {versions()}. {size.note}; seeds 0 to {size.runs - 1} are scored, {TUNING_SEED} to "
         f"{TUNING_SEED + size.tuning - 1} tune. {left_out}",
         "## All scenarios",
         summary(cells),

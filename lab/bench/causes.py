@@ -39,7 +39,7 @@ REAL_CAUSES = (
     "insignificant; the difference to constant least squares is significant. Trackers with one tuned number are a "
     "little better where the drift is slow and steady, as in the simulated random walks."
 )
-"""What the real records show."""
+"""Causes of the losses on real records."""
 
 SPEED_CAUSES = (
     "The first result is where driftfit loses to packages without a compiler: it takes seconds the first time on a "

@@ -59,7 +59,7 @@ THREADS = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL
 
 @app.command()
 def speed(quick: Quick = False, write_to: Out = None) -> None:
-    """Time every way to run beside installed peers and beside what cannot be beaten."""
+    """Time every way to run, and compare it with installed peers and with lower bounds."""
     arguments = [*(["--quick"] if quick else []), *(["--out", str(write_to)] if write_to else [])]
     command = [sys.executable, "-m", "lab.bench.commands", *arguments]
     raise typer.Exit(subprocess.run(command, env=os.environ | THREADS, check=False).returncode)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from lab.bench.machine import times
+from lab.bench.computer import times
 from lab.bench.peers import silence
 
 Answer = Callable[[], Array]
@@ -20,7 +20,7 @@ SAME = 1e-6
 
 
 class Job(NamedTuple):
-    """Something to time: ``steps`` samples a run. ``answer`` gives theta (T, n) or (n,); None: another algorithm."""
+    """Something to time: ``steps`` samples per run. ``answer`` gives theta (T, n) or (n,); None: another algorithm."""
 
     name: str
     run: Callable[[], object]
@@ -40,7 +40,9 @@ class Contest:
 
 
 class Line(NamedTuple):
-    """One package: nanoseconds a step, times ours, and by how much its numbers differ (NaN: another algorithm)."""
+    """One package: nanoseconds per step, multiples of ours, and by how much its numbers differ (NaN: another
+    algorithm).
+    """
 
     name: str
     ns: float
@@ -69,7 +71,7 @@ def need(module: str, name: str | None = None) -> Any:
 
 
 def hold(contest: Contest, repeats: int) -> Finish:
-    """Time everyone who is there, then compare what they computed."""
+    """Time all installed packages, then compare their results."""
     jobs, absent = [contest.ours], []
     with silence():
         for make in contest.others:

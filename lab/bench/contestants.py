@@ -17,7 +17,7 @@ from driftfit.engine.kernel import Array
 from driftfit.trackers.base import Tracker
 from driftfit.tracking import track
 from lab.bench import peers
-from lab.bench.machine import installed
+from lab.bench.computer import installed
 from lab.bench.peers import Follow, walk
 from lab.bench.records import Outcome, Record
 

@@ -30,7 +30,7 @@ def walk(setting: tuple[float, float], c: Array) -> Array:
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """What other packages warn of is theirs to mend, and divergence is scored, not warned of."""
+    """Warnings of other packages are suppressed; divergence is scored."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         yield

@@ -26,8 +26,8 @@ from driftfit.models.regression import Regression
 from driftfit.run.result import root_mean_square
 from driftfit.trackers.rls import RLS
 from lab.bench.accuracy import contestants, entries
+from lab.bench.computer import installed
 from lab.bench.contestants import run
-from lab.bench.machine import installed
 from lab.bench.records import Outcome, Record
 from lab.bench.scores import coverage, predicted
 

@@ -63,7 +63,7 @@ def coverage(error: Array, std: Array) -> float:
 
 
 def predicted(record: Record, outcome: Outcome) -> Array:
-    """Samples (T,) whose output was seen and predicted; an infinite prediction counts, it is an error."""
+    """Samples (T,) whose output was observed and predicted; an infinite prediction counts, it is an error."""
     return np.isfinite(record.y) & ~np.isnan(outcome.prediction)
 
 

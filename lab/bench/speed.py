@@ -1,4 +1,4 @@
-"""Speed contests, one function each: what is timed, and against which packages. ``python -m lab bench speed``.
+"""Speed contests, one function each: the contests, and the packages in each. ``python -m lab bench speed``.
 
 Every contest is a regression of four parameters unless it says otherwise, from the same start P0 = 10, with the same
 numbers. Times are medians of runs that take turns.
@@ -28,9 +28,9 @@ from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from lab.bench import speed_peers as peers
+from lab.bench.computer import times
 from lab.bench.contest import Contest, Finish, Job, hold
-from lab.bench.machine import times
-from lab.bench.speed_floors import floor
+from lab.bench.speed_bounds import bound
 from lab.bench.speed_peers import P0, Q, R, Signals
 
 SEED = 1
@@ -104,7 +104,7 @@ def live_nlms(T: int) -> Contest:
 
 
 def live_free(T: int) -> Contest:
-    """The tracker without settings, beside what it holds: a bank of filters."""
+    """The tracker without settings, compared with its parts: a bank of filters."""
     data = signals(T)
     others = (lambda: stream("driftfit Live, Kalman", kalman(), data),)
     return Contest(
@@ -204,14 +204,14 @@ def hammerstein_wiener(T: int) -> Contest:
     return Contest("Hammerstein-Wiener step", "no peer has this model", Job(name, run, T), others)
 
 
-FLOORS = ((2, 1), (4, 1), (6, 1), (10, 1), (4, 32))
+BOUNDS = ((2, 1), (4, 1), (6, 1), (10, 1), (4, 32))
 """(n, lanes) of the contests against the floors."""
 
 CONTESTS: tuple[tuple[Callable[[int], Contest], int, int], ...] = (
     (live_kalman, 500, 200), (live_rls, 2000, 200), (live_nlms, 2000, 200), (live_free, 2000, 200),
     (record_kalman, 20_000, 1000), (record_rls, 20_000, 1000), (record_ls, 5_000, 1000), (smoother, 10_000, 1000),
     (fleet, 80_000, 3200), (bank, 1000, 200), (hammerstein_wiener, 2000, 200),
-    *((partial(floor, n, lanes), 32_000, 3200) for n, lanes in FLOORS),
+    *((partial(bound, n, lanes), 32_000, 3200) for n, lanes in BOUNDS),
 )  # fmt: skip
 """Contests with their sizes, full and quick."""
 

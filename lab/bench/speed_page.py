@@ -11,8 +11,8 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, GREY, new_figure
 from lab.bench.causes import SPEED_CAUSES
+from lab.bench.computer import computer, markdown, versions
 from lab.bench.contest import SAME, Finish, Line
-from lab.bench.machine import machine, markdown, versions
 from lab.bench.speed import SEED, slope
 from lab.bench.speed_process import Start
 
@@ -27,6 +27,9 @@ compared programs take turns within one process, and figures are medians, so tha
 *Times ours* above 1 is slower than driftfit, below 1 faster. *Same numbers* is the largest difference of the
 estimates relative to the largest estimate; above {SAME:g} the numbers count as different. "Other" is a different
 algorithm, shown only for its cost."""
+
+OTHERS = "## What a user waits for"
+"""From this heading on the page holds what scripts in ``benchmarks/`` print."""
 
 FACTORS = """\
 Seconds are medians over fresh processes in which numpy is already imported; MB are sizes of files without numpy.
@@ -91,7 +94,7 @@ def growth_table(slopes: Slopes) -> str:
 def page(finishes: Sequence[Finish], slopes: Slopes, starts: tuple[Sequence[Start], Sequence[str]], quick: bool) -> str:
     """The whole page as markdown."""
     lost = losses(finishes)
-    parts = ["# Scoreboard: speed", INTRODUCTION, f"{machine()}. {versions()}. Seed {SEED}."]
+    parts = ["# Scoreboard: speed", INTRODUCTION, f"{computer()}. {versions()}. Seed {SEED}."]
     if quick:
         parts.append("**Quick form: small sizes, few repeats; not to be quoted.**")
     parts += ["## Where we lose", "\n".join(lost) or "In no contest was a peer faster.", SPEED_CAUSES]
@@ -120,9 +123,10 @@ def draw(slopes: Slopes) -> Figure:
 
 
 def write(folder: Path, text: str, slopes: Slopes) -> Path:
-    """Write ``scoreboard_speed.md`` and its picture into a folder; the page's path."""
+    """Write ``scoreboard_speed.md`` and its picture into a folder; the page's path. The end of the page stays."""
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     draw(slopes).savefig(folder / "figures" / "scoreboard_speed.png", dpi=100)
     target = folder / "scoreboard_speed.md"
-    target.write_text(text)
+    _, mark, others = target.read_text().partition(OTHERS) if target.exists() else ("", "", "")
+    target.write_text(text + (f"\n{mark}{others}" if mark else ""))
     return target

@@ -1,4 +1,4 @@
-"""What other packages do for the contests of speed: one function a package and task, ``make(signals) -> Job``.
+"""The jobs of other packages in the contests of speed: one function a package and task, ``make(signals) -> Job``.
 
 All run theta_t = theta_(t-1) + w, w ~ N(0, Q I), y = phi' theta + v, v ~ N(0, R), theta before the first sample
 N(0, P0 I), in double precision. Each raises ImportError where its package is absent.
@@ -139,7 +139,7 @@ def live_filterpy_imm(data: Signals) -> Job:
 
 
 def filterpy_filter(data: Signals) -> Job:
-    """The same loop as live, over a record that starts anew."""
+    """The same loop as live, over a record from its start."""
     part = data.first(len(data.y) // 10)
     n = part.phi.shape[1]
     rows, outputs = list(part.phi[:, None, :]), part.y.tolist()

@@ -1,4 +1,4 @@
-"""What a package costs before it runs: import, first result, disk space.
+"""The cost of a package before it runs: import, first result, disk space.
 
 Each figure is the time of a separate process in which numpy is already imported; processes take turns and medians are
 reported. The first result is the last estimate from a thousand samples of a regression with four parameters, by the
@@ -16,8 +16,8 @@ from importlib.metadata import PackageNotFoundError, distribution
 from statistics import median
 from typing import NamedTuple
 
+from lab.bench.computer import installed
 from lab.bench.contest import need
-from lab.bench.machine import installed
 
 HEAD = """
 import numpy as np, time
@@ -71,7 +71,7 @@ PROGRAMS: dict[str, tuple[str, str]] = {
 
 
 class Start(NamedTuple):
-    """Seconds to import, and to the first result; MB on disk alone, and with all that it needs beside numpy."""
+    """Seconds to import, and to the first result; MB on disk alone, and with everything that it needs besides numpy."""
 
     name: str
     seconds_import: float
@@ -112,7 +112,7 @@ def _row(name: str, package: str, seconds: list[tuple[float, float]]) -> Start:
 
 
 def needed(package: str) -> set[str]:
-    """A package and all that it requires, by the metadata of what is installed; numpy left out."""
+    """A package and all its requirements, by the metadata of installed packages; numpy left out."""
     Requirement = need("packaging.requirements", "Requirement")
     found: set[str] = set()
     waiting = [package]

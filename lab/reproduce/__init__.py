@@ -1,6 +1,6 @@
 """Reproductions of papers. A folder in this one with a function `main` is ``python -m lab reproduce NAME``.
 
-A `Claim` of a paper is judged by a function of numbers, with a rule that is printed beside its verdict.
+A `Claim` of a paper is judged by a function of numbers, with a rule that is printed next to its verdict.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 
 class Claim(NamedTuple):
-    """What is claimed, what is made of it, the rule by which, and the numbers that it was applied to."""
+    """A claim, its verdict, the rule of the verdict, and the numbers to which the rule was applied."""
 
     claim: str
     verdict: str
     rule: str
     measured: str
 
-    def told(self, width: int, by: str) -> str:
+    def text(self, width: int, by: str) -> str:
         """Numbers and rule, indented."""
         return "\n".join(indent(fill(text, width), by) for text in (self.measured, f"Rule: {self.rule}"))
 

@@ -65,18 +65,18 @@ def test_tables_and_claims_read_what_was_measured():
     assert tables.table(made_up()).row_count == len(tables.ROWS) + len(tables.ARRIVALS) + len(tables.BIAS) + 10
     found = made_up()
     times = {(2, 2, 3, 3): {"average": 60.0, "svd": 270.0, "filter": 330.0}}
-    told = {claim.claim.split(" (")[0]: claim for claim in claims.all_claims(found, times)}
-    assert told["Measurement noise has no obvious effect"].measured.startswith(
+    found_claims = {claim.claim.split(" (")[0]: claim for claim in claims.all_claims(found, times)}
+    assert found_claims["Measurement noise has no obvious effect"].measured.startswith(
         "at 20 dB the error is 0.41, without noise 0.012"
     )
-    assert "with Q/R = 1e-3 to 0.41" in told["A larger Q reduces the error"].measured
-    assert "0.0210, worst rms 1.000 and 1" in told["SVD is more accurate than AVE"].measured
-    assert "14 from theta0 = 10," in told["Estimates reach a small error from any start"].measured
+    assert "with Q/R = 1e-3 to 0.41" in found_claims["A larger Q reduces the error"].measured
+    assert "0.0210, worst rms 1.000 and 1" in found_claims["SVD is more accurate than AVE"].measured
+    assert "14 from theta0 = 10," in found_claims["Estimates reach a small error from any start"].measured
     assert (
         "14 (100 % arrive) from 1000"
-        in told["The extended Kalman filter is slower from 0.01 and fails from 1000"].measured
+        in found_claims["The extended Kalman filter is slower from 0.01 and fails from 1000"].measured
     )
-    assert told["A higher order is more accurate"].measured.startswith(
+    assert found_claims["A higher order is more accurate"].measured.startswith(
         "Er of (67) is 0.36 (q = 4); its b part is 33.3 %"
     )
     assert "hammerstein-wiener" in reproductions()

@@ -112,8 +112,8 @@ def test_numbers_turn_a_verdict_round(judge, cases):
     for numbers, verdict in cases:
         claim = judge(*numbers)
         assert claim.verdict == verdict
-        assert claim.rule in claim.told(10_000, "")
-        assert claim.measured in claim.told(10_000, "")
+        assert claim.rule in claim.text(10_000, "")
+        assert claim.measured in claim.text(10_000, "")
         verdicts.append(claim.verdict)
     assert len(set(verdicts)) > 1
 
@@ -209,5 +209,5 @@ def test_tables_of_banks_turn_a_verdict_round(judge, one, other):
 
 def test_verdicts_of_banks_on_the_printed_numbers():
     assert banks.scale(made("clean", {banks.KF: 0.352}), WRONG).verdict.startswith("it is required: r above all")
-    told = banks.losses(delayed(COSTS, 0.4)).verdict
-    assert told == "it buys delay; up to 3 it costs nothing, from 30 on it costs accuracy"
+    found_claims = banks.losses(delayed(COSTS, 0.4)).verdict
+    assert found_claims == "it buys delay; up to 3 it costs nothing, from 30 on it costs accuracy"

@@ -9,6 +9,7 @@ from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
     DeadZone,
@@ -28,8 +29,10 @@ from driftfit.models.hammerstein_wiener.results.product_drift import track_produ
 from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curves
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
+from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.results import Track
+from driftfit.run.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.piecewise import piecewise
@@ -55,21 +58,26 @@ from driftfit.use.rational import rational_model
 from driftfit.use.system_from_path import static_curve
 
 __all__ = [
+    "ARMAX",
     "ARX",
     "FLS",
     "GPB",
     "IMM",
+    "OE",
     "RLS",
     "AdaptiveKalman",
     "AugmentedFLS",
     "BSpline",
     "Bank",
     "Beam",
+    "BoxJenkins",
     "Change",
     "Chebyshev",
+    "ConformalFactor",
     "DataWarning",
     "DeadZone",
     "Decide",
+    "Equation",
     "ExtendedKalman",
     "FirstFloor",
     "Fleet",
@@ -87,6 +95,7 @@ __all__ = [
     "Outputs",
     "PiecewiseLinear",
     "Polynomial",
+    "PolynomialModel",
     "Regression",
     "Saturation",
     "Sensor",

@@ -11,16 +11,18 @@ from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
+from driftfit.judge.joint_noise import JointNoise
 from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
-from driftfit.run import fleet, many, outputs, result, shared_outputs
+from driftfit.run import fleet, keyed_results, outputs, result, shared_outputs
 from driftfit.run.live.rule import AlarmRule
 from driftfit.show.cells import cell_of
 from driftfit.show.fleet_summary import FleetSummary, summarise
-from driftfit.show.outputs_summary import OutputsSummary, SharedSummary, summarise_outputs, summarise_shared
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
 from driftfit.show.report import check_path, report
 from driftfit.show.report_many import page_of_many
+from driftfit.show.summary import Summary, summarise_outputs, summarise_shared
 from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.use.crossing import crossings
@@ -32,8 +34,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Judged(many.Many):
-    """Methods of many runs with keys; see `driftfit.judge.fleet_verdict`."""
+class Judged(keyed_results.KeyedResults):
+    """Verbs of results by key; see `driftfit.judge.fleet_verdict`."""
 
     def values(self) -> Iterator[Track]:
         """The results."""
@@ -155,7 +157,11 @@ class Outputs(outputs.Outputs, Judged, public=True):
         """The h nominal samples after the record, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny)."""
         return forecast_outputs(self, h, u)
 
-    def summary(self) -> OutputsSummary:
+    def joint_noise(self, memory: float | None = None) -> JointNoise:
+        """One noise covariance for all outputs, and their joint density; see `driftfit.judge.joint_noise`."""
+        return JointNoise(self, memory)
+
+    def summary(self) -> ByOutput[Summary]:
         """The summaries of all outputs, by name; print it."""
         return summarise_outputs(self)
 
@@ -194,8 +200,8 @@ class Shared(shared_outputs.Shared, public=True):
         """The report on the rows; see `driftfit.show.report`. ``alarms`` of `detect` have a separate section."""
         report(self.rows, path, title, alarms)
 
-    def summary(self) -> SharedSummary:
-        """Present parameters, and the one-step error of each output; print it."""
+    def summary(self) -> Summary:
+        """The summary of the rows, with the one-step error of each output; print it."""
         return summarise_shared(self)
 
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:

@@ -140,7 +140,7 @@ class Track(result.Track, public=True):
         return simulate.ahead(self, k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
-        """Outputs that inputs u would cause in the system at a sample, with bands; see `driftfit.use.simulate`."""
+        """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
         return simulate.simulate(self, u, at, y)
 
     def crossing(

@@ -1,4 +1,4 @@
-"""Streams with their verbs: what users get as `driftfit.Live`."""
+"""Streams with their verbs: `driftfit.Live` for users."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Live(live.Live, public=True):
 
     @property
     def system(self) -> LiveSystem:
-        """The `ARX` system as it stands now: poles, gains, responses with bands; see `driftfit.use.live_system`."""
+        """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.live_system`."""
         return LiveSystem(self)
 
 
@@ -49,6 +49,6 @@ class LiveOutputs(outputs.LiveOutputs, public=True):
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """The next h nominal samples, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny).
 
-        While `apply` is outstanding the first row of u is what it would bring.
+        While `apply` is outstanding, the first row of u is the input that it would receive.
         """
         return drive_on(copy(self), h, u)

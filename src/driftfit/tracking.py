@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, overload
+from os import PathLike
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, overload
 
 from driftfit.data.record import Reading
 from driftfit.fleets import Fleet
@@ -14,8 +15,39 @@ from driftfit.run.track import Trackers
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
 
+if TYPE_CHECKING:
+    from driftfit.show.export import Written
+
 Ranges = Mapping[Any, tuple[float | None, float | None]] | None
 """From signals to their valid ranges."""
+
+
+class Given(TypedDict, total=False):
+    """Arguments that every form of `track` takes by name."""
+
+    data: Any
+    time: Any
+    dt: Any
+    weights: Any
+    drift: Any
+    units: Mapping[str, str] | None
+    limits: Ranges
+    exclude: Any
+    keep: str
+    dtype: Any
+
+
+@overload
+def track(
+    model: Model,
+    tracker: Trackers,
+    y: Any,
+    u: Any = None,
+    *,
+    by: str | Sequence[str] | None = None,
+    to: str | PathLike[str],
+    **given: Unpack[Given],
+) -> Written: ...
 
 
 @overload
@@ -25,18 +57,10 @@ def track(
     y: Any,
     u: Any = None,
     *,
-    data: Any = None,
-    time: Any = None,
     by: None = None,
-    dt: Any = None,
-    weights: Any = 1.0,
-    drift: Any = 1.0,
-    units: Mapping[str, str] | None = None,
-    limits: Ranges = None,
-    exclude: Any = None,
-    keep: str = "std",
     warm_start: Run | bytes | None = None,
     prob: Any = None,
+    **given: Unpack[Given],
 ) -> Track: ...
 
 
@@ -47,17 +71,9 @@ def track(
     y: Any,
     u: Any = None,
     *,
-    data: Any = None,
-    time: Any = None,
     by: str | Sequence[str] | None = None,
-    dt: Any = None,
-    weights: Any = 1.0,
-    drift: Any = 1.0,
-    units: Mapping[str, str] | None = None,
-    limits: Ranges = None,
-    exclude: Any = None,
-    keep: str = "std",
     warm_start: Fleet | Mapping[Any, Run | bytes] | None = None,
+    **given: Unpack[Given],
 ) -> Fleet: ...
 
 
@@ -77,8 +93,10 @@ def track(
     limits: Ranges = None,
     exclude: Any = None,
     keep: str = "std",
+    dtype: Any = "float64",
     warm_start: Any = None,
     prob: Any = None,
+    to: str | PathLike[str] | None = None,
 ) -> Any:
     """Track the parameters of a model in a record, or in many records.
 
@@ -123,18 +141,29 @@ def track(
     exclude : list of (from, to), or a mapping from the keys of a fleet to such lists
         Intervals to leave out, both ends included, in times or, without time, in sample numbers: nothing in them is
         used or enters a lag, and the summary counts their samples (`driftfit.data.limits`).
-    keep : "std" or "cov"
-        "cov" also stores the covariance of every sample, n * n numbers each.
+    keep : "std", "cov" or "theta"
+        What is stored of every sample. "std": theta, std, prediction, innovation and its standard deviation, ok:
+        2 n + 4 numbers. "cov": also the covariance, n * n numbers. "theta": that alone, n numbers, for models of one
+        output; whatever else is asked for replays the record.
+    dtype : "float64" or "float32"
+        Precision in which results are stored: "float32" halves their memory. The filter works in double precision.
     warm_start : Track, Live, Fleet, bytes, mapping or None
         Continue where that run ended, given itself or as bytes (``live.to_bytes()``, ``run.end().to_bytes()``); for a
         fleet series by series, from a fleet or a mapping from key to any of these (new series start from the
         beginning).
     prob : (T, changes), (T, joint events) or None
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
+    to : path or None
+        A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
+        columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start``.
+    to : path or None
+        A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
+        columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start`` and ``prob``.
 
     Returns
     -------
-    Track, or a Fleet (from key to Track) for several series or several trackers. A model with several outputs (``ny``)
+    Track, or a Fleet (from key to Track) for several series or several trackers; with ``to`` the numbers of series and
+    rows written. A model with several outputs (``ny``)
     takes y (T, ny), or as many names, and returns `driftfit.fleets.Outputs`, or `driftfit.fleets.Shared` if the outputs
     share one theta; ``tracker`` may then map the name of each output to its tracker, and weights may be (T, ny).
 
@@ -151,4 +180,11 @@ def track(
         If most samples cannot be used because of ``dt``.
     """
     reading = Reading(time, dt, weights, drift, units, limits, exclude)
-    return plain.track(model, tracker, y, u, reading, data=data, by=by, keep=keep, warm_start=warm_start, prob=prob)
+    if to is not None:
+        from driftfit.show.export import write_parts  # importing polars takes as long as all other imports
+
+        if warm_start is not None or prob is not None:
+            raise ValueError("track: to= cannot be combined with warm_start= or prob=.")
+        return write_parts(plain.parts(model, tracker, y, u, reading, data=data, by=by, keep=keep, dtype=dtype), to)
+    more: Any = {"keep": keep, "dtype": dtype, "warm_start": warm_start, "prob": prob}
+    return plain.track(model, tracker, y, u, reading, data=data, by=by, **more)

@@ -5,6 +5,7 @@ After an upgrade of Numba run this file first: `pytest -n 0 tests/contract/test_
 
 import ast
 import gc
+import operator
 import threading
 import weakref
 from pathlib import Path
@@ -14,7 +15,9 @@ import numba
 import numpy as np
 import pytest
 from numba import types
+from numba.core.compiler import Flags
 from numba.core.registry import cpu_target
+from numba.core.typing.templates import AbstractTemplate
 
 from driftfit.engine import disk_cache, kernel
 from driftfit.engine import numba_internals as internals
@@ -110,6 +113,50 @@ def test_parts_are_linked_and_not_emitted():
     assert "cpython" not in made.library.get_llvm_str(), "no_cpython_wrapper leaves the wrapper in."
     with pytest.raises(TypeError, match="py_func"):
         doubled(np.ones(2))
+
+
+def test_passes_for_what_is_not_used_are_left_out():
+    def passes(made):
+        made.compile((VECTOR,))
+        (times,) = made.overloads[(VECTOR,)].metadata["pipeline_times"].values()
+        return {name.split("_", 1)[1] for name in times}
+
+    every, ours = passes(numba.njit(first)), passes(internals.under_ieee(first))
+    assert every - ours == internals.UNUSED, "DefaultPassBuilder or the names of its passes changed."
+    assert ours < every
+
+
+def test_operations_are_typed_once(monkeypatch):
+    def total(y, i):
+        return y[i] + y[i] * y[i]
+
+    def other(y, i):
+        return y[i] * y[i] + y[i]
+
+    internals.emit(total, (VECTOR, types.intp))
+    plus = cpu_target.typing_context.resolve_value_type(operator.add)
+    pair = types.float64, types.float64
+    implementation = plus._impl_keys[pair]
+    monkeypatch.setitem(plus._impl_keys, pair, "of a function with other options")
+    tried = []
+    monkeypatch.setattr(
+        AbstractTemplate,
+        "apply",
+        lambda self, *given, apply=AbstractTemplate.apply: tried.append(self) or apply(self, *given),
+    )
+    internals.emit(other, (VECTOR, types.intp))
+    assert not tried, "Function.get_call_type or Flags changed: operations are typed again in every function."
+    assert plus._impl_keys[pair] == implementation, "Functions with other options decide what our operations call."
+
+
+def test_functions_with_other_options_are_typed_by_themselves():
+    strict, loose, again = Flags(), Flags(), Flags()
+    loose.fastmath = True
+    again.fastmath = False  # the default, said aloud
+    assert strict != loose, "Flags._values no longer holds the options: a user's fast-math could enter our code."
+    assert strict == again
+    assert hash(strict) == hash(again), "Equal options differ."
+    assert Flags.options["fastmath"].default == strict.fastmath
 
 
 def test_parts_are_forgotten_and_compiled_again():

@@ -1,7 +1,7 @@
 """Flexible least squares, reproduced: four examples, one hundred noise seeds, every method at the weight of the paper.
 
-Prints the medians beside reference values, the best weight of each method, the cost of each algorithm as the record
-grows, and what the claims of the paper come to; draws the paper's ten figures. Source: Chen et al., "augmented flexible
+Prints the medians and reference values, the best weight of each method, the cost of each algorithm as the record grows,
+and the verdicts on the claims of the paper; draws the paper's ten figures. Source: Chen et al., "augmented flexible
 least squares for time-varying parameter systems", sections 5 and 6. Run ``python -m lab reproduce fls --help``.
 """
 
@@ -100,7 +100,7 @@ def measure(name: str, mu: float, seeds: Iterable[int]) -> Array:
 
 
 def table_of_medians(found: dict[str, Array]) -> Table:
-    """Measured medians beside the reference."""
+    """Measured medians and the reference."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, title="Median error, measured (reference)", title_justify="left")
     for head in ("", "", *METHODS):
         table.add_column(head, justify="right" if head else "left")

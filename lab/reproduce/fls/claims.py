@@ -1,4 +1,4 @@
-"""What the claims of the paper come to when they are measured."""
+"""The claims of the paper, measured."""
 
 from __future__ import annotations
 
@@ -188,5 +188,5 @@ def show(out: Console, claims: list[Claim]) -> None:
     out.print("Claims of the paper")
     for number, claim in enumerate(claims, 1):
         out.print(f"{number}. {claim.claim}: [bold]{claim.verdict}[/bold].")
-        out.print(claim.told(100, "   "))
+        out.print(claim.text(100, "   "))
     out.print()

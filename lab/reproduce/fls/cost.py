@@ -1,8 +1,8 @@
-"""What each algorithm costs as the record grows: dense and banded normal equations, exact smoother, on-line trackers.
+"""The cost of each algorithm as the record grows: dense and banded normal equations, exact smoother, on-line trackers.
 
 The off-line estimate solves R theta = b with R of order L n. Inverted as a dense matrix that is O(L^3 n^3); R is block
 tridiagonal, and solved as a band it is O(L n^3), as is the smoother by recursion. On-line trackers cost O(n) or O(n^2)
-a sample.
+per sample.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MU = 1.0
 
 
 def band(phi: Array, mu: float) -> Array:
-    """The upper band of R, (n + 1, L n): phi_k phi_k' + mu (1 or 2) I on the diagonal blocks, -mu beside them."""
+    """The upper band of R, (n + 1, L n): phi_k phi_k' + mu (1 or 2) I on the diagonal blocks, -mu next to them."""
     L, n = phi.shape
     ab = np.zeros((n + 1, L, n))
     neighbours = np.full(L, 2.0 * mu)

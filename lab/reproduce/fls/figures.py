@@ -86,7 +86,7 @@ def outputs(records: list[Simulated], found: list[Fit], title: str) -> Figure:
 
 
 def _band(axis: Axes, values: Array) -> None:
-    """What 95 % of the seeds span."""
+    """The range of 95 % of the seeds."""
     low, high = np.nanquantile(values, (0.025, 0.975), axis=0)
     axis.fill_between(np.arange(values.shape[1]), low, high, color=BLUE, alpha=0.15, lw=0, label="95 % of the seeds")
 

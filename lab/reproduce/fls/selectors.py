@@ -1,7 +1,7 @@
 """How the weight is chosen: the selectors of `tune` on the examples, and on records that are random walks.
 
 On a random walk with mu = r / q = 1, 10 and 100 a selector should find mu, and its 95 % interval should cover in 95 %
-of the records. On the examples, whose parameters are no random walks, what counts is the error of the smoothed path.
+of the records. On the examples, whose parameters are no random walks, the error of the smoothed path counts.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def choose(d: Simulated, method: str) -> Tuned:
 
 
 def on_example(name: str) -> dict[str, Choice]:
-    """Every selector on one example, beside the weight of the paper and the best of a grid for each record."""
+    """Every selector on one example, with the weight of the paper and the best of a grid for each record."""
     records = [example(name, s) for s in range(SEEDS[name])]
     found = {"paper": Choice(float(np.median([path_error(d, MU[name]) for d in records])), MU[name], 0.0)}
     for method in METHODS:
@@ -78,7 +78,7 @@ def on_example(name: str) -> dict[str, Choice]:
 
 
 def random_walk(mu: float, seed: int, T: int = 200) -> Simulated:
-    """Two random walks of r / q = mu with r = 1, seen through white regressors."""
+    """Two random walks of r / q = mu with r = 1, observed through white regressors."""
     rng = np.random.default_rng(seed)
     theta = paths([RandomWalk(0.0, mu**-0.5)] * 2, T, rng)
     phi = rng.normal(size=(T, 2))

@@ -1,4 +1,4 @@
-"""What is made of each claim of the paper: functions of numbers, each with its rule."""
+"""The verdict on each claim of the paper: functions of numbers, each with its rule."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Time-varying Hammerstein-Wiener systems, reproduced: four examples, 24 seeds (20 for the furnace).
 
-Prints medians beside reference values from an independent implementation, the cost of separation, and what the claims
-of the paper come to; draws figures 2 to 10, 12 and 13. Source: Feng and Hong (2021), Int. J. Systems Science 52(16).
-Run ``python -m lab reproduce hammerstein-wiener --help``.
+Prints medians and reference values of an independent implementation, the cost of separation, and the verdicts on the
+claims of the paper; draws figures 2 to 10, 12 and 13. Source: Feng and Hong (2021), Int. J. Systems Science 52(16). Run
+``python -m lab reproduce hammerstein-wiener --help``.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ def main(
     found = tables.measure(count, quick)
     out.print(tables.table(found))
     ratio, where = tables.worst_ratio(found)
-    told = "1 seed" if count == 1 else f"{count} seeds"
+    text = "1 seed" if count == 1 else f"{count} seeds"
     out.print(
-        f"{told}; largest deviation of a median from its reference, beyond rounding, {100 * ratio:.0f} % ({where})\n"
+        f"{text}; largest deviation of a median from its reference, beyond rounding, {100 * ratio:.0f} % ({where})\n"
     )
     times = cost.measure(500, cost.ORDERS[:1]) if quick else cost.measure()
     out.print(cost.table(times))

@@ -1,4 +1,4 @@
-"""What the claims of the paper come to when they are measured."""
+"""The claims of the paper, measured."""
 
 from __future__ import annotations
 
@@ -65,4 +65,4 @@ def show(out: Console, claims: list[Claim]) -> None:
     """Print claims, verdicts, numbers and rules."""
     for claim in claims:
         out.print(f"[bold]{claim.claim}:[/bold] {claim.verdict}")
-        out.print(claim.told(116, "    "), markup=False)
+        out.print(claim.text(116, "    "), markup=False)

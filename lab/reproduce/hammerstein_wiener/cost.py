@@ -1,4 +1,4 @@
-"""What separation costs beside the filter (remark 4): nanoseconds a sample by order."""
+"""The cost of separation in addition to the filter (remark 4): nanoseconds per sample by order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REPEATS = 5
 
 
 def least(function: Callable[[], object], samples: int) -> float:
-    """Nanoseconds a sample, the least of several runs."""
+    """Nanoseconds per sample, the least of several runs."""
     function()
     times = []
     for _ in range(REPEATS):
@@ -36,7 +36,7 @@ def least(function: Callable[[], object], samples: int) -> float:
 def measure(
     samples: int = 5000, orders: tuple[tuple[int, int, int, int], ...] = ORDERS
 ) -> dict[tuple[int, ...], dict[str, float]]:
-    """ns a sample, the least of five, for (na, nb, n_in, n_out); the last order without its filter step."""
+    """ns per sample, the least of five, for (na, nb, n_in, n_out); the last order without its filter step."""
     found: dict[tuple[int, ...], dict[str, float]] = {}
     rng = np.random.default_rng(0)
     for order in orders:
@@ -58,7 +58,7 @@ def measure(
 
 
 def table(times: dict[tuple[int, ...], dict[str, float]]) -> Table:
-    """Nanoseconds a sample."""
+    """Nanoseconds per sample."""
     shown = Table(box=SIMPLE_HEAD, show_edge=False, title="Nanoseconds a sample", title_justify="left")
     for head in ("na, nb, n_in, n_out", "filter step", *METHODS[:3]):
         shown.add_column(head, justify="right")

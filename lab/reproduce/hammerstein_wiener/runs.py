@@ -202,7 +202,7 @@ FIXES = ("least squares", "instruments", "instruments, unbiased basis")
 
 
 def fixes(seed: int, T: int = 20_000) -> dict[str, float]:
-    """|xi_hat - xi| on a constant system at 20 dB, by what takes the bias away."""
+    """|xi_hat - xi| on a constant system at 20 dB, by the method that removes the bias."""
     from driftfit.systems.hammerstein_wiener import START, simulate
 
     groups = (START[name] for name in "abcd")

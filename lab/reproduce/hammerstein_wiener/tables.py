@@ -1,4 +1,4 @@
-"""The table of the reproduction: measured medians and worst seeds beside the reference."""
+"""The table of the reproduction: measured medians and worst seeds, with the reference."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CHECKED_UP_TO = 1.0
 
 @dataclass(frozen=True)
 class Found:
-    """What was measured, by example and by seed."""
+    """Measured values, by example and by seed."""
 
     first: list[dict[str, Any]]
     second: list[dict[tuple[str, float], float]]
@@ -135,7 +135,7 @@ def gains(found: Found) -> list[float]:
 
 
 def table(found: Found) -> Table:
-    """Measured beside the reference."""
+    """Measured values and the reference."""
     shown = Table(box=SIMPLE_HEAD, show_edge=False, title="Errors of the parameters", title_justify="left")
     for head, justify in (("", "left"), ("what", "left"), ("median", "right"), ("(reference)", "right"),
                           ("worst rms", "right"), ("(reference)", "right")):  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is made of each claim of the paper: functions of numbers, each with its rule.
+"""The verdict on each claim of the paper: functions of numbers, each with its rule.
 
 Arrivals are (samples until the error is small for good, median over the runs that arrive; share of runs that do).
 """
@@ -16,19 +16,19 @@ Arrivals = Mapping[float, tuple[float, float]]
 
 def start(rows: Arrivals) -> Claim:
     """Example 2: arrivals of stage one and separation by the start."""
-    told = ", ".join(f"{samples:.0f} from theta0 = {k:g}" for k, (samples, _) in rows.items())
+    text = ", ".join(f"{samples:.0f} from theta0 = {k:g}" for k, (samples, _) in rows.items())
     whole = all(share == 1.0 and samples <= 2 * UNKNOWNS for samples, share in rows.values())
     return Claim(
         "Estimates reach a small error from any start",
         "holds without noise and with P0 = 1e8 I" if whole else "not in all runs",
         f"all runs arrive, in the median within twice as many samples as there are unknowns, {UNKNOWNS}.",
-        f"samples until the error is below {CLOSE:g} for good: {told}, for {UNKNOWNS} unknowns.",
+        f"samples until the error is below {CLOSE:g} for good: {text}, for {UNKNOWNS} unknowns.",
     )
 
 
 def rivals(rows: Arrivals, two_stage: float) -> Claim:
     """Example 2: arrivals of the extended Kalman filter, and the samples that stage one needs from 0.01."""
-    told = ", ".join(
+    text = ", ".join(
         f"{samples:.0f} ({100 * share:.0f} % arrive) from {k:g}" if share else f"no run arrives from {k:g}"
         for k, (samples, share) in rows.items()
     )
@@ -38,7 +38,7 @@ def rivals(rows: Arrivals, two_stage: float) -> Claim:
         {(True, True): "holds", (True, False): "it is slower, and does not fail",
          (False, True): "it fails, and is not slower", (False, False): "does not hold"}[slower, fails],
         "it needs half as many samples again from 0.01, and fewer than half of the runs arrive from 1000.",
-        f"samples it needs: {told}.",
+        f"samples it needs: {text}.",
     )  # fmt: skip
 
 
@@ -82,14 +82,14 @@ def order(raw: Mapping[int, float], share: float, legendre: tuple[float, float, 
     """Example 4: Er by the order of raw powers, the share of b in it; of Legendre polynomials the squared errors of a
     and of p, and the local gain over the true one.
     """
-    told = ", ".join(f"{error:.2f} (q = {q})" for q, error in raw.items())
+    text = ", ".join(f"{error:.2f} (q = {q})" for q, error in raw.items())
     fails = "we could not reproduce it with raw powers" if len(raw) > 1 else "not judged with one order"
     a, p, gain = legendre
     return Claim(
         "A higher order is more accurate (example 4)",
         "holds" if len(raw) > 1 and raw[max(raw)] < raw[min(raw)] else fails,
         "Er is smaller with the highest order than with the lowest.",
-        f"Er of (67) is {told}; its b part is {100 * share:.1f} % of that, and with d_1 = 1 b_1 is not 0.0378. "
+        f"Er of (67) is {text}; its b part is {100 * share:.1f} % of that, and with d_1 = 1 b_1 is not 0.0378. "
         f"Legendre polynomials of order 4 have squared errors of a of {a:.0e} and of p of {p:.0e}, and the local gain "
         f"is {gain:.2f} of the true one.",
     )

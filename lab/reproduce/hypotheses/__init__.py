@@ -1,9 +1,10 @@
-"""Banks of hypotheses, reproduced: tables of accuracy beside reference values, with RLS, tuned Kalman filters and IMM.
+"""Banks of hypotheses, reproduced: tables of accuracy with reference values, with RLS, tuned Kalman filters and IMM.
 
 Prints root mean square error, error after jumps and when steady, detection, delay, false alarms, log density of the
 outputs, calibration and cost for every reduction, on clean records and with outliers, a frozen sensor and regimes; then
-what wrong settings cost, what smoothing and unknown noise come to, and which claims hold. RLS and Kalman filters were
-tuned for the error on other records of the kind; banks were not. Run ``python -m lab reproduce hypotheses --help``.
+the cost of wrong settings, the effects of smoothing and unknown noise, and the claims that hold. RLS and Kalman filters
+were tuned for the error on other records of the kind; banks were not. Run ``python -m lab reproduce hypotheses
+--help``.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def cells(values: Sequence[float], reference: Sequence[float | None] | None) -> 
 
 
 def cell(value: float, reference: float | None) -> str:
-    """A measured value beside the reference."""
+    """A measured value and the reference."""
     return "-" if np.isnan(value) else short(value) + ("" if reference is None else f" ({short(reference)})")
 
 
@@ -134,7 +135,7 @@ def main(
     quick: Annotated[bool, typer.Option(help="Few records, and no row of great cost.")] = False,
     only: Annotated[str, typer.Option(help="Only tables whose title contains this.")] = "",
 ) -> None:
-    """Tables of accuracy of banks of hypotheses, beside reference values."""
+    """Tables of accuracy of banks of hypotheses, with reference values."""
     from lab.reproduce.hypotheses.claims import print_claims
 
     console = Console(width=200)

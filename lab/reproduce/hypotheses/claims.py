@@ -1,4 +1,4 @@
-"""What the claims made for banks of hypotheses come to when they are measured."""
+"""The claims made for banks of hypotheses, measured."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ def wording(found: Tables) -> Claim:
 def depth(found: Tables) -> Claim:
     """Optimal stopping."""
     rows = ("threshold tau=0.02 dmax=6", "look-ahead c=0.005 dmax=6")
-    told = ", ".join(
+    parts = ", ".join(
         f"{row} {against(found, 'variable', row, 'fixed d=5'):+.0f} % with {value(found, 'variable', row, LEAVES):.0f} "
         "leaf updates a sample"
         for row in rows
@@ -188,7 +188,7 @@ def depth(found: Tables) -> Claim:
         "A variable depth has the accuracy of a deep tree at the price of a shallow one",
         holds(max(against(found, "variable", row, "fixed d=5") for row in rows) < 6.0),
         "the RMSE is less than 6 % larger than that of the deep tree.",
-        f"RMSE against Decide(5) with {value(found, 'variable', 'fixed d=5', LEAVES):.0f}: {told}.",
+        f"RMSE against Decide(5) with {value(found, 'variable', 'fixed d=5', LEAVES):.0f}: {parts}.",
     )
 
 
@@ -225,7 +225,7 @@ def probabilities(found: Mapping[int, Calibrated]) -> Claim:
     """Calibration after decisions, by depth."""
     high = all(row.sure >= 0.9 for row in found.values())
     low = all(0.4 * row.faint <= row.true <= 2.5 * row.faint for row in found.values())
-    told = [
+    parts = [
         f"depth {d}: jumps decided with p above .97 happened at that very sample in {100 * row.sure:.0f} %, dates are "
         f"exact in {100 * row.exact:.0f} % and within one sample in {100 * row.near:.0f} %, probabilities of .01 to .1 "
         f"(mean {row.faint:.3f}) come true in {100 * row.true:.1f} %"
@@ -236,7 +236,7 @@ def probabilities(found: Mapping[int, Calibrated]) -> Claim:
         {(True, True): "holds", (False, True): "not to the sample and above 0.1, once branches have been cut",
          (True, False): "not below 0.1", (False, False): "does not hold"}[high, low],
         "decisions with p above .97 are right in 90 %; probabilities below 0.1 come true within a factor of 2.5.",
-        "; ".join(told) + ".",
+        "; ".join(parts) + ".",
     )  # fmt: skip
 
 
@@ -269,7 +269,7 @@ def print_claims(found: Tables, wrong: Rows, noise: Rows, runs: int, console: Co
         covariances(found), probabilities({d: calibrated(d, runs) for d in (1, 4)}), wording(found), depth(found),
         noise_variance(noise),
     ]  # fmt: skip
-    for k, told in enumerate(claims, 1):
-        claim, verdict, _, measured = told
+    for k, claim_of in enumerate(claims, 1):
+        claim, verdict, _, measured = claim_of
         console.print(fill(f"{k}. {claim}: {verdict}.", 118), style="bold", highlight=False)
-        console.print(told._replace(measured=measured[:1].upper() + measured[1:]).told(115, "   "), highlight=False)
+        console.print(claim_of._replace(measured=measured[:1].upper() + measured[1:]).text(115, "   "), highlight=False)

@@ -1,4 +1,4 @@
-"""What is run on what: the settings of every row of the tables."""
+"""The trackers and the records: the settings of every row of the tables."""
 
 from __future__ import annotations
 
@@ -44,35 +44,35 @@ Alarm = Callable[[Hypotheses], Array]
 
 
 def likeliest(lag: int) -> Alarm:
-    """While a change is likelier than none, seen from ``lag`` floors later."""
+    """Samples at which a change is likelier than none, given ``lag`` more levels."""
 
-    def on(told: Hypotheses) -> Array:
-        p = np.nan_to_num(told.lag_prob[:, lag]).reshape(len(told.run), -1, told.sensors).sum(axis=2)
+    def on(found: Hypotheses) -> Array:
+        p = np.nan_to_num(found.lag_prob[:, lag]).reshape(len(found.run), -1, found.sensors).sum(axis=2)
         return np.asarray(p.argmax(axis=1) > 0)
 
     return on
 
 
-def decided(told: Hypotheses) -> Array:
+def decided(found: Hypotheses) -> Array:
     """When a change is decided."""
-    on = np.zeros(len(told.run), bool)
-    on[[d.decided for d in told.decisions if d.event >= told.sensors]] = True
+    on = np.zeros(len(found.run), bool)
+    on[[d.decided for d in found.decisions if d.event >= found.sensors]] = True
     return on
 
 
 def window(threshold: float) -> Alarm:
     """While the probability of a change in the window passes a threshold."""
-    return lambda told: np.asarray(told.window > threshold)
+    return lambda found: np.asarray(found.window > threshold)
 
 
 class Entry(NamedTuple):
-    """A row of a table: a tracker, when it calls a change, and how it sees the record."""
+    """A row of a table: a tracker, when it reports a change, and its view of the record."""
 
     tracker: Tracker
     alarm: Alarm | None = None
     literal: bool = False
     """Regressors of outputs as measured: no leaf cleans them."""
-    told: Callable[[Jumping], Array] | None = None
+    prior: Callable[[Jumping], Array] | None = None
     """Probabilities of events that it is given."""
 
 
@@ -135,15 +135,15 @@ def imm(*others: Sensor, literal: bool = False, **more: Any) -> Entry:
 
 
 def oracle(*others: Sensor, changes: Any = CHANGES) -> Entry:
-    """A filter that is told every event."""
+    """A filter that is given every event."""
     Hm = 1 + len(others)
 
     def events(record: Jumping) -> Array:
-        told = np.zeros((len(record.y), len(changes) * Hm))
-        told[np.arange(len(told)), record.kinds * Hm + (record.bad if others else 0)] = 1.0
-        return told
+        prior = np.zeros((len(record.y), len(changes) * Hm))
+        prior[np.arange(len(prior)), record.kinds * Hm + (record.bad if others else 0)] = 1.0
+        return prior
 
-    return Entry(bank(GPB(1), *others, changes=changes), told=events)
+    return Entry(bank(GPB(1), *others, changes=changes), prior=events)
 
 
 def loss_of(miss: float) -> tuple[tuple[float, ...], ...]:

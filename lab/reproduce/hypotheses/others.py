@@ -37,7 +37,7 @@ NOISE = {
 
 
 def given(run: Track, kinds: Array) -> Array:
-    """The smoothed path if change ``kinds[t]`` is what happened before sample t."""
+    """The smoothed path if change ``kinds[t]`` happened before sample t."""
     return solve(problem_of(run, [])._replace(Q=STEPS[kinds]))[0]
 
 

@@ -1,4 +1,4 @@
-"""Reference values of the tables, of an independent implementation on records of its own; None where it gives none."""
+"""Reference values of the tables, of an independent implementation on separate records; None where it gives none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Row = tuple[float | None, ...]
 
 
 def lines(name: str) -> Iterator[list[str]]:
-    """Lines of one of the tables beside this file, without its header."""
+    """Lines of one of the tables in this folder, without its header."""
     text = (Path(__file__).parent / name).read_text(encoding="utf-8")
     return iter(list(csv.reader(text.splitlines()))[1:])
 

@@ -38,7 +38,7 @@ class Score(NamedTuple):
 
 def run(entry: Entry, record: Jumping) -> Track:
     """Track a record."""
-    prob = None if entry.told is None else entry.told(record)
+    prob = None if entry.prior is None else entry.prior(record)
     if not entry.literal:
         return track(MODEL, entry.tracker, record.y, record.u, prob=prob, keep="cov")
     past = np.r_[0.0, 0.0, record.y]
@@ -47,7 +47,7 @@ def run(entry: Entry, record: Jumping) -> Track:
 
 
 def alarms(entry: Entry, made: Track) -> Array:
-    """Samples after which a change was called; what is called within `REACH` samples of an alarm belongs to it."""
+    """Samples after which a change was called; changes reported within `REACH` samples of an alarm belong to it."""
     if entry.alarm is None:
         return np.zeros(0, int)
     kept: list[int] = []
@@ -108,7 +108,7 @@ class Measured(NamedTuple):
     """A row of a table."""
 
     values: tuple[float, ...]
-    """What `HEADS` says."""
+    """The numbers of `HEADS`."""
     each: Array
     """(runs,): RMSE of every record."""
 

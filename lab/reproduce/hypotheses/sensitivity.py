@@ -1,4 +1,4 @@
-"""What wrong settings cost: root mean square errors of five reductions when one setting is not what it should be."""
+"""The cost of wrong settings: root mean square errors of five reductions when one setting is wrong."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def bank(
     reduce: Reduction, jumps: float = 1.0, priors: float = 1.0, noise: float = 1.0, drift: float = 1.0,
     medium: bool = False,
 ) -> Bank:  # fmt: skip
-    """The bank of the tables, with factors on what it is told."""
+    """The bank of the tables, with factors on its settings."""
     more: tuple[tuple[Any, float], ...] = ((0.05, 0.003),) if medium else ()
     moves = ((0.6, 0.006), ([1e-6, 1e-6, 1.5], 0.004), *more)
     changes = [Change(0.002**2 * drift)]

@@ -251,7 +251,7 @@ class TimeVaryingResults:
 
 @dataclass(frozen=True)
 class CoefficientTable:
-    """What `summary` returns; ``print`` shows it as text, and a notebook as HTML."""
+    """The result of `summary`; ``print`` shows it as text, and a notebook as HTML."""
 
     facts: dict[str, str]
     table: pd.DataFrame

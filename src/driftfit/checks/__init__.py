@@ -1,4 +1,4 @@
-"""The promises of trackers and models as code, for those that stand outside this package as well.
+"""The promises of trackers and models as code, also for those outside this package.
 
 from driftfit.checks import check_model, check_tracker
 

@@ -15,7 +15,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.results import Track
-from driftfit.run.lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.smooth.problem import replay
 from driftfit.streams import Live
 from driftfit.trackers.kalman import Kalman
@@ -118,7 +118,7 @@ def _reach(model: Model, still: Kalman, run: Track) -> Iterator[str]:
     changed = np.flatnonzero((replay(track(model, still, y, u))["phi"] != replay(run)["phi"])[..., 0].any(axis=1))
     if changed.size and changed[0] < AT:
         yield f"It looks ahead: signals of sample {AT} are in the regressors of sample {changed[0]}."
-    if changed.size and changed[-1] > AT + model.reach:
+    if changed.size and changed[-1] > AT + model.reach and not model.recursive:
         yield f"reach is {model.reach}, but signals of sample {AT} are in the regressors of sample {changed[-1]}."
 
 

@@ -1,6 +1,6 @@
 """The promises of a tracker: `check_tracker`.
 
-Every check runs the tracker on a small simulated record. If a promise is broken, it returns a sentence that says which
+Every check runs the tracker on a small simulated record. For each broken promise it returns a sentence that names it
 and where to look. This takes about as long as compiling the tracker three times. A tracker that keeps all promises is
 not necessarily good: compare its one-step errors with those of others (`Track.summary`).
 """
@@ -20,7 +20,7 @@ from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.run.lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.result import root_mean_square
 from driftfit.streams import Live
 from driftfit.trackers.base import Tracker
@@ -180,7 +180,7 @@ def _no_time(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
 
 
 def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
-    if not tracker.drift_each:
+    if not tracker.drift_per_parameter:
         return
     y, u = record()
     drift = np.where(np.arange(T) % 20 == 0, 100.0, 1.0)
@@ -188,9 +188,9 @@ def _each(tracker: Tracker, model: Model, _: Track) -> Iterator[str]:
     one, each = (track(model, tracker, y, u, drift=given) for given in (drift, columns))
     if not np.allclose(one.theta, each.theta, rtol=1e-6, atol=1e-9):
         yield (
-            "It declares drift_each = True, but the same drift given for each parameter has another effect than one "
-            "drift for all: give its steps told=driftfit.trackers.parts.varying_drift.told "
-            "and multiply q by s.each[i, l] ** 2."
+            "It declares drift_per_parameter = True, but the same drift given for each parameter has another effect "
+            "than one drift for all: give its steps read_extra=driftfit.trackers.parts.varying_drift.read_drift "
+            "and multiply q by s.drift_root[i, l] ** 2."
         )
 
 

@@ -21,6 +21,7 @@ def select(
     plot: Plot = None,
 ) -> None:
     """Compare models (repeat --model), or the regressors of one, by how well they predict."""
+    from driftfit.judge.structures.select import Selection
     from driftfit.judge.structures.select import select as compare
 
     models = given.models()
@@ -30,5 +31,6 @@ def select(
             most=most, **given.arrays(),
         )  # fmt: skip
     say(said)
+    assert isinstance(said, Selection)  # `arrays` are of one output
     if plot is not None:
         said.plot().savefig(plot, dpi=150)

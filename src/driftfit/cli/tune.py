@@ -37,12 +37,12 @@ def tune(
             models[0], given.chosen_tracker(), method=method, h=ahead, groups=shared, level=level, **given.arrays()
         )
     assert isinstance(tuned, Tuned)  # `arrays` are of one output
-    told = [
+    rows = [
         ("Model", repr(models[0])),
         ("Tracker", shortened(repr(tuned.tracker))),
         ("Log-likelihood", f"{tuned.loglik:.6g}"),
     ]
-    say(facts(*told))
+    say(facts(*rows))
     table = table_of(f"Settings by {method}", "", "chosen", f"{level:.0%} from", "to")
     for name, value in tuned.chosen.items():
         low, high = tuned.interval.get(name, (np.nan, np.nan))

@@ -1,4 +1,4 @@
-"""What is known of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
+"""Known numbers of every sample besides its signals: how much time has passed, its noise, how far theta may move."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 INTERVAL, NOISE, DRIFT, COMMON = 0, 1, 2, 3
-"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker understands."""
+"""Columns, in the order in which `driftfit.engine.drivers` reads them, and how many every tracker reads."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more where a tracker takes more.
+    """``columns`` (T, k), or (1, k) where the same holds for every sample; k is 3, or more if there are extras.
 
     Samples of several outputs have columns (T, k, ny) or (1, k, ny); `for_output` gives those of one.
 
     ``interval``, ``noise`` and ``drift`` are its first columns: nominal intervals since the sample before, factors of
-    the noise variance, and factors of the drift. ``more`` (T, k - 3) is what `Tracker.beside` made.
+    the noise variance, and factors of the drift. ``extra`` (T, k - 3) is what `Tracker.extra_columns` made.
     """
 
     columns: Array
@@ -58,13 +58,13 @@ class Known:
         return self.columns[:, DRIFT]
 
     @property
-    def more(self) -> Array:
-        """(T, k - 3): further columns, which only some trackers understand."""
+    def extra(self) -> Array:
+        """(T, k - 3): extra columns, which only some trackers read."""
         return self.columns[:, COMMON:]
 
     @property
     def common(self) -> Known:
-        """Without what only some trackers understand."""
+        """Without the extra columns."""
         return Known(self.columns[:, :COMMON])
 
     def part(self, rows: slice | Array) -> Known:
@@ -92,8 +92,8 @@ class Known:
             columns[place, INTERVAL] *= factor
         return Known(columns)
 
-    def with_more(self, columns: Array) -> Known:
-        """With further columns (T, k) after interval, noise and drift."""
+    def with_extra(self, columns: Array) -> Known:
+        """With extra columns (T, k) after interval, noise and drift."""
         common = self.common.over(len(columns)).columns
         if common.ndim > 2:
             columns = np.repeat(columns[:, :, None], common.shape[2], axis=2)

@@ -16,7 +16,6 @@ from driftfit.data.clock import instants, zone_name
 from driftfit.data.signals import as_inputs
 from driftfit.engine.kernel import Array
 
-
 PLAIN = (np.ndarray, list, tuple, float, int)
 """What has neither names nor an index."""
 

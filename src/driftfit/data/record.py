@@ -28,7 +28,7 @@ from driftfit.trackers.base import Tracker
 
 @dataclass(frozen=True)
 class Labels:
-    """The names and units of the signals of a series, and what was left out of it.
+    """The names and units of the signals of a series, and counts of what was left out.
 
     ``units`` maps the name of a signal to its unit, ``zone`` is the time zone in which times are shown, ``dropped``
     counts rows that never became samples, and ``missing`` counts, by reason, numbers that were treated as missing.
@@ -151,6 +151,22 @@ class Records:
         time = None if self.time is None else self.time[rows]
         return Record(self.y[rows], self.u[rows], self.known.part(rows), time, self.labels_of(k))
 
+    def some(self, a: int, b: int) -> Records:
+        """Series a to b - 1; their arrays are views."""
+        first, length = self.first[a:b], self.length[a:b]
+        low = int(first.min())
+        rows = slice(low, int((first + length).max()))
+        return replace(
+            self,
+            keys=self.keys[a:b],
+            first=first - low,
+            length=length,
+            y=self.y[rows],
+            u=self.u[rows],
+            known=self.known.part(rows),
+            time=None if self.time is None else self.time[rows],
+        )
+
     def only(self, k: int) -> Records:
         """Series k alone; its arrays are views."""
         one = self.part(k)
@@ -182,10 +198,10 @@ class Records:
         """With everything that is known of the samples as columns of ``known``, as these trackers take it."""
         if self.drifts is None and prob is None:
             return self
-        columns, *others = (one.beside(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
+        columns, *others = (one.extra_columns(model, len(self.y), prob, self.drifts) for one in dict.fromkeys(trackers))
         if any(not np.array_equal(columns, other, equal_nan=True) for other in others):
             raise ValueError("track: a drift for each change is for one Bank at a time; the trackers here have others.")
-        return replace(self, known=self.known.with_more(columns), drifts=None)
+        return replace(self, known=self.known.with_extra(columns), drifts=None)
 
     def repeated(self, keys: tuple[Hashable, ...]) -> Records:
         """The only series under several keys, without copying it."""

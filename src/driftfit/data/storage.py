@@ -172,7 +172,7 @@ class Kept(ABC):
 
     @classmethod
     def _kinds(cls) -> Mapping[str, type[Kept]]:
-        """What `load` understands: the class that each kind of file becomes."""
+        """Classes that `load` accepts: the class that each kind of file becomes."""
         return {cls._kind: cls}
 
     @classmethod
@@ -193,7 +193,7 @@ class Kept(ABC):
 
 
 def _encode(value: Any) -> Any:
-    """Encode what JSON does not support: times and intervals."""
+    """Encode values that JSON does not support: times and intervals."""
     if isinstance(value, datetime):
         return {"datetime": value.isoformat()}
     if isinstance(value, timedelta):

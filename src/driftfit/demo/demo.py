@@ -188,7 +188,7 @@ def sentence(found: Search) -> str:
 
 
 def caveat(found: Search, early: Search) -> str:
-    """What the numbers do not show; ``early`` is the search before the crisis of 2008."""
+    """Facts that the numbers do not show; ``early`` is the search before the crisis of 2008."""
     i = CHOICES[found.best[0]][0]
     move = largest_move(found.run.theta[:, i])
     low, high = (bound[:, i] for bound in found.run.band(0.95))
@@ -208,8 +208,8 @@ def free(record: Record) -> Track:
     return track(MODEL, AdaptiveKalman(), record.y, record.u, time=record.time, dt=0.25)
 
 
-def beside(found: Search, adaptive: Track) -> str:
-    """What the tracker without settings estimates for the same coefficient."""
+def adaptive_estimate(found: Search, adaptive: Track) -> str:
+    """The estimate of the same coefficient by the tracker without settings."""
     i = CHOICES[found.best[0]][0]
     move = largest_move(adaptive.theta[:, i])
     before, after = (dated(adaptive, i, t) for t in move)
@@ -245,7 +245,7 @@ def show(out: Console, progress: Console, picture: Path) -> None:
     out.print(summary)
     out.print(Text(f"\n{sentence(found)}\n", "bold"))
     out.print(Text(f"{caveat(found, early)}\n"))
-    out.print(Text(f"{beside(found, adaptive)}\n"))
+    out.print(Text(f"{adaptive_estimate(found, adaptive)}\n"))
     try:
         draw(found, adaptive).savefig(picture, dpi=150)
     except ImportError as error:

@@ -54,7 +54,7 @@ def export_c(model: Model, tracker: Tracker, path: str | PathLike[str], *, fixed
 def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:
     """The state of a stream as the bytes of ``tracker_state`` (double precision, the byte order of this computer).
 
-    ``fixed_rate`` must be as it was in `export_c`.
+    ``fixed_rate`` must be that of `export_c`.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def to_struct(live: Live, *, fixed_rate: bool = False) -> bytes:
 def from_struct(model: Model, tracker: Tracker, state: bytes, *, fixed_rate: bool = False) -> Live:
     """A stream that continues from the bytes of a ``tracker_state`` of the double-precision build.
 
-    ``fixed_rate`` must be as it was in `export_c`.
+    ``fixed_rate`` must be that of `export_c`.
 
     Raises
     ------

@@ -27,6 +27,8 @@ class Calls(Expressions):
             return self._reinterpreted(node)
         function = self.value(node.func).constant
         arguments = [plain(self.value(one)) for one in node.args]
+        if function is kernel.packed or (function is kernel.wholes and arguments[0].kind == "items"):
+            return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):
             return self._at_address(arguments)
         if function in FOUR or function is simd.reached:

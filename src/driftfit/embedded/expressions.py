@@ -85,7 +85,7 @@ class Expressions:
         return self.refuse(node)  # type: ignore[no-any-return]
 
     def owner(self, node: ast.expr) -> tuple[Value, str]:
-        """What a bracket or ``.shape`` is applied to, and the name of the field if it is one."""
+        """The owner of a subscript or of ``.shape``, and the name of the field if it is one."""
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             record = self.value(node.value)
             if record.kind == "record":
@@ -98,7 +98,7 @@ class Expressions:
         if owner.kind == "tile":
             return Value("record", "s")
         if owner.kind == "items":
-            item: Value = owner.constant[int(self.value(parts[0]).constant)]
+            item: Value = owner.constant[int(self.value(parts[-1]).constant)]
             return item
         if owner.kind == "table":
             return self._entry(owner, [self.value(one) for one in parts])

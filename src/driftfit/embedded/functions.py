@@ -2,9 +2,10 @@
 
 The translator walks the syntax tree of each function with the kinds of its arguments (`driftfit.embedded.values`).
 Known integers, tables and functions become constants of the text, branches that a constant excludes are left out, and a
-function is written once for each set of shapes with which it is called. A step may use what `driftfit.engine.kernel`
-allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so the double-precision build
-gives the same bits as the compiled steps if the C compiler neither contracts nor reorders them.
+function is written once for each set of shapes with which it is called. A step may use everything that
+`driftfit.engine.kernel` allows, so a new tracker needs nothing here. Floating-point expressions keep their order, so
+the double-precision build gives the same bits as the compiled steps if the C compiler neither contracts nor reorders
+them.
 
 The number of operations is counted along the way: loops at their longest, and the more expensive of two branches.
 """
@@ -69,6 +70,10 @@ class Body(Statements):
             elif one.kind == "address":
                 self.parameters.append(f"real *{name}")
                 named[argument.arg] = renamed(one, name)
+            elif one.kind == "items":
+                own = [renamed(item, f"{name}{k}") for k, item in enumerate(one.constant)]
+                self.parameters += [f"real *{item.text}" for item in own]
+                named[argument.arg] = Value("items", constant=own)
             elif one.known and one.kind != "real":
                 named[argument.arg] = one
             elif one.kind in RANK:
@@ -145,4 +150,6 @@ def _passed(value: Value) -> str:
         return "s"
     if value.kind in ("array", "address"):
         return begin_of(value)
+    if value.kind == "items":
+        return ", ".join(begin_of(item) for item in value.constant)
     return "" if value.known and value.kind != "real" else value.text

@@ -35,7 +35,7 @@ typedef double tracker_real;
 /* theta: {names} */
 
 /* The state of one stream, which the caller owns. Results: theta and var (the variances of theta, INFINITY for what the
-   data have not told apart yet). {known} */
+   data have not distinguished yet). {known} */
 typedef struct {{
 {fields}
 }} tracker_state;
@@ -237,7 +237,7 @@ def _face(made: Translation, memory: set[str]) -> str:
 
 
 def _after_the_start(made: Translation) -> str:
-    """What a sample takes after the start, if the start takes more."""
+    """The operations of a sample after the start, if the start takes more."""
     ordinary = _said(_ordinary(made.unit))
     differs = ordinary != _said(made.entry.operations)
     return f" After the start a sample takes at most\n  {ordinary}." if differs else ""

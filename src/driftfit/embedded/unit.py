@@ -30,7 +30,7 @@ class Function:
 
 
 class Unit:
-    """What the functions of one file share."""
+    """The shared state of the functions of one file."""
 
     def __init__(self, record: Array, constant: frozenset[str], flags: frozenset[str]) -> None:
         self.record = record
@@ -43,7 +43,7 @@ class Unit:
         self.written: set[str] = set()
         """Fields that a translated function may write."""
         self.replaced: set[str] = set()
-        """Fields whose value stands in the text in their place."""
+        """Fields that are replaced by their value in the text."""
         self.functions: dict[Any, Function] = {}
         self.tables: dict[str, str] = {}
         self.names: Counter[str] = Counter()

@@ -7,6 +7,7 @@ record  the state; tile, an array of one state
 array   numbers in memory: their start, their shape, and the stride of every axis
 address the address of the first number of an array
 four    four numbers that are computed together
+items   several values, such as the addresses that a routine is given together
 table   a tuple or an array of constants; python, a function or module; nothing, no value
 """
 
@@ -50,6 +51,7 @@ class Value:
         """The key of specialisation: constant integers are part of it, constant floats are not."""
         fixed = self.constant if self.kind in ("bool", "int", "table", "python") else None
         fixed = id(fixed) if self.kind in ("table", "python") else fixed
+        fixed = len(self.constant) if self.kind == "items" else fixed
         return self.kind, fixed, self.shape, self.strides, self.element, self.scalar
 
 
@@ -89,7 +91,7 @@ def narrow(value: Value) -> str:
 
 
 def plain(value: Value) -> Value:
-    """A flag as the floating-point number that it is; other values as they are."""
+    """A flag as the floating-point number that it is; other values unchanged."""
     return Value("real", f"({value.text} ? R(1.0) : R(0.0))") if value.kind == "flag" else value
 
 

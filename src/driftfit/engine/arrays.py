@@ -1,4 +1,4 @@
-"""What users hand over as numbers: arrays of floats, missing values as NaN, known factors of variances."""
+"""Conversion of what users pass as numbers: arrays of floats, missing values as NaN, known factors of variances."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Functions that a compiled machine calls by their address, which a step finds by their symbol.
+"""Functions that a compiled machine calls by address; a step looks the address up by symbol.
 
-A machine is compiled once for all; a function of the user's that it calls is not known then. So the function becomes a
-machine of its own, a step asks for its address where it runs, and `call` goes there.
+A machine is compiled once; the user's function that it calls is not yet known then. So the function is
+compiled as a separate machine, a step looks up its address at run time, and `call` calls it.
 """
 
 from __future__ import annotations
@@ -28,14 +28,16 @@ def _address_of(context: Any, machine: Any) -> Any:
     return types.intp(machine), build
 
 
-def _call(context: Any, address: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, out: Any) -> Any:
-    """Call the function at an address with six numbers and the address of its results."""
+def _call(context: Any, address: Any, numbers: Any, out: Any) -> Any:
+    """Call the function at an address with a tuple of six numbers and the address of its results."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        builder.call(builder.inttoptr(arguments[0], _KIND.as_pointer()), arguments[1:])
+        at, given, results = arguments
+        values = [builder.extract_value(given, k) for k in range(NUMBERS)]
+        builder.call(builder.inttoptr(at, _KIND.as_pointer()), [*values, results])
         return context.get_dummy_value()
 
-    return types.void(types.intp, *[types.float64] * NUMBERS, types.intp), build
+    return types.void(types.intp, types.UniTuple(types.float64, NUMBERS), types.intp), build
 
 
 address_of = named_intrinsic("callback.address_of", _address_of)

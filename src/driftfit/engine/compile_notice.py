@@ -1,6 +1,7 @@
-"""Says that the compiler is at work, where a user waits for it: one line on stderr after two seconds, once a process.
+"""A notice that the compiler is working, shown when a user has to wait for it: one line on stderr after two seconds,
+once per process.
 
-Only where somebody looks: on a terminal, or in a notebook. What goes to a file or a program stays as it is.
+Only where somebody looks: on a terminal, or in a notebook. Output to a file or a program is not changed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _said = False
 
 @contextmanager
 def compiling() -> Iterator[None]:
-    """Around what compiles; of nested ones the outermost counts."""
+    """A context manager around compilation; of nested ones the outermost counts."""
     global _depth, _spent
     with lock:
         _depth += 1
@@ -51,12 +52,12 @@ def compiling() -> Iterator[None]:
 
 
 def watched() -> bool:
-    """Whether a user sees stderr."""
+    """Whether stderr is a terminal."""
     return "ipykernel" in sys.modules or bool(sys.stderr and sys.stderr.isatty())
 
 
 def say() -> None:
-    """Say it, once."""
+    """Print the notice, once."""
     global _said
     from driftfit.engine.disk_cache import folder
 

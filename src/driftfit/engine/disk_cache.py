@@ -1,14 +1,15 @@
-"""Compiled code on disk: one file for each function and signature, found by a name made of all that it depends on.
+"""Compiled code on disk: one file for each function and signature, found by a name that is a digest of everything on
+which it depends.
 
-Numba keeps the signatures of a function in one index and numbers its files by what the index held when it was read: two
-processes that compile different layouts at the same moment may store both under one number, and a third runs the wrong
-code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the processor,
-and the versions of everything that makes code, so that two processes can only ever write the same content; a file
-appears at once or not at all, and what was in a damaged file is compiled again.
+Numba keeps the signatures of a function in one index and numbers its files by the length of the index when it was read:
+two processes that compile different layouts at the same moment may store both under one number, and a third runs the
+wrong code. Here there is no index. The name of a file is a digest of the function's identity, the signature, the
+processor, and the versions of everything that makes code, so that two processes can only ever write the same content; a
+file is written completely or not at all, and the contents of a damaged file are compiled again.
 
 The folder is ``NUMBA_CACHE_DIR`` where that is set, else ``__pycache__`` of the package, else the user's cache folder.
 Code is found in any of them, as in an image that was filled by ``driftfit warm`` and can only be read, and written to
-the first that can be written. Where none can, it is compiled in memory by every process, and a warning says so
+the first that can be written. If no folder can be written, every process compiles in memory, and a warning is issued
 once.
 """
 
@@ -37,7 +38,7 @@ MAKERS = ("kernel.py", "numba_internals.py", "simd.py")
 
 @cache
 def folders() -> tuple[Path, ...]:
-    """Where compiled code may be kept, the first choice first."""
+    """Folders in which compiled code may be stored, the first choice first."""
     given = numba.config.CACHE_DIR
     if given:
         return (Path(given) / "driftfit",)
@@ -48,7 +49,7 @@ def folders() -> tuple[Path, ...]:
 
 @cache
 def folder() -> Path | None:
-    """Where compiled code goes: the first folder that can be written, or None."""
+    """The folder in which compiled code is stored: the first that can be written, or None."""
     for place in folders():
         try:
             place.mkdir(parents=True, exist_ok=True)
@@ -61,7 +62,7 @@ def folder() -> Path | None:
 
 @cache
 def makers() -> str:
-    """What decides how code is made: versions, processor, and the files that emit code by hand."""
+    """Everything that determines the generated code: versions, processor, and the files that emit code by hand."""
     build = hashlib.sha256()
     for name in MAKERS:
         build.update((PACKAGE / name).read_bytes())
@@ -75,7 +76,7 @@ def name_of(function: str, identity: str, signature: Any) -> str:
 
 
 def read(name: str) -> Any:
-    """What was kept under a name, in any of the folders; None where there is nothing, or nothing whole."""
+    """The code stored under a name in any of the folders; None if there is none, or if it is damaged."""
     for place in folders():
         try:
             data = (place / name).read_bytes()
@@ -90,7 +91,7 @@ def read(name: str) -> Any:
 
 
 def _touch(path: Path) -> None:
-    """Note that a file was used, for `prune`; once a day is enough."""
+    """Record that a file was used, for `prune`; once a day is enough."""
     try:
         if time.time() - path.stat().st_mtime > 86400.0:
             os.utime(path)
@@ -99,7 +100,7 @@ def _touch(path: Path) -> None:
 
 
 def write(name: str, content: Any) -> None:
-    """Keep something under a name, if there is a place for it."""
+    """Store data under a name, if a folder can be written."""
     place = folder()
     if place is None:
         _say_nothing_is_kept()
@@ -148,7 +149,7 @@ def contents() -> Contents:
 
 
 def prune(days: float) -> int:
-    """Remove what other versions made, and what was not used for so many days; returns how many files."""
+    """Remove code that other versions made, and code that was not used for so many days; returns how many files."""
     oldest = time.time() - 86400.0 * days
     gone = [path for path in _files() if not _mine(path) or path.stat().st_mtime <= oldest]
     for path in gone:
@@ -157,7 +158,7 @@ def prune(days: float) -> int:
 
 
 def _place() -> Path | None:
-    """The folder that is written, or that can be read at least."""
+    """The folder that is written, or else one that can be read."""
     return folder() or next((place for place in folders() if place.is_dir()), None)
 
 

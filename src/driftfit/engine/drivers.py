@@ -17,6 +17,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -31,11 +32,19 @@ WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
 
 LARGEST = 1e38
-"""Signals at least this large cannot be used, about what single precision holds and more than anything measured."""
+"""Signals at least this large are not used: about the largest number in single precision, and more than any
+measurement.
+"""
 
 SMALLEST = 1e-38
 """Signals below this are zero. Between the two the fourth power of any ratio of signals is a number: no product of a
 regressor, a covariance that earlier regressors left, and an innovation overflows."""
+
+
+OPEN = ("report", "memory", "flat")
+"""Fields at the end of a record whose lengths are no part of its type for compiled code, which is the same for all
+lengths: it finds them by their addresses, one after the other from that of the first.
+"""
 
 
 INPUTS = types.Array(types.float64, 1, "A", readonly=True)
@@ -47,9 +56,9 @@ def no_preparation(L: int) -> None:
 
 
 class ModelSteps(NamedTuple):
-    """What a model compiles: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
+    """The steps of a model: ``regress`` writes ``s.phi`` from the signals and lags, ``push`` moves the lags.
 
-    ``ready(L)`` brings what they call by symbol within reach, before a tile of L lanes is driven for the first time.
+    ``ready(L)`` loads the routines that they call by symbol, before a tile of L lanes is driven for the first time.
     """
 
     regress: Step
@@ -59,7 +68,7 @@ class ModelSteps(NamedTuple):
 
 @kernel
 def clean(s: State, l: int) -> None:
-    """Decide what can be used, and make everything that trackers read finite.
+    """Decide which data can be used, and make everything that trackers read finite.
 
     Entries of phi and y are cleaned by themselves: zeroing all of phi when only y is missing would make an ARX model's
     own prediction zero and so bias its lags.
@@ -94,26 +103,26 @@ def unknown(s: State, l: int) -> None:
 
 @kernel
 def nothing_more(o: State, s: State, l: int) -> None:
-    """Store nothing beside the common fields."""
+    """Store nothing but the common fields."""
 
 
 @kernel
-def nothing_told(s: State, known: Array, t: int, l: int) -> None:
-    """Take nothing from further columns of what is known."""
+def nothing_extra(s: State, known: Array, t: int, l: int) -> None:
+    """Ignore extra columns."""
 
 
 class TrackerSteps(NamedTuple):
-    """What a tracker compiles.
+    """The steps of a tracker.
 
-    ``predict`` is what time does to the state (``s.dt`` nominal intervals have passed; 0 means that nothing may
-    happen), ``correct`` what the data say. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use
-    ``s.ok`` (0 or 1) as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers
-    that start from no knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are what it calls by
-    symbol; ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms
-    of a tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
-    ``outputs`` name from the record ``s`` to the stored record ``o``. ``told(s, known, t, l)`` takes what the user
-    knows of a sample beside interval, noise and drift from the columns of ``known`` after the third, where there are
-    some. ``note(o, s, l)`` copies what the tracker's ``noted`` names when a run is replayed for a smoother.
+    ``predict`` is the time update (``s.dt`` nominal intervals have passed; if 0, nothing may change), ``correct`` the
+    measurement update. ``correct`` must write ``s.y_hat``, ``s.e`` and its variance ``s.s`` and use ``s.ok`` (0 or 1)
+    as a factor of its gain. ``begin`` takes the place of both while ``s.root`` is 1, for trackers that start from no
+    knowledge at all (`driftfit.trackers.parts.diffuse`), and ``machines`` are the routines that it calls by symbol;
+    ``instead`` names machines that steps call, each with the one that is called in its place, so that two forms of a
+    tracker share the code of a driver. ``report`` fills ``s.var``. ``store(o, s, l)`` copies what the tracker's
+    ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
+    columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
+    ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
     """
 
     predict: Step
@@ -121,8 +130,8 @@ class TrackerSteps(NamedTuple):
     report: Step = diagonal
     begin: Step | None = None
     store: Any = nothing_more
-    told: Any = nothing_told
-    note: Any = nothing_more
+    read_extra: Any = nothing_extra
+    store_for_smoother: Any = nothing_more
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
@@ -151,14 +160,48 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     for name, value in starts[0].items():
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
+    opened = [field for name in OPEN for field in fields if field[0] == name]
+    fields = [field for field in fields if field not in opened]
     size = np.dtype(fields).itemsize
     # whole cache lines, so that no vector load of a lane block straddles two
     fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
-    tile = _aligned(np.dtype(fields, align=True), 1)
+    tile = _aligned(_followed_by(np.dtype(fields, align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
     return tile
+
+
+def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
+    """A record type with further fields of numbers behind it, in whole cache lines."""
+    names, offsets, end = list(dtype.names or ()), [at for _, at, *_ in (dtype.fields or {}).values()], dtype.itemsize
+    formats: list[Any] = [dtype[name] for name in names]
+    for name, kind, shape in fields:
+        names.append(name)
+        formats.append((kind, shape))
+        offsets.append(end)
+        end += 8 * math.prod(shape)
+    size = -(-end // 64) * 64
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": size}, align=True)
+
+
+def as_compiled(tile: Array) -> Array:
+    """The tile as compiled code takes it: of its open fields (`OPEN`) only the beginning."""
+    if OPEN[0] not in (tile.dtype.names or ()):
+        return tile
+    return np.ndarray(tile.shape, _beginning(tile.dtype), tile)
+
+
+@lru_cache(maxsize=256)
+def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of a record up to the first entry of its open fields."""
+    fields = dtype.fields or {}
+    (first, at, *_), names = fields[OPEN[0]], [name for name in fields if name not in OPEN]
+    beginning = np.dtype(
+        {"names": names, "formats": [dtype[name] for name in names],
+         "offsets": [fields[name][1] for name in names], "itemsize": at}, align=True,
+    )  # fmt: skip
+    return _followed_by(beginning, [(OPEN[0], first.base, (1, first.shape[-1]))])
 
 
 def repeat_tile(tile: Array, count: int) -> Array:
@@ -175,21 +218,24 @@ def _aligned(dtype: np.dtype[Any], count: int) -> Array:
     return np.ndarray(count, dtype, raw, -raw.ctypes.data % 64)
 
 
-def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std") -> np.dtype[Any]:
-    """The record that a driver writes for one sample of a tile.
+def output_type(tile: Array, outputs: Sequence[str] = (), keep: str = "std", dtype: Any = np.float64) -> np.dtype[Any]:
+    """The record that is kept of one sample of a tile; in double precision, and not of theta alone, a driver writes it.
 
-    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok. What is
-    not common comes first: Numba takes a record that continues another one for the same type, with a warning.
+    P when ``keep`` is "cov"; the fields of the tile that ``outputs`` names; then theta, var, y_hat, e, s, ok; of
+    "theta" that alone. What is not common comes first: Numba takes a record that continues another one for the same
+    type, with a warning.
     """
-    return _output_type(tile.dtype, tuple(outputs), keep)
+    return _output_type(tile.dtype, tuple(outputs), keep, np.dtype(dtype))
 
 
 @lru_cache(maxsize=256)
-def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str) -> np.dtype[Any]:
+def _output_type(tile: np.dtype[Any], outputs: tuple[str, ...], keep: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
     n, L = tile["theta"].shape
-    names = (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
-    fields: list[Any] = [("P", np.float64, (n, n, L))] if keep == "cov" else []
-    fields += [(name, tile[name].base, tile[name].shape) for name in names]
+    names = ("theta",) if keep == "theta" else (*outputs, "theta", "var", "y_hat", "e", "s", "ok")
+    fields: list[Any] = [("P", dtype, (n, n, L))] if keep == "cov" else []
+    for name in names:
+        own = tile[name].base
+        fields.append((name, dtype if own.kind == "f" else own, tile[name].shape))
     return np.dtype(fields, align=True)
 
 
@@ -211,7 +257,8 @@ class Drivers(NamedTuple):
     update_one: Any
 
     def updater(self, tile: Array, m: int) -> Any:
-        """The entry point for one sample of tiles of this type: ``f(tile, y, u)``, u as `one_or_all` gives it.
+        """The entry point for one sample of tiles of this type: ``f(as_compiled(tile), y, u)``, u as `one_or_all`
+        gives it.
 
         A number is read faster than an array, and a model of one input needs no second routine for arrays.
         """
@@ -268,8 +315,8 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     """Build the drivers of a (model, tracker) pair.
 
     ``run(tile, y, u, known, out)`` takes y (T, L), u (T, m, L) and `known` (T, 3, L), or one row of it that holds for
-    every sample (more columns go to ``told``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does one
-    sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
+    every sample (extra columns go to ``read_extra``), and fills out (T,) of `output_type`. ``update(tile, y, u)`` does
+    one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
     regress, push, ready = model
@@ -278,14 +325,14 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
     sample = _sample(regress, push, _advance(tracker))
-    run = _run(driver, sample, tracker.told, tracker.store, covariance if keep == "cov" else nothing_more)
+    run = _run(driver, sample, tracker.read_extra, tracker.store, covariance if keep == "cov" else nothing_more)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
-        # nothing looks at types and bounds after this; contiguous, as every layout would be compiled anew
+        # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
         y, u, known = (np.ascontiguousarray(array, dtype=np.float64) for array in (y, u, known))
         _check_shapes(tile, len(out), y, u, known)
         ready(tile["theta"].shape[2])
-        run(tile, y, u, known, out)
+        run(as_compiled(tile), y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
 
@@ -311,7 +358,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: Any, keep_more: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
@@ -329,7 +376,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, told: Any, store: Any, ke
                 s.drift[l] = known[t * changing, 2, l]
             if known.shape[1] > 3:
                 for l in range(L):
-                    told(s, known, t, l)
+                    read_extra(s, known, t, l)
             if given:
                 for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
                     for l in range(L):
@@ -400,9 +447,9 @@ def tile_type(tile: Array) -> types.Type:
         flags.aligned,
     )
     if key not in _TILE_TYPES:
-        _TILE_TYPES[key] = numba.typeof(tile)
+        _TILE_TYPES[key] = numba.typeof(as_compiled(tile))
     return _TILE_TYPES[key]
 
 
 _TILE_TYPES: dict[Any, types.Type] = {}
-"""Types by what they depend on, one for each kind of tile that was compiled."""
+"""Record types by their fields, one for each kind of tile that was compiled."""

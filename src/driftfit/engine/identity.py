@@ -19,8 +19,8 @@ def identity(function: FunctionType) -> str:
 
     Numba's cache looks at the time stamp of the one file that holds the driver; steps live in other files. Giving every
     step an identity made of its code and the identities of what it refers to lets drivers that are closures over steps
-    be found on disk by a second process, and recompiles them when a step was edited. The code is what was compiled, not
-    its text: the file may have been edited since it was imported, and at a prompt there is none.
+    be found on disk by a second process, and recompiles them when a step was edited. The identity is that of the
+    compiled code, not of its text: the file may have been edited since it was imported, and at a prompt there is none.
     """
     used = used_globals(function)
     used |= dict(zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True))
@@ -31,7 +31,7 @@ def identity(function: FunctionType) -> str:
 
 
 def used_globals(function: FunctionType) -> dict[str, Any]:
-    """The globals that a function reads; TypeError where one is not defined yet: an edit of it would go unnoticed."""
+    """The globals that a function reads; TypeError if one is not yet defined, because its edits would go unnoticed."""
     names = _globals(function.__code__)
     later = sorted(names - function.__globals__.keys() - vars(builtins).keys())
     if later:
@@ -57,7 +57,7 @@ def _globals(code: CodeType) -> set[str]:
 
 
 def _code(code: CodeType) -> str:
-    """What code does, without the places where its text stands."""
+    """The contents of code, without line numbers."""
     constants = [_code(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
     return repr((code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
 
@@ -65,7 +65,7 @@ def _code(code: CodeType) -> str:
 def _identity_of(value: Any, function: FunctionType, name: str) -> str:
     if isinstance(value, tuple):
         return f"({', '.join(_identity_of(v, function, name) for v in value)})"
-    if value is np or value is math:  # what hangs on any other module may be edited unseen
+    if value is np or value is math:  # attributes of any other module may be edited unnoticed
         return str(value.__name__)
     if isinstance(value, bool | int | float | str | type(None) | np.generic):
         return repr(value)

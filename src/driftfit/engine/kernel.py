@@ -1,4 +1,4 @@
-"""Lanes: the record that holds a state, and the decorators that compile what works on it.
+"""Lanes: the record that holds a state, and the decorators that compile functions of it.
 
 The state of one tile is one NumPy record. Every field has a fixed shape with a trailing lane axis of length L, so that
 for n parameters ``theta`` is (n, L) and ``P`` is (n, n, L). A *step* is a function ``step(s, l)`` that works on lane
@@ -47,7 +47,7 @@ Step = Callable[[State, int], None]
 
 
 def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool) -> Any:
-    """Compile under IEEE rules and without the GIL; the cache on disk and `identity` know it by what it does."""
+    """Compile under IEEE rules and without the GIL; its identity names it in the cache on disk."""
     assert isinstance(function, FunctionType)
     name = hashlib.sha256(f"{identity(function)}{sorted(options)}".encode()).hexdigest()
     if cache:
@@ -69,7 +69,7 @@ def _compiled(function: Callable[..., Any], cache: bool = False, **options: bool
 
 
 def _again(dispatcher: Any, again: Callable[..., Any]) -> Any:
-    """Note how a function like this one is made of another source; see `driftfit.engine.substitute`."""
+    """Store how a function like this one is made from another source; see `driftfit.engine.substitute`."""
     dispatcher.again = again
     return dispatcher
 
@@ -78,8 +78,8 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
     """Compile a step, or a function that steps call.
 
     Inlined: with a call inside the lane loop the loop stays scalar (measured: 14 ns instead of 6 a lane-step at n = 4).
-    With ``inline=False`` the compiler may choose, for what the lane loop is better without. Division follows IEEE rules
-    instead of raising, the GIL is released, and there is no fast-math.
+    With ``inline=False`` the compiler may choose; this is for functions that the lane loop is faster without. Division
+    follows IEEE rules instead of raising, the GIL is released, and there is no fast-math.
     """
     made = internals.as_part(_compiled(function, forceinline=inline, **internals.STEP), internals.StepDispatcher)
     return _again(made, lambda other: kernel(other, inline))
@@ -88,8 +88,8 @@ def kernel(function: Callable[..., Any], inline: bool = True) -> Any:
 def shared(function: Callable[..., Any]) -> Any:
     """Compile a function of arrays once for all sizes, to be called.
 
-    A step is compiled anew for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
-    or arrays at addresses, is compiled once and found on disk after that. Unless it is told otherwise, Numba inlines
+    A step is recompiled for every size of the record. A function that takes views of one lane, as ``s.P[:, :, l]``,
+    or arrays at addresses, is compiled once and found on disk after that. By default Numba inlines
     what an inlined function calls too: a bank became one function of 70,000 instructions, on which LLVM spent seven
     times as long.
     """
@@ -102,7 +102,7 @@ def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] =
 
     Passing a few dozen arrays may cost more than the work on them. With ``sizes`` the first argument is a number of
     parameters, and the work is compiled once for each of these sizes, which the compiler then knows, so that it unrolls
-    loops and keeps what they work on in registers; and once for all others.
+    loops and keeps their data in registers; and once for all others.
     """
     if function is None:
         return lambda source: _for_sizes(part(source), sizes)
@@ -110,7 +110,7 @@ def part(function: Callable[..., Any] | None = None, *, sizes: tuple[int, ...] =
 
 
 def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
-    """``work`` with a constant for its first argument where that is one of the sizes."""
+    """``work`` with a constant for its first argument if that is one of the sizes."""
     if not sizes:
         return work
     size, others = sizes[0], _for_sizes(work, sizes[1:])
@@ -127,8 +127,8 @@ def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
 class Machine(types.ExternalFunction):
     """A routine that steps call by its symbol, with addresses and numbers: compiled once for all drivers.
 
-    What a driver calls in the ordinary way is linked into it and optimised again for every type of record. A machine is
-    compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
+    An ordinary function that a driver calls is linked into it and optimised again for every type of record. A machine
+    is compiled apart; drivers on disk know its name only, and `load` gives that an address in this process.
     """
 
     identity: str
@@ -144,7 +144,7 @@ class Machine(types.ExternalFunction):
         return self.dispatcher.py_func
 
     def __reduce__(self) -> Any:
-        """By its name: Numba pickles what a step uses into the key of its cache, and numbers types by process."""
+        """By its name: Numba pickles the globals of a step into the key of its cache, and numbers types by process."""
         return _machine, (self.symbol,)
 
     def load(self) -> None:
@@ -161,7 +161,7 @@ register_model(Machine)(models.OpaqueModel)
 _MACHINES: dict[str, Machine] = {}
 _DISPATCHERS: dict[str, Any] = {}
 _LOADED: dict[str, Any] = {}
-"""The owner of the code, which would go with it."""
+"""The owners of the code, without which it would be freed."""
 
 
 def _machine(symbol: str) -> Machine:
@@ -238,16 +238,16 @@ class Driver:
         return internals.load(internals.Code(*code), self._instead)
 
     def let_go(self, found: Any) -> None:
-        """Forget an entry point; who holds it may go on using it."""
+        """Forget an entry point; whoever holds it may continue to use it."""
         self._entries = {key: one for key, one in self._entries.items() if one is not found}
 
 
 LAYOUT = 0x0001 | 0x0002 | 0x0100
-"""NumPy's flags of what the compiler's type of an array knows: rows contiguous, columns contiguous, aligned."""
+"""NumPy's flags that are part of the compiler's type of an array: rows contiguous, columns contiguous, aligned."""
 
 
 def _kind(value: Any) -> Any:
-    """What the type of an argument depends on."""
+    """The properties on which the type of an argument depends."""
     if not isinstance(value, np.ndarray):
         return type(value)
     return value.dtype, value.ndim, value.flags.num & LAYOUT
@@ -262,8 +262,8 @@ MOST_ENTRIES = 256
 """Entry points of drivers that a process keeps, of some 0.3 MB each."""
 
 KEPT = 300
-"""Parts whose code is kept for drivers to come, of some 0.2 MB each; a driver takes in some twenty to sixty, and the
-same for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
+"""Parts whose code is kept for later drivers, of some 0.2 MB each; a driver inlines some twenty to sixty, and the
+same ones for a record, a smoother and a stream. More of them make sense where a process compiles many configurations in
 turn.
 """
 
@@ -276,7 +276,7 @@ class _Entries:
         self.lock = Lock()
 
     def used(self, entry: Any, owner: Driver) -> None:
-        """Note that an entry point is in use, and let go of those that were not for longest."""
+        """Mark an entry point as used, and release the least recently used ones."""
         with self.lock:
             self._owners.setdefault(entry, ref(owner))
             self._owners.move_to_end(entry)
@@ -303,7 +303,7 @@ def _release_locks() -> None:
         lock.release()
 
 
-if hasattr(os, "register_at_fork"):  # a child has no thread that would release what another one held: fork between them
+if hasattr(os, "register_at_fork"):  # a child process has no thread that would release its parent's locks
     os.register_at_fork(before=_acquire_locks, after_in_parent=_release_locks, after_in_child=_release_locks)
 
 floats = internals.matrix_at("floats", types.float64)
@@ -314,9 +314,28 @@ wholes = internals.matrix_at("wholes", types.int64)
 """wholes(address, rows, columns): the array (rows, columns) of whole numbers that begins at an address."""
 
 
+def _in_a_row(context: Any, numbers: Any) -> Any:
+    """The typed half of `packed`."""
+    word, index = internals.ir.IntType(64), internals.ir.IntType(32)
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        with builder.goto_entry_block():
+            place = builder.alloca(internals.ir.ArrayType(word, len(numbers)))
+        for k, kind in enumerate(numbers):
+            value = context.cast(builder, builder.extract_value(given[0], k), kind, types.intp)
+            builder.store(value, builder.gep(place, [index(0), index(k)], inbounds=True))
+        return builder.ptrtoint(place, word)
+
+    return types.intp(numbers), build
+
+
+packed = internals.named_intrinsic("packed", _in_a_row)
+"""packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine."""
+
+
 @kernel
 def nothing(s: State, l: int) -> None:
-    """The step that leaves the record alone."""
+    """The step that changes nothing."""
 
 
 LOG2 = 0.6931471805599453

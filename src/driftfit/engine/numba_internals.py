@@ -1,7 +1,7 @@
-"""All that leans on the private side of Numba and llvmlite. No other module imports `numba.core` or llvmlite.
+"""Everything that uses private parts of Numba and llvmlite. No other module imports `numba.core` or llvmlite.
 
-Each section says what it leans on and why. `tests/contract/test_numba_internals.py` has a canary for each, which says
-in a sentence what broke. Tried with the versions in `TRIED`.
+Each section names the private parts that it uses, and the reason. `tests/contract/test_numba_internals.py` has a canary
+for each, which names in one sentence what broke. Tried with the versions in `TRIED`.
 
     lock           numba.core.compiler_lock         one lock for all that compiles, so that threads cannot mix
     identity       Dispatcher._set_uuid             other processes find closures over compiled functions
@@ -9,6 +9,8 @@ in a sentence what broke. Tried with the versions in `TRIED`.
                    CompileResult._reduce, _rebuild
     code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted
                    codegen's factories
+    typing         Function.get_call_type, _impl_keys,  the types of Numba's own operations are found once
+                   Flags._values, Record.__repr__
     memory         _reset_overloads,                what the compiler made of a part is let go
                    remove_user_function, _dispose
     object code    codegen._tm, llvmlite's ORC,     drivers are kept as object code and freed with the last reference
@@ -19,8 +21,7 @@ in a sentence what broke. Tried with the versions in `TRIED`.
     fields         AttributeTemplate                fields of a table by name; see `driftfit.trackers.bank.table`
     vectors        llvmlite.ir                      instructions on SIMD vectors; see `driftfit.engine.simd`
 
-What is had by public means instead: types and typeof, intrinsics, data models, compile options (`numba.njit`,
-`numba.extending`).
+Public means (`numba.njit`, `numba.extending`) serve for types, intrinsics, data models, options and the passes.
 """
 
 from __future__ import annotations
@@ -44,12 +45,13 @@ from llvmlite.binding import newpassmanagers as passes
 from numba import _dynfunc, njit, types
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompileResult
+from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder, Flags
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
+from numba.core.targetconfig import ConfigStack
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
@@ -60,7 +62,7 @@ TRIED = {
     "numba": ("0.62.1", "0.63.1", "0.64.0", "0.65.1", "0.66.0", "0.68.1"),
     "llvmlite": ("0.45.1", "0.46.0", "0.47.0", "0.48.0", "0.50.0"),
 }
-"""Versions that the canary tests passed with."""
+"""Versions with which the canary tests passed."""
 
 
 # ---- lock -----------------------------------------------------------------------------------------------------------
@@ -74,7 +76,7 @@ ours, and one that compiles ours, would take the two in opposite orders."""
 
 
 def name_for_pickle(compiled: Any, name: str) -> None:
-    """Let a compiled function or an intrinsic be known by a name that is the same in every process.
+    """Give a compiled function or an intrinsic a name that is the same in every process.
 
     Numba numbers functions at random in each process, and the number is part of all that refers to them.
     """
@@ -92,26 +94,42 @@ LINKED = {**STEP, "_nrt": False}
 tenths of the time of compiling a bank."""
 
 
+UNUSED = {
+    "LiteralPropagation", "annotate_types", "dump_parfor_diagnostics", "inline_closure_likes", "inline_inlinables",
+    "inline_overloads", "literal_unroll", "make_function_op_code_to_jit_function", "nopython_rewrites", "with_lifting",
+}  # fmt: skip
+"""Passes for comprehensions, inner functions, expressions of whole arrays and ``with``, which nothing here has."""
+
+
+class Pipeline(CompilerBase):
+    """Numba's passes without those, which take 6 per cent of the time of compiling."""
+
+    def define_pipelines(self) -> list[Any]:
+        made = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        made.passes = [one for one in made.passes if one[0].name() not in UNUSED]
+        return [made]
+
+
 def under_ieee(function: Callable[..., Any], **options: bool) -> Any:
-    """Compile as everything here is: division as in IEEE 754, no fast-math, without the GIL."""
-    return njit(error_model="numpy", nogil=True, **options)(function)
+    """Compile with IEEE 754 division, without fast-math, and without the GIL."""
+    return njit(error_model="numpy", nogil=True, pipeline_class=Pipeline, **options)(function)
 
 
 # ---- stored ---------------------------------------------------------------------------------------------------------
 
 
 def processor() -> str:
-    """What code is made for."""
+    """The processor for which code is generated."""
     return f"{sys.byteorder}{cpu_target.target_context.codegen().magic_tuple()}"
 
 
 def versions() -> tuple[str, str]:
-    """Of what makes code."""
+    """The versions on which code depends."""
     return numba.__version__, llvmlite.__version__
 
 
 class Stored(_Cache):
-    """The cache that a dispatcher asks: ``read(sig)`` gives what was kept, ``write(sig, data)`` keeps it."""
+    """The cache of a dispatcher: ``read(sig)`` returns stored code, ``write(sig, data)`` stores it."""
 
     def __init__(self, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
         self._read, self._write = read, write
@@ -140,7 +158,7 @@ class Stored(_Cache):
 
 
 def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
-    """Keep what a dispatcher compiles where ``read`` and ``write`` find and put it."""
+    """Store the code of a dispatcher by ``read`` and ``write``."""
     dispatcher._cache = Stored(read, write)
 
 
@@ -148,16 +166,16 @@ def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, 
 
 
 class Fragment(JITCodeLibrary):
-    """Code for others to take in: neither optimised nor emitted, which those who take it in do."""
+    """Code that other functions inline: neither optimised nor emitted; that is done by the function that inlines it."""
 
     def _optimize_final_module(self) -> None:
-        """Left to those who take it in."""
+        """Left to the function that inlines it."""
 
     def _finalize_final_module(self) -> None:
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """There is none: nothing was emitted."""
+        """There is no pointer: nothing was emitted."""
         return 0
 
     def serialize_using_object_code(self) -> Any:
@@ -166,7 +184,7 @@ class Fragment(JITCodeLibrary):
 
 
 class WholeFragment(Fragment):
-    """Code that is optimised with all that it takes in."""
+    """Code that is optimised together with everything that it inlines."""
 
     def _optimize_final_module(self) -> None:
         JITCodeLibrary._optimize_final_module(self)
@@ -178,9 +196,9 @@ class WholeFragment(Fragment):
 
 
 class StepFragment(WholeFragment):
-    """A step that takes in no other is optimised: what the compiler makes of a loop over lanes depends on it (5 %).
+    """A step that inlines no other step is optimised: the speed of a loop over lanes depends on it (5 %).
 
-    One that takes in others holds what is optimised in them, and is optimised with the driver that takes it in. Doing
+    A step that inlines others contains optimised code, and is optimised with the driver that inlines it. Doing
     it at every level took a quarter of the time of compiling an `AdaptiveKalman`, and gave no faster code.
     """
 
@@ -190,7 +208,7 @@ class StepFragment(WholeFragment):
 
 
 class PartDispatcher(CPUDispatcher):
-    """A function that Numba compiles for others to take in."""
+    """A function that Numba compiles so that others inline it."""
 
     library: type[Fragment] = Fragment
 
@@ -209,7 +227,7 @@ class PartDispatcher(CPUDispatcher):
 
 
 class StepDispatcher(PartDispatcher):
-    """A step: taken in by drivers; for Python it is compiled once more, into code that can be called."""
+    """A step: inlined by drivers; for Python it is compiled again, into code that can be called."""
 
     library = StepFragment
 
@@ -220,13 +238,13 @@ class StepDispatcher(PartDispatcher):
 
 
 class WholeDispatcher(PartDispatcher):
-    """A function that takes in all that it calls."""
+    """A function that inlines everything that it calls."""
 
     library = WholeFragment
 
 
 def as_part(dispatcher: Any, kind: type[PartDispatcher] = PartDispatcher) -> Any:
-    """Let a function that Numba compiles be linked into others and nothing else."""
+    """Make a function that Numba compiles only linkable into others."""
     dispatcher.__class__ = kind
     return dispatcher
 
@@ -272,7 +290,39 @@ def _library_of(name: str, kind: type[Fragment]) -> Iterator[None]:
 
 
 _builders: dict[Any, Any] = {}
-"""What makes LLVM's passes, by its options: Numba makes one for every function, and LLVM does not free all of it."""
+"""The builders of LLVM's passes, by their options: Numba makes one per function, of which LLVM frees only a part."""
+
+
+# ---- typing ---------------------------------------------------------------------------------------------------------
+
+# Numba tries dozens of templates for every sum, product and index of every function, and compares compile options one
+# by one for each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
+
+
+def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:
+    """The types of a call of one of Numba's own operations, as ``find`` gives them."""
+    known: dict[Any, tuple[Any, Any]] = {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or not all(isinstance(one, _PLAIN) for one in args):
+            return find(self, context, args, kws)
+        key = self, context, tuple(args), ConfigStack.top_or_none()
+        if key not in known:
+            found = find(self, context, args, kws)
+            known[key] = found, self._impl_keys[found.args]
+        found, self._impl_keys[found.args] = known[key]  # options of another function may have changed the latter
+        return found
+
+    return get_call_type
+
+
+_PLAIN = types.Number, types.Boolean, types.Array, types.BaseTuple, types.Literal, int  # no code, which must be let go
+_equal = Flags.__eq__
+_NAMES = hash(tuple(sorted(Flags.options)))  # what Numba's own hash amounts to: it sorts names, not values
+types.Function.get_call_type = _remembered(types.Function.get_call_type)
+Flags.__eq__ = lambda one, other: (type(one) is type(other) and one._values == other._values) or _equal(one, other)
+Flags.__hash__ = lambda self: _NAMES
+types.Record.__repr__ = lambda self: self.name  # written out for every pass over a function, and read by nobody
 
 
 # ---- memory ---------------------------------------------------------------------------------------------------------
@@ -284,7 +334,8 @@ for _manager in (passes.ModulePassManager, passes.FunctionPassManager):
         _manager._dispose = passes.NewPassManager._dispose
 
 _recent: OrderedDict[Any, None] = OrderedDict()
-"""(dispatcher, types of the arguments) of what was compiled only to be linked, those used last at the end."""
+"""(dispatcher, types of the arguments) of functions that were compiled only to be linked, the most recently used last.
+"""
 
 
 def _note_use(dispatcher: Any, signature: Any) -> None:
@@ -294,7 +345,7 @@ def _note_use(dispatcher: Any, signature: Any) -> None:
 
 
 def forget(most: int) -> None:
-    """Let go of all but the ``most`` parts used last; while nothing is compiled, which may take them in."""
+    """Release all but the ``most`` recently used parts, while nothing is compiled that may inline them."""
     while len(_recent) > most:
         (place, arguments), _ = _recent.popitem(last=False)
         dispatcher = place()
@@ -316,20 +367,20 @@ OWN_ADDRESSES = "numba.dynamic.globals"
 
 
 class Code(NamedTuple):
-    """A compiled function that Python calls, as it is kept on disk."""
+    """A compiled function that Python calls, as stored on disk."""
 
     data: bytes
     """Object code."""
     module: str
     name: str
     wrapper: str
-    """Symbol of what Python calls."""
+    """Symbol of the function that Python calls."""
     outside: tuple[str, ...]
-    """Symbols that it calls and does not have."""
+    """Symbols that it calls and does not define."""
     environments: tuple[tuple[str, Any], ...]
     """Symbols of environments, its own first, and the environments."""
     lasting: bool
-    """Whether it means the same in another process."""
+    """Whether it is valid in another process."""
 
 
 def emit(function: FunctionType, arguments: tuple[Any, ...]) -> Code:
@@ -379,7 +430,7 @@ _numbers = itertools.count()
 
 @cache
 def _loader() -> Any:
-    """The loader; what compiled code calls of Numba's own is there after this."""
+    """The loader; after this, Numba's own functions that compiled code calls are available."""
     cpu_target.target_context.refresh()
     rtsys.initialize(cpu_target.target_context)
     return llvm.create_lljit_compiler()
@@ -402,7 +453,7 @@ def publish(dispatcher: Any, arguments: tuple[Any, ...], symbol: str) -> Any:
 def _array(dtype: Any, *shape: Any) -> Any:
     """The typed half of an intrinsic ``f(address, *shape)``: the C array of this shape that begins at an address.
 
-    `numba.carray` does the same by two functions of its own for every caller, and counts references.
+    `numba.carray` does the same with two additional functions for every caller, and counts references.
     """
     array = types.Array(dtype, len(shape), "C")
 

@@ -17,7 +17,7 @@ import numpy as np
 
 
 class DataWarning(UserWarning):
-    """Something in the data that makes a result less than it seems; what was found, and the way out."""
+    """A property of the data that makes a result less reliable than it seems; the message names it and the remedy."""
 
 
 def warn(message: str, kind: type[Warning] = DataWarning) -> None:
@@ -33,11 +33,11 @@ class Settings:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if "__repr__" not in vars(cls):  # a dataclass leaves alone what its class has
+        if "__repr__" not in vars(cls):  # a dataclass does not replace a method that its class defines
             cls.__repr__ = Settings.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        """What makes it again: settings without a default, and those that differ from it."""
+        """The expression that constructs it again: settings without a default, and those that differ from it."""
         own = [field for field in fields(self) if field.init]  # type: ignore[arg-type]
         said = [f"{f.name}={getattr(self, f.name)!r}" for f in own if getattr(self, f.name) != f.default]
         return f"{type(self).__name__}({', '.join(said)})"

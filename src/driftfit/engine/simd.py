@@ -34,7 +34,7 @@ class Vector8(types.Type):
 
 
 class Vector4(types.Type):
-    """A vector of four floats: amid a filter of single numbers a few of eight cost more than they saved."""
+    """A vector of four floats: between scalar operations of a filter, vectors of eight cost more than they saved."""
 
     def __init__(self) -> None:
         super().__init__(name="driftfit.Vector4")
@@ -123,7 +123,7 @@ def _gather(context: Any, array: Any, row: Any, order: Any, k: Any) -> Any:
 
 
 def _spread(builder: Any, value: Any, kind: Any) -> Any:
-    """One number in all places of a vector."""
+    """A vector with one number in all places."""
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
     everywhere = ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
     return builder.shuffle_vector(one, one, everywhere)

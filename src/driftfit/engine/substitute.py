@@ -1,4 +1,4 @@
-"""Compiled functions, built again with other functions in the place of some that they call."""
+"""Recompile functions with some of the functions that they call replaced by others."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from driftfit.engine.kernel import Machine, machine
 
 
 def substituted(functions: Sequence[Any], others: Mapping[Any, Any]) -> tuple[Any, ...]:
-    """Compiled functions, or machines, built again with other functions in the place of some that they call.
+    """Functions or machines, recompiled with some of the functions that they call replaced.
 
-    ``others`` says what takes whose place, also where it is called through others. So a second form of a machine is the
-    first with some parts replaced, and is compiled only where it is asked for.
+    ``others`` maps each function to its replacement, which also applies to indirect calls. So a second form of a
+    machine is the first with some parts replaced, and is compiled only where it is asked for.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The comparison in every summary: what simpler predictors would have achieved on the same samples.
+"""The comparison in every summary: the errors of simpler predictors on the same samples.
 
 *persistence*   the last known output
 *constant LS*   recursive least squares without forgetting on the same regressors (fitted only to the past)
@@ -35,8 +35,13 @@ class Comparison(NamedTuple):
     samples: int
 
 
-def persistence(y: Array) -> Array:
-    """For every sample the last known output before it; NaN before the first."""
+def persistence(y: Array, rows: int = 1) -> Array:
+    """For every sample the last known output before it; NaN before the first.
+
+    Where outputs share one theta, an instant has several ``rows``, and the last value of a row is that of its output.
+    """
+    if rows > 1:
+        return np.stack([persistence(one) for one in y.reshape(-1, rows).T], axis=1).ravel()
     seen = np.where(np.isfinite(y), np.arange(len(y)), -1)
     last = np.concatenate([[-1], np.maximum.accumulate(seen)[:-1]])
     return np.where(last >= 0, y[last], np.nan)
@@ -73,7 +78,8 @@ def errors(run: Track, burn: int | None = None, steady: Array | None = None) -> 
     tracked, constant = _error(y, run.prediction, run.innovation), _error(y, steady["y_hat"][:, 0], steady["e"][:, 0])
     lagged = _with_lags(steady, y, run.known.noise)
     lagged = np.where(np.isfinite(lagged), lagged, constant)
-    own = (tracked, y - persistence(y), constant, lagged, arx["e"][:, 0])
+    rows = len(run.program.whole.outputs)
+    own = (tracked, y - persistence(y, rows), constant, lagged, arx["e"][:, 0])
     scored = np.arange(len(y)) >= (burn_in(run.model.n) if burn is None else burn)
     for error in own:
         scored &= np.isfinite(error)

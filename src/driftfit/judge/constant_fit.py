@@ -12,16 +12,25 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
-from driftfit.data.record import Record
+from driftfit.data.record import Reading, Record
 from driftfit.engine.drivers import LARGEST, TrackerSteps, drivers, make_tile, output_type, repeat_tile, unknown
 from driftfit.engine.kernel import Array, Driver, State, kernel, shared
 from driftfit.models.base import Model
 from driftfit.run.collected_samples import COLLECTED, collect
+from driftfit.run.fleet import Fleet
+from driftfit.run.outputs import Outputs
 from driftfit.run.program import lanes_of
+from driftfit.run.result import Track
+from driftfit.run.shared_outputs import Shared
+from driftfit.run.track import track
+from driftfit.trackers.kalman import Kalman
 
+STILL = Kalman(q=0.0, r=1.0)
+"""Constant parameters with a diffuse start."""
 FLAT = 1e-11
 """A diagonal entry below this share of its column counts as zero."""
 
@@ -112,3 +121,21 @@ def constant_errors(phi: Array, y: Array, weight: Array) -> Array:
     root, e = np.sqrt(weight), np.full(len(y), np.nan)
     _predictions(np.column_stack([phi, y]) * root[:, None], known, e)
     return e / root
+
+
+def constant_outputs(
+    model: Model, y: Any, u: Any, reading: Reading, data: Any, by: Any = None
+) -> dict[str, list[Track]]:
+    """Each output as a separate regression, tracked with constant parameters: by name, one run for every record.
+
+    Their predictions fill missing lags. Outputs that share one theta are one regression, on all rows.
+    """
+    run = track(model, STILL, y, u, reading, data=data, by=by)
+    if isinstance(run, Shared):
+        return {"rows": [run.rows]}
+    assert isinstance(run, Outputs | Fleet)
+    lanes = list(run.values())
+    if model.shared:
+        return {"rows": lanes}
+    names = run.outputs if isinstance(run, Outputs) else run.records.outputs
+    return {name: lanes[k :: len(names)] for k, name in enumerate(names)}

@@ -157,7 +157,7 @@ def _whiteness(white: Whiteness) -> Check:
     )
     advice = (
         f"The innovations are correlated ({first:.2f} at the first lag, {sign}): the model leaves something "
-        f"predictable. Try {hint}."
+        f"predictable. Try {hint}; if they stay correlated, the noise is coloured: use ARMAX, OE or BoxJenkins."
     )
     return Check("whiteness (p)", white.p, 0.01, np.inf, advice)
 

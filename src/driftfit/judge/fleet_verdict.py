@@ -13,20 +13,17 @@ Source: Benjamini and Hochberg (1995). Cost: that of a verdict for each run.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
-from time import monotonic
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
-from rich.progress import Progress
 from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.diagnose import Diagnosis, diagnose
+from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import Verdict, p_text, verdict
 from driftfit.show.parts.text import Printed, key_text, table_of
 
@@ -34,10 +31,6 @@ if TYPE_CHECKING:
     from driftfit.run.result import Track
 
 SHOWN = 20
-PATIENCE = 2.0
-"""Seconds after which a progress bar appears."""
-
-Said = TypeVar("Said")
 
 
 def discoveries(p: Array) -> Array:
@@ -240,7 +233,7 @@ def verdicts(
     runs: Mapping[Hashable, Track], level: float, lags: int | None = None, burn: int | None = None
 ) -> ManyVerdicts:
     """Judge runs by key; see `driftfit.judge.verdict.verdict` for the settings and errors."""
-    said = _each(runs, lambda run: verdict(run, level, lags, burn), "verdict")
+    said = on_all_cores(runs, lambda key: verdict(runs[key], level, lags, burn), "verdict")
     q, q_pays = (
         discoveries(np.array(p)) for p in ([v.p for v in said.values()], [v.constants.p for v in said.values()])
     )
@@ -253,22 +246,4 @@ def verdicts(
 
 def diagnoses(runs: Mapping[Hashable, Track]) -> ManyDiagnoses:
     """Diagnose runs by key."""
-    return ManyDiagnoses(_each(runs, diagnose, "diagnosis"))
-
-
-def _each(runs: Mapping[Hashable, Track], judge: Callable[[Track], Said], what: str) -> dict[Hashable, Said]:
-    """The result of ``judge`` for each run, on all cores; the first runs alone, so that only one thread compiles."""
-    from driftfit.run.lanes import cores
-
-    keys, tracks = list(runs), list(runs.values())
-    said = [judge(track) for track in tracks[:1]]
-    progress = Progress(console=Console(stderr=True), transient=True)
-    task, begun, shown = progress.add_task(what, total=len(tracks), completed=len(said)), monotonic(), False
-    with ThreadPoolExecutor(cores()) as pool, ExitStack() as stack:
-        for one in pool.map(judge, tracks[1:]):
-            said.append(one)
-            progress.advance(task)
-            if not shown and monotonic() - begun > PATIENCE:
-                stack.enter_context(progress)
-                shown = True
-    return dict(zip(keys, said, strict=True))
+    return ManyDiagnoses(on_all_cores(runs, lambda key: diagnose(runs[key]), "diagnosis"))

@@ -25,7 +25,9 @@ COLOURS = (BLUE, RED, "#3a8f4d", "#9a6fb0", "#c08a1e", "#4aa3a8", "#7a5c46", "#d
 
 
 class Health(NamedTuple):
-    """What a diagnosis looked at; ``fine`` says whether a check, by its name, is within its limits."""
+    """The quantities that a diagnosis examines; ``fine`` maps the names of checks to whether they are within their
+    limits.
+    """
 
     run: Track
     z: Array

@@ -32,9 +32,10 @@ from driftfit.data.record import Reading
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.judge.regressors import regressors
-from driftfit.judge.statistics.break_dates import date_loglik, smallest
+from driftfit.judge.segments.joint import jointly
+from driftfit.judge.statistics.break_dates import dated
 from driftfit.judge.statistics.constancy import shortest as shortest_of
-from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
+from driftfit.judge.statistics.noise import HELD, Noise, begun, whitened
 from driftfit.judge.statistics.robust import orthonormal, robust_fit
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
 
 CELLS = 2000
 """Largest number of positions for breaks that are compared at once."""
-SWEEPS = 10
 
 
 class Break(NamedTuple):
@@ -212,11 +212,12 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
     if not fit.scale > 1e-10 * np.sqrt(np.mean(rows.y**2)):
         return _undivided(run, rows.phi, rows.y, level)
     Q = orthonormal(rows.phi / size)[0]
-    found = noise(Q, fit.residual, CELLS, least, quiet=false)
+    search, found, starts = begun(Q, fit.residual, CELLS, least, quiet=false)
+    found = jointly(search, found, starts, false)
     # a value limited by the fit still supports one side; without its row it does not
     used = np.abs(found.near) <= HELD * found.level
     X, z = Q * (used / found.level)[:, None], np.where(used, found.held, 0.0) / found.level
-    breaks, spans = _dated(X / found.white, z / found.white, found, least, level)
+    breaks, spans = dated(X / found.white, z / found.white, found.ar, found.breaks.tolist(), least, level)
     at = [int(rows.at[b]) for b in breaks]
     time = run.time
     edges = [0, *breaks, N]
@@ -225,28 +226,9 @@ def segmented(run: Track, level: float = 0.95, false: float = 0.01, shortest: in
         Segment(limits[k], limits[k + 1], *_fitted(rows.phi[a:b], rows.y[a:b], found, a, b))
         for k, (a, b) in enumerate(pairwise(edges))
     )
-    dated = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
+    said = tuple(Break(time[t], time[rows.at[a]], time[rows.at[b]], t) for t, (a, b) in zip(at, spans, strict=True))
     spread = float(np.median(found.level))
-    return Segmentation(dated, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
-
-
-def _dated(X: Array, z: Array, found: Noise, least: int, level: float) -> tuple[list[int], list[tuple[int, int]]]:
-    """The most likely dates, each between its neighbours until all are stable, and their intervals."""
-    breaks, N = [int(b) for b in found.breaks], len(z)
-    spans = [(b, b) for b in breaks]
-    p = len(found.ar)
-    for _ in range(SWEEPS):
-        before = list(breaks)
-        for k, _b in enumerate(breaks):
-            a, b = ([0, *breaks][k], [*breaks, N][k + 1])
-            low, high = min(max(least // 2, p + 1), (b - a) // 3), max((b - a) - least // 2, (b - a) * 2 // 3)
-            loglik = date_loglik(X[a:b], z[a:b], found.ar, low, high)
-            breaks[k] = a + low + int(np.argmax(loglik))
-            first, last = smallest(loglik, level)
-            spans[k] = (a + low + first, a + low + last)
-        if breaks == before:
-            break
-    return breaks, spans
+    return Segmentation(said, parts, level, found.penalty, spread, tuple(map(float, found.ar)), run)
 
 
 def _fitted(phi: Array, y: Array, found: Noise, a: int, b: int) -> tuple[Array, Array]:

@@ -3,18 +3,18 @@
 The verdict answers two questions whose answers may differ:
 
 * *Do the parameters move?* Score tests of constant coefficients (`driftfit.judge.statistics.constancy`): the mean
-  square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
-  null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
-  changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r
-  do not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
-  ``benchmarks/verdict_error_rate.py`` verifies.
-* *Does following them pay?* The one-step errors of the run beside persistence, constant least squares on the past, the
-  same with two lags of the outputs and regressors, and a constant ARX, on the same samples, with paired tests
-  (`driftfit.judge.statistics.paired`). Correlated noise can be predicted, which a drifting parameter does as well: so
-  following pays where the run beats the better of constants without lags and with them.
+square of Nyblom and Hansen, and the suprema over one break and over an interval, with one error rate for all. Their
+null distribution follows the noise and the excitation of the record itself, so outliers, a changing noise variance,
+changing inputs and correlated noise are not mistaken for drift. The tests use the record, not the tracker: q and r do
+not enter. If the parameters are constant, the verdict says that they move with probability ``level``, as
+``benchmarks/verdict_error_rate.py`` verifies. * *Does following them pay?* The one-step errors of the run are compared
+with those of persistence, constant least squares on the past, the same with two lags of the outputs and regressors, and
+a constant ARX, on the same samples, with paired tests (`driftfit.judge.statistics.paired`). Correlated noise can be
+predicted, which a drifting parameter does as well: so following pays where the run beats the better of constants
+without lags and with them.
 
-The first sentence says what both answers together mean. A parameter is named as one that moves where the joint test
-rejects, its own still does when what was named before it is taken into account
+The first sentence combines both answers. A parameter is named as one that moves where the joint test
+rejects, its own still does when the parameters named before are taken into account
 (`driftfit.judge.statistics.attribution`), and its values before and after differ by more than chance.
 
 A model without enough lags has correlated noise, which is hard to tell from a drifting intercept. The order of an
@@ -180,7 +180,7 @@ class Verdict(Printed):
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
-        return f"These move: {'; '.join(_told(moved) for moved in self.parameters if moved.moves)}."
+        return f"These move: {'; '.join(_sentence(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
         steady = self.constants
@@ -207,14 +207,14 @@ class Verdict(Printed):
 
     def _caution(self) -> str:
         better = [rival.name for rival in self.rivals if rival.rms < self.rms]
-        told = f"Lower error than this run: {', '.join(better)}. " if better else ""
+        text = f"Lower error than this run: {', '.join(better)}. " if better else ""
         if self.correlated:
-            told += (
+            text += (
                 "The residuals are correlated, even within segments of constant parameters. A model with too few "
                 f"lags causes this, and so does a fast drift. The test allows for {self.lags} "
                 f"lag{'' if self.lags == 1 else 's'} of correlation; try one more lag in the model."
             )
-        return told.strip()
+        return text.strip()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         for sentence in self.sentences:
@@ -238,7 +238,7 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
     return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
-def _told(moved: Moved) -> str:
+def _sentence(moved: Moved) -> str:
     """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
     if abs(moved.last - moved.after) <= 2.0 * moved.std:

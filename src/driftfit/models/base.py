@@ -16,9 +16,9 @@ from driftfit.engine.settings import Settings
 class Model(Settings, ABC):
     """How signals become ``y_t = phi_t' theta_t + v_t``.
 
-    Beside its regression a model declares what else it is: the properties and methods that have a default here, which
-    `driftfit.checks.check_model` tests. A model is *bound* once the number (and perhaps the names) of its inputs is
-    known; `bind` returns the bound model, and everything else needs one.
+    Besides its regression a model declares its other properties: the properties and methods that have a default here,
+    which `driftfit.checks.check_model` tests. A model is *bound* once the number (and perhaps the names) of its inputs
+    is known; `bind` returns the bound model, and everything else needs one.
     """
 
     intercept: bool = False
@@ -91,7 +91,7 @@ class Model(Settings, ABC):
         """The compiled ``regress`` and ``push``."""
 
     def memory_for(self, doubts: bool) -> Mapping[str, Any]:
-        """`memory` with a tracker that says which readings it took for outliers (`TrackerSteps.doubts`), or without."""
+        """`memory` for a tracker that marks readings as outliers (`TrackerSteps.doubts`), or for one that does not."""
         return self.memory()
 
     def steps_for(self, doubts: bool) -> ModelSteps:
@@ -134,7 +134,7 @@ class Model(Settings, ABC):
     def output_lags(self) -> int | None:
         """How many entries of phi, from its first, are past outputs and get predictions where those are missing.
 
-        None where past outputs stand elsewhere, or in functions of theirs; 0 where there are none.
+        None if past outputs are elsewhere, or are transformed; 0 where there are none.
         """
         return None
 
@@ -159,6 +159,11 @@ class Model(Settings, ABC):
     def reach(self) -> int:
         """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
         return 0
+
+    @property
+    def recursive(self) -> bool:
+        """Whether regressors hold earlier results of the model itself, so that a sample acts on all after it."""
+        return False
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
         """Run systems forward: the outputs (D, h) that inputs and noise cause, each fed back as a lag.

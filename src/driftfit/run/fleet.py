@@ -8,17 +8,19 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from driftfit.data.record import Records
-from driftfit.run.lanes import run_lanes
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
+from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
-class Fleet(Many):
+class Fleet(KeyedResults):
     """Results of many series, from key to `Track` like a dict, in the order of the table.
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
@@ -109,6 +111,7 @@ def run_fleet(
     keep: str = "std",
     failed: Mapping[Hashable, str] | None = None,
     before: Mapping[Hashable, Run | bytes] | None = None,
+    dtype: Any = np.float64,
 ) -> Fleet:
     """Run every series by its programs (one for each output) and return the results; all have one bound model.
 
@@ -118,7 +121,7 @@ def run_fleet(
     if not records.keys:
         return Fleet(programs, records, [], failed or {}, {})
     starts, records = _begun(programs, records, before or {})
-    lanes = run_lanes(programs, records, keep, starts)
+    lanes = run_lanes(programs, records, keep, starts, dtype)
     series = lanes[:: records.ny]
     absent = {key: "interrupted before it was run" for key, lane in zip(records.keys, series, strict=True) if not lane}
     if absent:

@@ -23,14 +23,14 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.many import Many
-from driftfit.run.program import Program, lanes_of, shown, state_of, tile_of
+from driftfit.run.keyed_results import KeyedResults
+from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
 
-class Outputs(Many):
+class Outputs(KeyedResults):
     """A record with several outputs, each with its own theta.
 
     Attributes
@@ -133,9 +133,9 @@ class Outputs(Many):
         """Sum over the outputs: their noises are assumed to be independent."""
         return sum(track.loglik for track in self.values())
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, ny, n): pointwise bands of theta at this level."""
-        low, high = zip(*(track.band(level) for track in self.values()), strict=True)
+    def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T, ny, n): pointwise bands of theta at this level; ``conformal`` as for `Track.band`."""
+        low, high = zip(*(track.band(level, conformal) for track in self.values()), strict=True)
         return np.stack(low, axis=1), np.stack(high, axis=1)
 
     def cov(self, t: int) -> Array:
@@ -145,9 +145,13 @@ class Outputs(Many):
     @cached_property
     def _collected(self) -> Array:
         """The samples as the tracker received them, with the regressors that all outputs share."""
-        steps = self._programs[0].steps._replace(store=collect)
+        return self.replayed(collect, COLLECTED)
+
+    def replayed(self, store: Any, fields: tuple[str, ...]) -> Array:
+        """The run again, (T,) records of a lane for each output, with these fields as ``store`` writes them."""
         tile = tile_of(self._programs, [self._starts[j] for j in sorted(self._starts)])
-        out = np.empty(len(self), output_type(tile, COLLECTED))
+        out = np.empty(len(self), output_type(tile, fields))
+        steps = self._programs[0].steps._replace(store=store)
         self._programs[0].drivers(steps=steps).run(tile, *lanes_of(self.record), out)
         return out
 
@@ -181,7 +185,7 @@ class Outputs(Many):
         own = [name for name, shape in shapes.items() if shape == state[name].shape]
         for name in own:
             tile[name][0, ..., 0] = state[name]
-        out = alone.written(tile, len(self), "cov" if "P" in names_of(lane.out) else "std")
+        out = alone.written(tile, len(self), *kept(lane.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = lane.written(name)
         start = {name: value for name, value in self._starts[j].items() if name in own} if self._starts else None

@@ -28,6 +28,12 @@ from driftfit.trackers.base import Tracker
 CHUNK = 1_000_000
 """Samples between two updates of the progress bar."""
 
+BLOCK = 4096
+"""Samples of a block of results of which only a part is kept."""
+
+SHORT = 32
+"""Rows of fewer numbers are copied column by column: NumPy takes 30 ns for each row."""
+
 State = Mapping[str, Array]
 """Fields of one lane of a tile, by name."""
 
@@ -139,6 +145,7 @@ class Program:
 
     def drivers(self, keep: str = "std", steps: TrackerSteps | None = None) -> Drivers:
         """The compiled loops; ``steps`` replace the tracker's own, to inspect the run."""
+        keep = "std" if keep == "theta" else keep
         found = self._drivers.get((keep, steps))
         if found is None:
             found = drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
@@ -156,27 +163,61 @@ class Program:
         """A tile with the state of a run, without the known factors of its last sample."""
         return self.tile({name: value for name, value in state.items() if name not in STANDING})
 
-    def written(self, tile: Array, T: int, keep: str = "std") -> Array:
-        """An array for the driver's output of T samples of a tile."""
-        return np.empty(T, output_type(tile, self.tracker.outputs, keep))
+    def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
+        """An array for the results of T samples of a tile."""
+        return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
 
-    def run(self, tile: Array, record: Record, keep: str = "std") -> Array:
-        """Run a tile over a record, a lane for each output; returns the driver's output, (T,) of `output_type`."""
+    def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
+        """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
         T = len(record)
-        out = self.written(tile, T, keep)
-        run = self.drivers(keep).run
+        out = self.written(tile, T, keep, dtype)
         if T <= CHUNK:
-            run(tile, *lanes_of(record), out)
+            self.fill(tile, *lanes_of(record), out)
             return out
         with progress("tracking", T, True) as advance:
             for a in range(0, T, CHUNK):
                 part = slice(a, min(a + CHUNK, T))
-                run(tile, *lanes_of(record.part(part)), out[part])
+                self.fill(tile, *lanes_of(record.part(part)), out[part])
                 advance(part.stop - a)
         return out
 
+    def fill(self, tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
+        """Run a tile over samples. What is not kept of their results is written to a block that stays in the cache."""
+        keep, _ = kept(out.dtype)
+        run, rows = self.drivers(keep).run, output_type(tile, self.tracker.outputs, "std" if keep == "theta" else keep)
+        if out.dtype == rows:
+            run(tile, y, u, known, out)
+            return
+        block = np.empty(min(BLOCK, len(out)), rows)
+        for a in range(0, len(out), BLOCK):
+            part = slice(a, min(a + BLOCK, len(out)))
+            results = block[: part.stop - a]
+            run(tile, y[part], u[part], known if len(known) == 1 else known[part], results)
+            _copy(results, out[part])
 
-STANDING = ("interval", "noise", "drift", "each")
+
+def _copy(results: Array, out: Array) -> None:
+    """Store what ``out`` keeps of results, all at once where it keeps all."""
+    T, names = len(out), out.dtype.names or ()
+    if names == results.dtype.names and all(results.dtype[name].base == np.float64 for name in names):
+        out.view(out.dtype[names[0]].base).reshape(T, -1)[...] = results.view(np.float64).reshape(T, -1)
+        return
+    for name in names:
+        into, given = out[name].reshape(T, -1), results[name].reshape(T, -1)
+        if into.shape[1] >= SHORT:
+            into[...] = given
+            continue
+        for k in range(into.shape[1]):
+            into[:, k] = given[:, k]
+
+
+def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
+    """(what is kept, in which precision) in rows of results."""
+    names = rows.names or ()
+    return "cov" if "P" in names else "std" if "var" in names else "theta", rows["theta"].base
+
+
+STANDING = ("interval", "noise", "drift", "drift_root")
 """Fields with the known factors of one sample."""
 
 
@@ -194,6 +235,12 @@ def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
     memory = model.memory_for(programs[0].steps.doubts)
+    tracker = programs[0].tracker
+    if both := sorted((set(memory) & set(starts[programs[0]])) - set(tracker.replaces)):
+        raise ValueError(
+            f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "
+            "which would be one and the same; rename it in one of them, or list it in the tracker's `replaces`."
+        )
     return make_tile(model.n, model.m, memory, [starts[one] for one in programs])
 
 

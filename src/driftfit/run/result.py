@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
-from statistics import NormalDist
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -16,7 +15,8 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.program import Program, State, lanes_of, state_of
+from driftfit.run.conformal import quantile, widened
+from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
@@ -40,7 +40,7 @@ class Lane(NamedTuple):
         if self.tile["theta"].shape[-1] == 1:
             return self
         tile = program.tile(state_of(self.tile, self.lane))
-        out = program.written(tile, len(self.out), "cov" if "P" in names_of(self.out) else "std")
+        out = program.written(tile, len(self.out), *kept(self.out.dtype))
         for name in names_of(out):
             out[name][..., 0] = self.written(name)
         return Lane(out, tile)
@@ -118,9 +118,26 @@ class Track(Plain):
         """The state after the last sample, field by field; these are views and must not be written to."""
         return state_of(self._lane.tile, self._lane.lane)
 
+    @property
+    def undetermined(self) -> Array:
+        """Which parameters the record does not determine, (n,) bool: their std after the last sample is inf."""
+        var: Array = self._lane.tile["var"][0, :, self._lane.lane]
+        return np.isinf(var)
+
     def written(self, name: str) -> Array:
-        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example."""
-        return self._lane.written(name)
+        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example.
+
+        Replays the record, once, if only theta was kept.
+        """
+        return (self._lane if name in self.stores() else self._complete).written(name)
+
+    @cached_property
+    def _complete(self) -> Lane:
+        """The results with everything that ``keep="std"`` stores."""
+        if kept(self._lane.out.dtype)[0] != "theta":
+            return self._lane
+        tile = self.fresh()
+        return Lane(self.program.run(tile, self.record), tile)
 
     def stores(self) -> tuple[str, ...]:
         """Names of these fields."""
@@ -209,11 +226,11 @@ class Track(Plain):
         the noise variance (`driftfit.trackers.parts.student`); for a tracker that weighs hypotheses it is that of their
         mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
-        s, e = self.innovation_var, self.innovation
+        s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))
         counted = self.ok & np.isfinite(s) & (s > 0.0)
-        own = self.tracker.log_density(self._lane.out)
+        own = self.tracker.log_density(self._complete.out)
         if own is not None:
-            terms = own[:, self._lane.lane]
+            terms = own[:, self._complete.lane]
         elif self.tracker.learns_noise:
             terms = log_student(e, s, residuals_before(self.ok, s, float((self.start or {}).get("count", 0.0))))
         else:
@@ -224,12 +241,32 @@ class Track(Plain):
             terms[counted] += self.model.log_jacobian(self.theta[counted], self.y[counted])
         return terms
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model."""
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"band: level must be between 0 and 1, such as 0.95; got {level!r}.")
-        half = NormalDist().inv_cdf(0.5 + level / 2.0) * self.std
+    def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T, n): pointwise bands of theta at this level, under the tracker's own model.
+
+        With ``conformal`` they are as much wider as bands of the output had to be so far (`output_band`).
+        """
+        half = quantile(level) * self.std
+        if conformal:
+            half = half * widened(self.innovation, self.innovation_var, level, "band")[1:, None]
         return self.theta - half, self.theta + half
+
+    def output_band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T,): bands of each output before it is known, for models whose innovation is that of y.
+
+        With ``conformal`` they are widened or narrowed by a factor that keeps the share of outputs within them at
+        ``level`` in any record (`driftfit.ConformalFactor`, which does the same for a stream, bit for bit). A warning
+        is issued where it exceeds 2. ValueError for a model whose innovation is not that of y.
+        """
+        if self.model.implicit and not self.tracker.output_error:
+            raise ValueError(
+                "output_band: the innovation of this model is that of its equation, and not that of y; "
+                "use run.forecast() for bands of the output."
+            )
+        half = quantile(level, "output_band") * self.innovation_std
+        if conformal:
+            half = half * widened(self.innovation, self.innovation_var, level, "output_band")[:-1]
+        return self.prediction - half, self.prediction + half
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).
@@ -284,7 +321,7 @@ class Track(Plain):
             "model": storage.describe(self.model),
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
-            "keep": "cov" if self.keeps_cov else "std",
+            "keep": kept(self._lane.out.dtype)[0],
         }
         arrays = {"y": self.y, "u": self.u, "known": self.known.columns}
         if self.record.time is not None:
@@ -312,7 +349,7 @@ class Track(Plain):
         )
         tile = program.tile()
         storage.restore(path, program.tracker, arrays, "state_", state_of(tile))
-        out = program.written(tile, len(record), header["keep"])
+        out = program.written(tile, len(record), header["keep"], arrays["out_theta"].dtype)
         storage.restore(path, program.tracker, arrays, "out_", {name: out[name][..., 0] for name in names_of(out)})
         start = {name.removeprefix("start_"): arrays[name] for name in arrays if name.startswith("start_")}
         return cls(program, record, Lane(out, tile), start or None)

@@ -102,9 +102,9 @@ class Shared(Plain):
         """Covariance (n, n) of theta after all outputs of sample t."""
         return self.rows.cov((t % len(self) + 1) * len(self.outputs) - 1)
 
-    def band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """(low, high), each (T, n): pointwise bands of theta at this level."""
-        low, high = self.rows.band(level)
+    def band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
+        """(low, high), each (T, n): pointwise bands of theta at this level; ``conformal`` as for `Track.band`."""
+        low, high = self.rows.band(level, conformal)
         return self.last_rows(low), self.last_rows(high)
 
     def end(self) -> End:

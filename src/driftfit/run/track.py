@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from driftfit.data import outputs
 from driftfit.data.arguments import check_roles
 from driftfit.data.record import Reading, Records, one_series, rows
-from driftfit.engine.settings import one_of
+from driftfit.engine.settings import one_of, warn
 from driftfit.models.base import Model
 from driftfit.run.fleet import Fleet, run_fleet
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Track
 from driftfit.run.shared_outputs import Shared
-from driftfit.run.unlearned import warn_unlearned
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
 Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 """One tracker for all, or one per setting of a grid or per series."""
+
+PART = 64_000_000
+"""Bytes of results that `parts` holds at a time; a table of them takes some three times as much."""
 
 Result = Track | Fleet | Outputs | Shared
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
@@ -29,33 +36,80 @@ Result = Track | Fleet | Outputs | Shared
 
 def track(
     model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
-    by: str | Sequence[str] | None = None, keep: str = "std", warm_start: Any = None, prob: Any = None,
+    by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64", warm_start: Any = None,
+    prob: Any = None,
 ) -> Result:  # fmt: skip
     """Track the parameters of a model; arguments as for `driftfit.track`, with time and others in a `Reading`."""
-    check_roles("track", model, tracker, several=True)
-    one_of("track", "keep", keep, ("std", "cov"))
-    reading = Reading() if reading is None else reading
-    model, records, failed = records_of(model, y, u, reading, data, by)
-    records = records.for_model(model, reading)
-    many = by is not None or _is_grid(tracker, records)
-    if prob is not None and (many or len(model.outputs) > 1):
-        raise ValueError("track: prob= is for one series and one tracker.")
-    if many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
+    task = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype, prob))
+    if task.many and warm_start is not None and not isinstance(warm_start, Mapping | Fleet):
         raise ValueError(
             "warm_start: with by= or a grid pass the result of such a run, or a mapping from key to its end or bytes; "
             f"got {warm_start!r}."
         )
+    run: Any
+    if task.many:
+        run = run_fleet(task.programs, task.records, keep, task.failed, warm_start, dtype)
+    else:
+        run = _one(task.programs, task.records, keep, warm_start, dtype)
+    warn_unlearned(run)
+    return run  # type: ignore[no-any-return]
+
+
+def parts(
+    model: Model, tracker: Trackers, y: Any, u: Any = None, reading: Reading | None = None, *, data: Any = None,
+    by: str | Sequence[str] | None = None, keep: str = "std", dtype: Any = "float64",
+) -> Iterator[Fleet]:  # fmt: skip
+    """`track` for many series, some of them at a time, so that their results need little memory."""
+    task = _task(model, tracker, y, u, reading, data, by, Kept(keep, dtype))
+    if not task.many:
+        raise ValueError("track: to= is for many series: give by=, or several trackers.")
+    programs, records, ny = task.programs, task.records, task.records.ny
+    if not records.keys:
+        yield run_fleet(programs, records, keep, task.failed, dtype=dtype)
+        return
+    row = programs[0].written(programs[0].tile(), 0, keep, dtype).dtype.itemsize * ny
+    upto = np.cumsum(records.length) * row // PART
+    bounds = [0, *(np.flatnonzero(np.diff(upto)) + 1).tolist(), len(records.keys)]
+    for k, (a, b) in enumerate(pairwise(bounds)):
+        yield run_fleet(programs[a * ny : b * ny], records.some(a, b), keep, {} if k else task.failed, dtype=dtype)
+
+
+class Kept(NamedTuple):
+    """What is stored of every sample, in which precision, and what is known of events beforehand."""
+
+    keep: str = "std"
+    dtype: Any = "float64"
+    prob: Any = None
+
+
+class Task(NamedTuple):
+    """Checked series, the program of each output of each of them, and units without data with the reasons."""
+
+    programs: list[Program]
+    records: Records
+    failed: Mapping[Hashable, str]
+    many: bool
+
+
+def _task(
+    model: Model, tracker: Trackers, y: Any, u: Any, reading: Reading | None, data: Any, by: Any, kept: Kept
+) -> Task:
+    check_roles("track", model, tracker, several=True)
+    one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
+    one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
+    if kept.keep == "theta" and len(model.outputs) > 1:
+        raise ValueError("track: keep='theta' is for models of one output.")
+    reading = Reading() if reading is None else reading
+    model, records, failed = records_of(model, y, u, reading, data, by)
+    records = records.for_model(model, reading)
+    many = by is not None or _is_grid(tracker, records)
+    if kept.prob is not None and (many or len(model.outputs) > 1):
+        raise ValueError("track: prob= is for one series and one tracker.")
     if by is None and many:
         records = records.repeated(tuple(tracker) if isinstance(tracker, Mapping) else tuple(range(len(tracker))))  # type: ignore[arg-type]
     trackers = _per_series(tracker, records) or _any_of(tracker)
-    programs, records = _prepared(model, trackers, records, keep, prob)
-    if many:
-        fleet = run_fleet(programs, records, keep, failed, warm_start)
-        warn_unlearned(fleet)
-        return fleet
-    run = _one(programs, records, keep, warm_start)
-    warn_unlearned(run)
-    return run
+    programs, records = _prepared(model, trackers, records, kept.keep, kept.prob)
+    return Task(programs, records, failed, many)
 
 
 def _prepared(
@@ -141,7 +195,9 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
     return list(tracker)
 
 
-def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None) -> Track | Outputs | Shared:
+def _one(
+    programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any
+) -> Track | Outputs | Shared:
     """Run one series."""
     program, record = programs[0], records.part(0)
     starts = carried(before, programs)
@@ -149,9 +205,37 @@ def _one(programs: Sequence[Program], records: Records, keep: str, before: Run |
         begins = None if record.time is None else record.time[0]
         record = replace(record, known=record.known.begun({0: first_interval(before, begins, record.labels)}))
     tile = tile_of(programs, starts)
-    out = program.run(tile, record, keep)
+    out = program.run(tile, record, keep, dtype)
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
     run = Track(program, record, Lane(out, tile), *starts)
     return run if program.shared is None else Shared(run)
+
+
+def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
+    """Warn of the parameters that `Tracker.unlearned` marks."""
+    one = run.rows if isinstance(run, Shared) else run
+    if isinstance(one, Track):
+        ends = [(one.program, one.state)] if one.undetermined.any() else []
+    else:
+        ends = list(one.undetermined())
+    found, counts, owners = 0, Counter[str](), []
+    for program, state in ends:
+        missed = [name for name, left in zip(program.names, program.tracker.unlearned(state), strict=True) if left]
+        found += bool(missed)
+        counts.update(missed)
+        owners += [type(program.tracker).__name__] if missed else []
+    if not found:
+        return
+    named = ", ".join(counts)
+    if not isinstance(one, Track):
+        named = (
+            f"in {found} of {len(one.keys())} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
+        )
+    warn(
+        f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "
+        "others: std is inf. The other parameters are not affected; to avoid this warning leave out columns that are "
+        "constant or repeat another.",
+        UserWarning,
+    )

@@ -22,7 +22,7 @@ from driftfit.run.program import Program, State, programs_of, state_of, tile_of
 from driftfit.run.states.layout import fields_of, unpacked
 from driftfit.trackers.base import Tracker
 
-_LEFT = ("interval", "noise", "drift", "each", "F")
+_LEFT = ("interval", "noise", "drift", "drift_root", "F")
 """Fields that are not carried over: an operator's settings of the stream, and the diffuse likelihood of that run."""
 
 
@@ -70,16 +70,16 @@ UNSAID: Mapping[str, Any] = {
     "dt": None, "zone": None, "limits": None, "last": None, "ignored": 0, "lag": 0, "awaits": 0, "cold": False,
     "windows": (), "alarms": (),
 }  # fmt: skip
-"""What is not written about a stream, because it is the rule."""
+"""Values that are not written for a stream, because they are the default."""
 
 
 def written(
     programs: Sequence[Program], lanes: Sequence[bytes], extra: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Header and arrays of a file: the packed states of all lanes, and what else there is to say of the stream."""
+    """Header and arrays of a file: the packed states of all lanes, and the other facts about the stream."""
     described = [storage.describe(one.tracker) for one in programs]
     model = programs[0].whole
-    header = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
+    header: dict[str, Any] = {"kind": KINDS[len(model.outputs) > 1], "model": storage.describe(model)}
     header |= {"tracker": described[0] if len(described) == 1 else described, "fields": programs[0].layout.text}
     header |= {"extra": {name: value for name, value in extra.items() if value != UNSAID[name]}}
     return header, {f"state{lane}": np.frombuffer(data, np.uint8) for lane, data in enumerate(lanes)}
@@ -125,7 +125,7 @@ def restore(
 
 
 class Run(Protocol):
-    """What a warm start can begin from: a `Track`, a `Live`, or one of several outputs."""
+    """Runs from which a warm start can begin: a `Track`, a `Live`, or one of several outputs."""
 
     def end(self) -> End:
         """The end of the run."""
@@ -137,7 +137,7 @@ def ended(run: Run | bytes) -> End:
 
 
 def carried(run: Run | bytes | None, programs: Sequence[Program]) -> tuple[State, ...]:
-    """The fields that each lane takes over from a run before; ValueError where the two do not fit."""
+    """The fields that each lane takes over from a run before; ValueError if the two do not fit."""
     if run is None:
         return ()
     end = ended(run)

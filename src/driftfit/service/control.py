@@ -21,7 +21,7 @@ LONGEST = 16 << 20
 
 
 class Control(threading.Thread):
-    """Answers on the socket."""
+    """Answers requests on the socket."""
 
     def __init__(self, engine: Engine, path: Path, status: Any) -> None:
         super().__init__(name="driftfit-control", daemon=True)

@@ -31,7 +31,7 @@ def described(config: Config) -> str:
 
 
 def greeting(config: Config, folder: Path) -> str:
-    """What is said at the start."""
+    """The messages at the start."""
     page = config.page
     scheme = "https" if page.certificate else "http"
     where = f"{scheme}://{page.host}:{page.port}/" if page.enabled else "no page"

@@ -1,4 +1,4 @@
-"""The service as a process: engine, sources, sinks, the control socket, and the page in a process of its own."""
+"""The service as a process: engine, sources, sinks, the control socket, and the page in a separate process."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from typing import Any
 from driftfit.engine.version import __version__
 from driftfit.service.control import Control
 from driftfit.service.core.engine import Engine
-from driftfit.service.runners import Runner, SinkRunner, SourceRunner
 from driftfit.service.settings.config import Config
+from driftfit.service.threads import SinkThread, SourceThread, WorkerThread
 
 log = logging.getLogger("driftfit.service")
 LOOK = 1.0
 """Seconds between two looks at the page's process."""
 STOP = 10.0
-"""Seconds that sinks have to write what is stored when the service stops."""
+"""Seconds that sinks have to write stored results when the service stops."""
 
 
 class JsonLines(logging.Formatter):
@@ -68,8 +68,8 @@ class Service:
             log.info("recovered", extra={"detail": {"samples": self.engine.recovered}})
         self._private = Path(tempfile.mkdtemp(prefix="driftfit-"))
         self.control = Control(self.engine, self._private / "control", self.status)
-        self.sources = [SourceRunner(self.engine, one) for one in config.sources]
-        self.sinks = [SinkRunner(self.engine, one) for one in config.sinks]
+        self.sources = [SourceThread(self.engine, one) for one in config.sources]
+        self.sinks = [SinkThread(self.engine, one) for one in config.sinks]
         self.page: subprocess.Popen[bytes] | None = None
         self.page_starts = 0
         self._stopping = threading.Event()
@@ -87,7 +87,7 @@ class Service:
         if signals:
             for one in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(one, lambda *_: self.stop())
-        runners: list[Runner] = [*self.sources, *self.sinks]
+        runners: list[WorkerThread] = [*self.sources, *self.sinks]
         for runner in (*runners, self.control):
             runner.start()
         keeper = threading.Thread(target=self._keep, daemon=True)
@@ -108,7 +108,7 @@ class Service:
             one.stop()
         self.engine.stop()
 
-    def _close(self, runners: list[Runner]) -> None:
+    def _close(self, runners: list[WorkerThread]) -> None:
         self._stopping.set()
         with self.engine.news:
             self.engine.news.notify_all()

@@ -12,7 +12,7 @@ from statistics import NormalDist
 import numpy as np
 from rich.text import Text
 
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.show.parts.text import html_of, key_text, table_of
@@ -23,7 +23,7 @@ SHOWN = 20
 Row = tuple[str, str, float, float]
 
 
-def cell_of(result: Track | Many | Shared) -> str:
+def cell_of(result: Track | KeyedResults | Shared) -> str:
     """One line about the result and a table, as HTML."""
     rows, count = _rows(result)
     table = table_of("Parameters after the last sample", "", "", "theta", "std", "[0.025", "0.975]", names=2)
@@ -35,9 +35,9 @@ def cell_of(result: Track | Many | Shared) -> str:
     return html_of(Text(repr(result)), table, *more)
 
 
-def _rows(result: Track | Many | Shared) -> tuple[Iterator[Row], int]:
+def _rows(result: Track | KeyedResults | Shared) -> tuple[Iterator[Row], int]:
     """(key, name, theta, std) of every parameter of every lane, and how many there are."""
-    if isinstance(result, Many):
+    if isinstance(result, KeyedResults):
         lanes = ((key_text(key), run) for key, run in result.items())
         return (row for key, run in lanes for row in _own(key, run)), sum(len(run.names) for run in result.values())
     return _own("", result), len(result.names)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     import xarray
 
 
-def to_xarray(result: Track | Many | Shared) -> xarray.Dataset:
+def to_xarray(result: Track | KeyedResults | Shared) -> xarray.Dataset:
     """A result as a dataset; ImportError without xarray."""
     try:
         import xarray
     except ImportError:
         raise ImportError('to_xarray needs xarray: pip install "driftfit[xarray]"') from None
-    if isinstance(result, Many):
+    if isinstance(result, KeyedResults):
         dimension = "output" if isinstance(result, Outputs) else "unit"
         keys = xarray.DataArray([key_text(key) for key in result], dims=dimension, name=dimension)
         return xarray.concat([_dataset(xarray, run) for run in result.values()], dim=keys, join="outer")

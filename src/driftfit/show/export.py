@@ -9,10 +9,10 @@ format has room for them: ``attrs`` in pandas, the metadata of fields in pyarrow
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -21,14 +21,14 @@ from driftfit.data.clock import Clock
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.run.fleet import Fleet
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
 from driftfit.run.shared_outputs import Shared
 from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
 
-Result = Track | Shared | Many
+Result = Track | Shared | KeyedResults
 Single = Track | Outputs | Shared
 """One record."""
 
@@ -55,6 +55,36 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     if zone is not None:
         table = table.with_columns(pl.col(time).dt.replace_time_zone("UTC").dt.convert_time_zone(zone))
     return table
+
+
+class Written(NamedTuple):
+    """Results that were written to Parquet: the folder, how many series and rows, and units without a result."""
+
+    path: Path
+    series: int
+    rows: int
+    failed: dict[Hashable, str]
+
+
+def write_parts(fleets: Iterator[Fleet], to: str | PathLike[str]) -> Written:
+    """Write the table of each fleet to a file of the folder ``to``, before the next is run; ValueError if it has any.
+
+    Each file is complete or absent.
+    """
+    folder, series, rows = Path(to), 0, 0
+    failed: dict[Hashable, str] = {}
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"track: to={str(to)!r} exists and is not empty; give a new folder.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, fleet in enumerate(fleets):
+        failed |= fleet.failed
+        if not len(fleet):
+            continue
+        table, file = as_table(fleet), folder / f"part-{k:06d}.parquet"
+        table.write_parquet(file.with_suffix(".partial"))
+        file.with_suffix(".partial").rename(file)
+        series, rows = series + len(fleet.series()), rows + len(table)
+    return Written(folder, series, rows, failed)
 
 
 def _of_nothing(fleet: Fleet, arrays: bool) -> pl.DataFrame:

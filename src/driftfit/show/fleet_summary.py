@@ -21,7 +21,7 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.judge.compare import persistence
-from driftfit.run.many import Many
+from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track, burn_in, root_mean_square
 from driftfit.show.parts.text import Printed, counts, facts, key_text, table_of
 
@@ -91,7 +91,7 @@ class FleetSummary(Printed):
             yield Text(f" and {len(self.units) - SHOWN} that moved less", "dim")
 
 
-def summarise(fleet: Many) -> FleetSummary:
+def summarise(fleet: KeyedResults) -> FleetSummary:
     """Build the summary of results by key, all with the same number of parameters."""
     runs = list(fleet.values())
     paths = [_path(run) for run in runs]

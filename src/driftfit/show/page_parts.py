@@ -62,7 +62,7 @@ def picture(figure: Figure, run: Track, caption: str) -> str:
 
 
 def svg(figure: Figure, thin: bool = False) -> str:
-    """A figure as SVG text in the colours of the page; ``thin`` turns what it draws for each sample into an image."""
+    """A figure as SVG text in the colours of the page; ``thin`` draws the samples as an image."""
     import matplotlib
 
     for axis in figure.axes:

@@ -1,9 +1,9 @@
 """Report: one self-contained page about a run, for a reader who does not know this library.
 
-The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and what was
-skipped. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and turn
-light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which keeps
-the page small.
+The page gives the verdict first, then the parameters, the comparison, the diagnostics, pictures, settings and counts of
+skipped samples. Pictures are inline SVG in the colours of the page, which follow the reader's light or dark setting and
+turn light for print; nothing is loaded from elsewhere. The points of a long record are an image inside the SVG, which
+keeps the page small.
 """
 
 from __future__ import annotations
@@ -169,9 +169,9 @@ def _checks(health: Diagnosis) -> str:
         low, high = ("" if np.isinf(limit) else f"{limit:.4g}" for limit in (check.low, check.high))
         state = '<span class="good">ok</span>' if check.ok else '<span class="bad">out of bounds</span>'
         rows.append((check.name, f"{check.value:.4g}", low, high, "not known" if np.isnan(check.value) else state))
-    told = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
+    text = "".join(f"<li>{escape(sentence)}</li>" for sentence in health.sentences)
     listed = table("Numbers with their limits.", ("check", "value", "from", "to", ""), rows)
-    return listed + (f"<ul>{told}</ul>" if told else "")
+    return listed + (f"<ul>{text}</ul>" if text else "")
 
 
 def _settings(run: Track, facts: Summary) -> str:

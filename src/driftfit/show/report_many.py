@@ -95,9 +95,9 @@ def _rows(said: ManyVerdicts, health: ManyDiagnoses) -> str:
 
 
 def _pictured(row: Judgement, run: Track) -> str:
-    told = escape(" ".join(row.said.sentences))
+    text = escape(" ".join(row.said.sentences))
     shown = picture(parameter_figure(run), run, PARAMETERS)
-    return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{told}</p>{shown}</div>'
+    return f'<div class="one"><h3>{escape(key_text(row.key))}</h3><p>{text}</p>{shown}</div>'
 
 
 def _health(health: ManyDiagnoses) -> str:
@@ -105,10 +105,10 @@ def _health(health: ManyDiagnoses) -> str:
         "How many are out of bounds.", ("check", "series"), [(name, str(k)) for name, k in health.counts.items()]
     )
     worst = [key for key in health.worst[:PICTURED] if not health[key].ok]
-    told = "".join(
+    text = "".join(
         f"<li><b>{escape(key_text(key))}</b>: {escape(' '.join(health[key].sentences))}</li>" for key in worst
     )
-    return counts + (f"<ul>{told}</ul>" if told else "")
+    return counts + (f"<ul>{text}</ul>" if text else "")
 
 
 def _settings(runs: Mapping[Hashable, Track], failed: Mapping[Hashable, str]) -> str:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.text import Text
 
 from driftfit.judge.compare import Comparison, compare
-from driftfit.run.result import Track, burn_in
+from driftfit.run.outputs import Outputs
+from driftfit.run.result import Track, burn_in, root_mean_square
+from driftfit.run.shared_outputs import Shared
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, counts, facts, shortened, table_of
 
 _RIVALS = ("tracked", "persistence", "constant LS", "constant ARX")
@@ -94,6 +97,21 @@ def summarise(run: Track) -> Summary:
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
         _signals(run), _span(run), counts(run.labels.dropped), (*_missing(run), *run.tracker.remarks(run)),
     )  # fmt: skip
+
+
+def summarise_outputs(run: Outputs) -> ByOutput[Summary]:
+    """The summary of each output with a separate theta."""
+    return ByOutput({name: summarise(run[name]) for name in run.outputs})
+
+
+def summarise_shared(run: Shared) -> Summary:
+    """The summary of the rows of a shared theta, with the one-step error of each output after the start."""
+    kept = run.innovation[burn_in(len(run.names)) :]
+    errors = (root_mean_square(e[np.isfinite(e)]) for e in kept.T)
+    text = ", ".join(f"{name} {error:.5g}" for name, error in zip(run.outputs, errors, strict=True))
+    summary = summarise(run.rows)
+    remarks = (("Rows", f"{len(run.outputs)} of each sample"), ("RMS error of", text), *summary.remarks)
+    return replace(summary, remarks=remarks)
 
 
 def _signals(run: Track) -> str:

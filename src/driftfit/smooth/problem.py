@@ -22,16 +22,16 @@ from driftfit.trackers.base import RandomWalk
 
 @lru_cache
 def attentive(steps: TrackerSteps) -> TrackerSteps:
-    """Steps that store the factor of the noise variance when the tracker runs, and what the tracker notes itself.
+    """Steps that store the factor of the noise variance when the tracker runs, and the tracker's ``smoother_fields``.
 
     A model may make it larger than the factor that the user gave (measurement noise that enters through a curve).
     """
-    predict, begin, note = steps.predict, steps.begin, steps.note
+    predict, begin, store = steps.predict, steps.begin, steps.store_for_smoother
 
     @kernel
     def collect_all(o: State, s: State, l: int) -> None:
         collect(o, s, l)
-        note(o, s, l)
+        store(o, s, l)
         o.used_noise[l] = s.used_noise[l]
 
     @kernel
@@ -58,7 +58,7 @@ def replay(run: Track) -> Array:
     """
     program = run.program
     tile = program.tile()
-    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.noted)))
+    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.smoother_fields)))
     program.drivers(steps=attentive(program.steps)).run(tile, *lanes_of(run.record), out)
     return out
 
@@ -69,23 +69,24 @@ def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:
     ``prior`` replaces the random walk that the tracker assumes.
     """
     own, tracker = prior is None, run.tracker
-    each = run.known.more if own and run.known.more.size else NONE
+    drift_root = run.known.extra if own and run.known.extra.size else NONE
     if prior is None:
-        prior = free(run.model.n) if tracker.noted else tracker.random_walk(run.model)
+        prior = free(run.model.n) if tracker.smoother_fields else tracker.random_walk(run.model)
     seen = replay(run)
     dt, ok = seen["dt"][:, 0], seen["ok"][:, 0] > 0.0
     weight = np.divide(1.0, seen["used_noise"][:, 0], out=np.zeros(len(ok)), where=ok)
     drift = dt * run.known.drift
-    if own and tracker.noted:
-        noted = {name: seen[name][..., 0] for name in tracker.noted}
-        q, r_of = tracker.varying(run.model, noted, seen["e"][:, 0], drift)
-        each, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
+    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
+    if own and tracker.smoother_fields:
+        fields = {name: seen[name][..., 0] for name in tracker.smoother_fields}
+        q, r_of = tracker.estimated_variances(run.model, fields, seen["e"][:, 0], drift)
+        phi, y = tracker.regression(fields, phi, y)
+        drift_root, weight, time, drift = np.sqrt(q), weight / r_of, drift, np.ones(len(drift))
     trend = dt if prior.slopes else NONE
     if prior.at_first_sample or prior.p0 is None:
         first = int(np.argmax(dt > 0.0)) + 1
         drift[:first], trend[:first] = 0.0, 0.0
     r = 1.0 if prior.r is None else prior.r
     p0 = None if prior.p0 is None else prior.p0 / r
-    phi, y = np.ascontiguousarray(seen["phi"][..., 0]), seen["y"][:, 0].copy()
-    walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, each, trend)
-    return average_drift(walk, time) if own and tracker.noted else walk
+    walk = Walk(phi, y, weight, drift, prior.q / r, prior.theta0, p0, prior.r, drift_root, trend)
+    return average_drift(walk, time) if own and tracker.smoother_fields else walk

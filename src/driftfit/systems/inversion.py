@@ -84,7 +84,7 @@ def _check_rising(basis: Basis, d: Array, low: Array, high: Array, first: int) -
         where = points[t, bad[t]]
         raise NotMonotoneError(
             f"sample {first + t}: the output block does not increase between y = {where.min():g} and {where.max():g} "
-            f"(d = {np.array2string(d[t], precision=4)}), so y cannot be told from w."
+            f"(d = {np.array2string(d[t], precision=4)}), so y cannot be recovered from w."
         )
 
 

@@ -7,12 +7,13 @@ are 1 for one half of the filters; for the others they are learned from the reco
 (`driftfit.trackers.parts.modes.weights`), so that parameters may drift at different rates. The filters are the modes of
 a Markov chain and interact (`driftfit.trackers.parts.modes.ladder`).
 
-The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.noise_levels`). For each filter
-the levels are merged at once, which is a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings out of all
-proportion are left out (`driftfit.trackers.parts.outlying_readings`), and r is not below what coarse readings allow
-(`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap of the parameters
-(`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its last value are left
-out too (`driftfit.trackers.parts.frozen`).
+The noise variance has J levels f_j r, the last an outlier's (`driftfit.trackers.parts.modes.noise_levels`). For each
+filter the levels are merged at once, by a rank-one update (`driftfit.trackers.parts.modes.filters`). Readings far
+outside the usual range are left out (`driftfit.trackers.parts.outlying_readings`), and r is never below the variance
+due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
+of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
+last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
+additional regressor (`driftfit.trackers.parts.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -42,7 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coloured import learn_colour, white, whiten_noise
+from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -65,9 +66,9 @@ from driftfit.trackers.parts.modes.filters import (
     weigh,
 )
 from driftfit.trackers.parts.modes.ladder import filters, mix
-from driftfit.trackers.parts.modes.smoother import NOTED, note, varying
+from driftfit.trackers.parts.modes.noise_levels import any_level, finest, learn_noise, noise_prior
+from driftfit.trackers.parts.modes.smoother import SMOOTHER_FIELDS, estimated_variances, store_for_smoother
 from driftfit.trackers.parts.modes.weights import learn_weights, machine_weights, no_weights
-from driftfit.trackers.parts.noise_levels import any_level, finest, learn_noise, noise_prior
 from driftfit.trackers.parts.outlying_readings import (
     bound_leverage,
     learn_proportion,
@@ -76,22 +77,12 @@ from driftfit.trackers.parts.outlying_readings import (
     proportion,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+from driftfit.trackers.rls import learn_scale
 
 RESIDUALS = 4
 """Number of residuals before the filters start."""
 LOG_RATIOS = (-math.log(math.pi), -1.5 * math.log(2.0), math.log(2.0 / (math.pi * math.sqrt(3.0))))
 """log(gamma((nu + 1) / 2) / gamma(nu / 2) / sqrt(pi nu)) of Student's density, for nu = 1, 2, 3."""
-
-
-@kernel
-def learn_start(s: State, l: int) -> None:
-    """Count a residual of the least squares that the start runs; s.s and s.scale come in units of y."""
-    counted = s.ok[l] * s.fresh[l]
-    s.squares[l] += counted * s.e[l] * s.e[l] / s.s[l]
-    s.count[l] += counted
-    s.s[l] *= s.scale[l]
-    scale = s.squares[l] / s.count[l]
-    s.scale[l] = s.coarse[l] if s.coarse[l] > scale else scale  # NaN is kept
 
 
 @kernel
@@ -175,8 +166,9 @@ def report(s: State, l: int) -> None:
 
 @kernel
 def begin(s: State, l: int) -> None:
-    """Least squares until the filters start; then, while there are directions that nothing is known of, those there
-    are."""
+    """Least squares until the filters start; afterwards the running filters, while there are directions without
+    information.
+    """
     if s.settled[l] > 0:
         predict(s, l)
         whiten_noise(s, l)
@@ -197,7 +189,7 @@ def begin(s: State, l: int) -> None:
         s.noise[l] = noise
         if s.s[l] < np.inf:
             residuals = s.count[l]
-            learn_start(s, l)
+            learn_scale(s, l)
             s.density[l] = start_density(s.e[l], s.s[l], residuals)
         spanned_variance(s, l)
         settle(s, l)
@@ -216,7 +208,7 @@ class AdaptiveKalman(Tracker):
     ----------
     groups : sequence of sequences of indices, or None
         Parameters that drift together, such as ``[[0, 1], [2]]``: each group has filters in which it alone drifts.
-        None: only what is learned from the record.
+        None: only quantities that are learned from the record.
 
     Raises
     ------
@@ -229,7 +221,7 @@ class AdaptiveKalman(Tracker):
     width: ClassVar[int] = 1
     outputs: ClassVar[tuple[str, ...]] = ("density",)
     density: ClassVar[str] = "density"
-    noted: ClassVar[tuple[str, ...]] = NOTED
+    smoother_fields: ClassVar[tuple[str, ...]] = SMOOTHER_FIELDS
     adapts: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = (
         *SCRATCH, "gain", "e_k", "step", "h", "inverse", "joint", "mu_next", "share", "row", "m_next",
@@ -283,11 +275,24 @@ class AdaptiveKalman(Tracker):
     @property
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
-            predict, correct, report, begin, keep_density, note=note, machines=(*FRAME, machine_weights), doubts=True
+            predict,
+            correct,
+            report,
+            begin,
+            keep_density,
+            store_for_smoother=store_for_smoother,
+            machines=(*FRAME, machine_weights),
+            doubts=True,
         )
 
-    def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
-        return varying(noted, e, time, self.state(model.n))
+    def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        running = fields["settled"] > 0
+        return np.where(running[:, None], fields["white"], phi), np.where(running, y - fields["explained"], y)
+
+    def estimated_variances(
+        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
+    ) -> tuple[Array, Array]:
+        return estimated_variances(fields, e, time, self.state(model.n))
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         if lane["settled"]:
@@ -317,7 +322,7 @@ class AdaptiveKalman(Tracker):
             )
         if lately.any():
             said.append(("Not learned now", f"{', '.join(names[lately])}: not excited by the last regressors"))
-        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane))
+        return (*said, *proportion(lane), *held_readings(lane), *resolution(lane), *colour(lane))
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
         never = np.isinf(lane["var"])

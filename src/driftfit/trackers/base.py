@@ -50,11 +50,13 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
+    replaces: ClassVar[tuple[str, ...]] = ()
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
-    noted: ClassVar[tuple[str, ...]] = ()
-    """Fields of the record that `varying` needs of every sample; ``steps.note`` stores them when a run is replayed."""
-    drift_each: ClassVar[bool] = False
+    smoother_fields: ClassVar[tuple[str, ...]] = ()
+    """Fields that `estimated_variances` needs from every sample; ``steps.store_for_smoother`` stores them."""
+    drift_per_parameter: ClassVar[bool] = False
     """Whether every parameter may have its own drift at every sample (`driftfit.trackers.parts.varying_drift`)."""
     adapts: ClassVar[bool] = False
     """Whether it estimates drift and noise on-line, so that its innovations are normal again soon after a fault."""
@@ -63,8 +65,8 @@ class Tracker(Settings, ABC):
     of the forecast, Gaussian or Student's.
     """
     learns_noise: ClassVar[bool] = False
-    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before: their
-    number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
+    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
     """
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""
@@ -118,16 +120,23 @@ class Tracker(Settings, ABC):
             "track with FLS or Kalman."
         )
 
-    def varying(self, model: Model, noted: Mapping[str, Array], e: Array, time: Array) -> tuple[Array, Array]:
+    def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:
+        """phi (T, n) and y (T,) as the tracker used them; ``fields`` as in `estimated_variances`."""
+        return phi, y
+
+    def estimated_variances(
+        self, model: Model, fields: Mapping[str, Array], e: Array, time: Array
+    ) -> tuple[Array, Array]:
         """Variances of the drift before each sample (T, n), and of its noise (T,), if the tracker estimates them.
 
-        ``noted`` (T, ..) are the fields that ``noted`` names, e (T,) the innovations, time (T,) the intervals of drift.
+        ``fields`` (T, ..) are those that ``smoother_fields`` names, e (T,) the innovations, time (T,) the intervals of
+        drift.
         """
         raise NotImplementedError
 
-    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
-        """Further columns (T, k) of known factors at every sample, for ``steps.told``."""
-        if prob is None and drift is not None and self.drift_each:
+    def extra_columns(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
+        """Known factors of every sample after interval, noise and drift, (T, k), which ``steps.read_extra`` reads."""
+        if prob is None and drift is not None and self.drift_per_parameter:
             return roots(type(self).__name__, self.names_for(model), T, drift)
         given = "prob" if prob is not None else f"drift of shape {np.shape(drift)}"
         raise ValueError(
@@ -135,12 +144,12 @@ class Tracker(Settings, ABC):
             "drift for each change are for a Bank, a drift for each parameter is for FLS and Kalman."
         )
 
-    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+    def set_extra(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         """Set the known factors of the next sample of a stream; None is the default."""
         if prob is None and drift is None:
-            lane["each"][:] = 1.0
+            lane["drift_root"][:] = 1.0
         else:
-            lane["each"][:] = self.beside(model, 1, prob, np.asarray(drift)[None])[0]
+            lane["drift_root"][:] = self.extra_columns(model, 1, prob, np.asarray(drift)[None])[0]
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         """Add variances p (n,), in squared units of theta, to the covariance in the fields of one lane.
@@ -183,7 +192,7 @@ class Tracker(Settings, ABC):
         return ()
 
     def unlearned(self, lane: Mapping[str, Array]) -> Array:
-        """Which entries of theta a record should have told by now and has not, (n,) bool: `track` warns of them."""
+        """Which entries of theta the data should have determined by now but have not, (n,) bool: `track` warns."""
         return np.zeros(len(lane["theta"]), bool)
 
     def learning(self, lane: Mapping[str, Array]) -> Array:

@@ -50,7 +50,7 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import correct, learn_scale, no_scale
 
 
@@ -59,7 +59,7 @@ def drift(s: State, l: int) -> None:
     """Between samples only, because the prior refers to the first sample."""
     time = s.dt[l] * s.drift[l] * s.begun[l]
     for i in range(s.theta.shape[0]):
-        s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
+        s.P[i, i, l] += s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * time
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
 
 
@@ -123,7 +123,7 @@ class FLS(Tracker):
     required: ClassVar[tuple[str, ...]] = ("mu",)
     learns_noise: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
-    drift_each: ClassVar[bool] = True
+    drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.mu is not None:
@@ -147,7 +147,7 @@ class FLS(Tracker):
             "G": np.diag(np.sqrt(1.0 / mu)),
             "r": 1.0,
             "g": np.zeros(n),
-            "each": np.ones(n),
+            "drift_root": np.ones(n),
             "begun": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
@@ -176,4 +176,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)

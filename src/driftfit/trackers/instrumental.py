@@ -12,7 +12,7 @@ covariance of theta in units of the noise variance, which is estimated as in `RL
 
 In an ARX model the noise of an output is in the regressors of the next samples. If it is coloured, it is correlated
 with them, and least squares is biased however long the record. Instruments are correlated with the regressors, but not
-with the noise: the inputs themselves, and in the place of past outputs those of an auxiliary model
+with the noise: the inputs themselves, and the outputs of an auxiliary model instead of past outputs
 
     x_t = zeta_t' a_t,  |x_t| <= the largest output so far;   a_{t+1} = a_t + 0.05 (theta_t - a_t)
     zeta_t = [x_{t-1} .. x_{t-na}, the other regressors]
@@ -62,7 +62,7 @@ from driftfit.trackers.parts.resolution import resolution, resolve
 from driftfit.trackers.rls import fade, learn_scale, no_scale
 
 FOLLOWING = 0.05
-"""Share of the distance to theta that the auxiliary model goes at a sample: twenty samples behind."""
+"""Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
 
 LEAST_SQUARES = 10.0
 """Samples for each parameter, at the start, that are used as in least squares."""

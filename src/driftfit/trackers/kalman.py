@@ -45,14 +45,14 @@ from driftfit.trackers.parts.diffuse import (
     spanned_variance,
 )
 from driftfit.trackers.parts.information import triangular_root
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 
 
 @kernel
 def drift(s: State, l: int) -> None:
     time = s.dt[l] * s.drift[l]
     for i in range(s.theta.shape[0]):
-        s.P[i, i, l] += s.q[i, l] * (s.each[i, l] * s.each[i, l]) * time
+        s.P[i, i, l] += s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * time
 
 
 @kernel
@@ -60,7 +60,7 @@ def drift_matrix(s: State, l: int) -> None:
     time = s.dt[l] * s.drift[l]
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
-            s.P[i, j, l] += s.q[i, j, l] * (s.each[i, l] * s.each[j, l]) * time
+            s.P[i, j, l] += s.q[i, j, l] * (s.drift_root[i, l] * s.drift_root[j, l]) * time
 
 
 @kernel
@@ -70,8 +70,8 @@ def begin(s: State, l: int) -> None:
     spanned_variance(s, l)
 
 
-INDEPENDENT = TrackerSteps(drift, measurement, diagonal, begin, told=told, machines=MACHINES)
-TOGETHER = TrackerSteps(drift_matrix, measurement, diagonal, begin, told=told, machines=MACHINES)
+INDEPENDENT = TrackerSteps(drift, measurement, diagonal, begin, read_extra=read_drift, machines=MACHINES)
+TOGETHER = TrackerSteps(drift_matrix, measurement, diagonal, begin, read_extra=read_drift, machines=MACHINES)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Kalman(Tracker):
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
-    drift_each: ClassVar[bool] = True
+    drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.q is not None:
@@ -132,7 +132,7 @@ class Kalman(Tracker):
             "q": matrix("Kalman", "q", self.q, n) if together else vector("Kalman", "q", self.q, n),
             "r": self.r,
             "g": np.zeros(n),
-            "each": np.ones(n),
+            "drift_root": np.ones(n),
             "G": triangular_root(matrix("Kalman", "q", self.q, n)),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
             **(self._root(n) if self.form == "sqrt" else {}),

@@ -17,14 +17,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from driftfit.data.arguments import check_role
-from driftfit.data.record import Reading
+from driftfit.data.record import Reading, Record
 from driftfit.engine.kernel import Array
+from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
-from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
+from driftfit.run.program import Program
+from driftfit.run.result import Track, track_record
 from driftfit.run.track import track
 from driftfit.show.parts.axes import BLUE, GREY, RED, panels
-from driftfit.smooth.shared_theta import SmoothedShared
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.fls import FLS
 
@@ -46,7 +47,7 @@ class Frontier(NamedTuple):
 
 def frontier(
     model: Model, y: Any, u: Any = None, *, mu: Any = None, differences: int = 1, data: Any = None, **known: Any
-) -> Frontier:
+) -> Frontier | ByOutput[Frontier]:
     """The two costs of the smoothed path for every mu.
 
     Parameters
@@ -59,40 +60,50 @@ def frontier(
     differences : 1 or 2
         As for `FLS`.
 
+    Returns
+    -------
+    Frontier. A model with several outputs gives one for each, by name (if they share one theta, one for all).
+
     Raises
     ------
     ValueError
         If a mu is not positive, and for everything that `track` does not accept.
     """
     check_role("frontier", "model", model, Model)
-    if len(model.outputs) > 1 and not model.shared:
-        raise ValueError("frontier: takes one output at a time: use run[name], and frontier(run[name].model, .y, .u).")
     reading = Reading(**known)
+    if len(model.outputs) > 1:
+        runs = constant_outputs(model, y, u, reading, data)
+        found = {name: _of(run.model, run.record, mu, differences) for name, (run,) in runs.items()}
+        return found["rows"] if model.shared else ByOutput(found)
+    run = track(model, FLS(1.0), y, u, reading, data=data)
+    assert isinstance(run, Track)
+    return _of(run.model, run.record, mu, differences)
+
+
+def _of(model: Model, record: Record, mu: Any, differences: int) -> Frontier:
+    """The frontier of one record."""
     if mu is None:
-        steady = _path(model, FLS(1.0), y, u, reading, data)
-        used = steady.walk.weight > 0.0
-        power = float(np.mean(np.sum(steady.walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
+        walk = _path(model, FLS(1.0), record).walk
+        used = walk.weight > 0.0
+        power = float(np.mean(np.sum(walk.phi[used] ** 2, axis=1))) if used.any() else 1.0
         mu = power * np.logspace(-4.0, 5.0 * differences, 17 + 20 * differences)
     weights = np.sort(np.atleast_1d(np.asarray(mu, dtype=float)))
-    paths = [_path(model, FLS(float(m), differences=differences), y, u, reading, data) for m in weights]
+    paths = [_path(model, FLS(float(m), differences=differences), record) for m in weights]
     return Frontier(weights, np.array([p.measurement_cost for p in paths]), np.array([_movement(p) for p in paths]))
 
 
-def _path(model: Model, tracker: FLS, y: Any, u: Any, reading: Reading, data: Any) -> Smoothed:
+def _path(model: Model, tracker: FLS, record: Record) -> Smoothed:
     """The smoothed path of a record."""
-    run = track(model, tracker, y, u, reading, data=data)
-    if isinstance(run, Shared):
-        return SmoothedShared.of_shared(run)
-    assert isinstance(run, Track)
-    return Smoothed.of(run)
+    return Smoothed.of(track_record(Program(model, tracker), record))
 
 
 def _movement(path: Smoothed) -> float:
     """r_D^2 from the path itself, because the difference of J and r_M^2 has no accurate digits for large mu."""
-    path = path.rows if isinstance(path, SmoothedShared) else path
     walk = path.walk
     steps = np.diff(path.slope if len(walk.trend) else path.theta, axis=0) ** 2
-    factors = np.broadcast_to(walk.drift[1:, None] * (walk.each[1:] ** 2 if len(walk.each) else 1.0), steps.shape)
+    factors = np.broadcast_to(
+        walk.drift[1:, None] * (walk.drift_root[1:] ** 2 if len(walk.drift_root) else 1.0), steps.shape
+    )
     return float(np.sum(np.divide(steps, factors, out=np.zeros_like(steps), where=factors > 0.0)))
 
 

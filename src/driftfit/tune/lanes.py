@@ -34,7 +34,7 @@ BLOCK = 1024
 
 
 class Task(NamedTuple):
-    """What settings are scored on: a bound model and checked records, each of which begins with an unknown theta."""
+    """The task on which settings are scored: a bound model and checked records; theta is unknown at each start."""
 
     model: Model
     records: tuple[Record, ...]

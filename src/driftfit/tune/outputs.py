@@ -7,51 +7,23 @@ whose predictions also fill missing lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Console, ConsoleOptions, RenderResult
-from rich.text import Text
-
 from driftfit.data.record import Reading
+from driftfit.judge.constant_fit import constant_outputs
 from driftfit.models.base import Model
-from driftfit.run.fleet import Fleet
-from driftfit.run.outputs import Outputs
-from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
-from driftfit.run.track import track
-from driftfit.show.parts.text import Printed
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.kalman import Kalman
 from driftfit.tune.lanes import Task
 from driftfit.tune.tuned import Tuned
 
-STILL = Kalman(q=0.0, r=1.0)
-"""Constant parameters with a diffuse start."""
 
-
-class TunedOutputs(Mapping[str, Tuned], Printed):
+class TunedOutputs(ByOutput[Tuned]):
     """The result of `tune` for a model with several outputs: one `driftfit.tune.tuned.Tuned` for each."""
-
-    def __init__(self, each: Mapping[str, Tuned]) -> None:
-        self._each = dict(each)
-
-    def __getitem__(self, output: str) -> Tuned:
-        return self._each[output]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._each)
-
-    def __len__(self) -> int:
-        return len(self._each)
 
     def __repr__(self) -> str:
         return f"TunedOutputs({', '.join(f'{name}: {one.tracker!r}' for name, one in self.items())})"
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        for place, (name, one) in enumerate(self.items()):
-            yield Text(f"\n{name}" if place else name, "bold")
-            yield one
 
     @property
     def tracker(self) -> dict[str, Tracker]:
@@ -76,18 +48,6 @@ def tune_outputs(
     """Tune every output with ``one(task)``, or the rows of a shared theta at once."""
     if not isinstance(tracker, Tracker):
         raise ValueError(f"tune: several outputs are tuned for one kind of tracker; got {tracker!r}.")
-    run = track(model, STILL, y, u, Reading(**known), data=data, by=by)
-    if isinstance(run, Shared):
-        return one(Task(run.rows.model, (run.rows.record,)))
-    if model.shared:
-        assert isinstance(run, Fleet)
-        return one(_together(list(run.values())))
-    assert isinstance(run, Outputs | Fleet)
-    lanes = list(run.values())
-    names = run.outputs if isinstance(run, Outputs) else run.records.outputs
-    return TunedOutputs({name: one(_together(lanes[k :: len(names)])) for k, name in enumerate(names)})
-
-
-def _together(runs: Sequence[Track]) -> Task:
-    """The records of some runs with one model."""
-    return Task(runs[0].model, tuple(run.record for run in runs))
+    runs = constant_outputs(model, y, u, Reading(**known), data, by)
+    tuned = {name: one(Task(some[0].model, tuple(run.record for run in some))) for name, some in runs.items()}
+    return tuned["rows"] if model.shared else TunedOutputs(tuned)

@@ -1,4 +1,4 @@
-"""What tuning found: settings, their intervals, and everything that was tried."""
+"""The result of tuning: settings, their intervals, and everything that was tried."""
 
 from __future__ import annotations
 
@@ -33,25 +33,14 @@ METHODS = {
 class Tuned(Printed):
     """The result of `tune`; printing it shows the estimates with their intervals.
 
-    Attributes
-    ----------
-    tracker : Tracker
-        The tracker with all its settings, ready for `track` and `Live`.
-    method : str
-        The criterion.
-    loglik : float
-        Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers without a variance. For trackers
-        that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which knew less at the start.
-    noise : float
-        Estimated noise variance; unreliable if ``at_bound`` is not empty.
-    at_bound : tuple of str
-        Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
-    interval : dict of (low, high)
-        By name of setting, the interval of the likelihood at ``level``: from profiles (for "q[..]/r", "mu",
-        "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated together). NaN for
-        other methods.
-    level : float
-        The level of the intervals.
+    Attributes ---------- tracker : Tracker The tracker with all its settings, ready for `track` and `Live`. method :
+    str The criterion. loglik : float Log-likelihood of the record under ``tracker`` and ``noise``; NaN for trackers
+    without a variance. For trackers that estimate their scale on-line (`RLS`, `FLS`) it is above that of a run, which
+    had less information at the start. noise : float Estimated noise variance; unreliable if ``at_bound`` is not empty.
+    at_bound : tuple of str Settings that ended at a bound of the search, or at zero; empty if the optimum is inside.
+    interval : dict of (low, high) By name of setting, the interval of the likelihood at ``level``: from profiles (for
+    "q[..]/r", "mu", "forgetting" and a single "q" or "r"), or from the curvature (for "q[..]" and "r" estimated
+    together). NaN for other methods. level : float The level of the intervals.
     """
 
     tracker: Tracker

@@ -35,7 +35,7 @@ import scipy
 from driftfit.data.clock import Clock
 from driftfit.data.labels import inputs_for
 from driftfit.data.record import time_text
-from driftfit.engine.drivers import one_or_all
+from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
 from driftfit.run.program import state_of
@@ -55,7 +55,7 @@ class Crossing:
     Attributes
     ----------
     name, limit, side
-        What crosses which limit, and whether it is then "below" or "above" it.
+        Which quantity crosses which limit, and whether it is then "below" or "above" it.
     probability : float
         Probability that it crosses within ``horizon`` samples.
     median, low, high : float
@@ -185,7 +185,7 @@ def _covariances(run: Track) -> tuple[Array, Array]:
     lane = state_of(tile)
     update = run.program.drivers().updater(tile, run.model.m)
     now = run.tracker.cov(lane).copy()
-    update(tile, np.nan, one_or_all(np.full(run.model.m, np.nan)))
+    update(as_compiled(tile), np.nan, one_or_all(np.full(run.model.m, np.nan)))
     with np.errstate(invalid="ignore"):
         return now, run.tracker.cov(lane) - now
 

@@ -46,7 +46,7 @@ def simulate_by_draws(run: Track, u: Array, at: int, given: Array) -> Prediction
 
     noise = np.sqrt(r) * np.random.default_rng(1).normal(size=(DRAWS + 1, h - known))
     smooth, noisy = played(np.zeros_like(noise)), played(noise)
-    return _told(smooth[0], smooth[1:], noisy[1:], run.tracker.covariance)
+    return _prediction_of(smooth[0], smooth[1:], noisy[1:], run.tracker.covariance)
 
 
 def ahead_by_draws(run: Track, k: int) -> Prediction:
@@ -76,7 +76,7 @@ def _ahead(run: Track, at: Array, past: Array, inputs: Array, cov: Array, r: Arr
     mean = systems(run, run.theta[at])
     hat = _played(run, mean, past[at], inputs[at], np.zeros((count, k)), (low, high))[:, -1]
     if not run.tracker.covariance:
-        return _told(hat, None, None, False)
+        return _prediction_of(hat, None, None, False)
     theta = systems(run, drawn(run.theta[at], cov[at], DRAWS, 0).reshape(DRAWS * count, -1))
     rows = np.tile(np.arange(count), DRAWS)
     noise = np.sqrt(r[at])[rows, None] * np.random.default_rng(1).normal(size=(DRAWS * count, k))
@@ -86,7 +86,7 @@ def _ahead(run: Track, at: Array, past: Array, inputs: Array, cov: Array, r: Arr
         before, given, span = past[at[row]], inputs[at[row]], (low[row], high[row])
         smooth[part] = _played(run, theta[part], before, given, np.zeros((len(part), k)), span)[:, -1]
         noisy[part] = _played(run, theta[part], before, given, noise[part], span)[:, -1]
-    return _told(hat, smooth.reshape(DRAWS, count), noisy.reshape(DRAWS, count), True)
+    return _prediction_of(hat, smooth.reshape(DRAWS, count), noisy.reshape(DRAWS, count), True)
 
 
 def _played(run: Track, theta: Array, y: Array, u: Array, noise: Array, span: Span) -> Array:
@@ -132,7 +132,7 @@ def _spans(run: Track) -> tuple[Array, Array]:
     return np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
 
 
-def _told(hat: Array, smooth: Array | None, noisy: Array | None, covariance: bool) -> Prediction:
+def _prediction_of(hat: Array, smooth: Array | None, noisy: Array | None, covariance: bool) -> Prediction:
     """Mean and spreads over draws (D, h)."""
     if not covariance or smooth is None or noisy is None:
         unknown = np.full(len(hat), np.nan)

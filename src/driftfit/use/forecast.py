@@ -26,7 +26,7 @@ import numpy as np
 
 from driftfit.data.labels import inputs_for
 from driftfit.engine.arrays import as_numbers
-from driftfit.engine.drivers import one_or_all
+from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
@@ -72,7 +72,7 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
 
 
 def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
-    """`forecast` from where a stream stands; while `apply` is outstanding the first row of u is what that brings."""
+    """`forecast` from the present state of a stream; while `apply` is outstanding, the first row of u is its input."""
     return forecast_from(live.program, *live.driven_on(future(live.model, h, u)))
 
 
@@ -96,10 +96,10 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     result = Forecast(np.empty((h, len(now))), np.empty((h, len(now))), np.empty(h), np.empty(h))
     for k in range(h):
         look[...] = tile
-        y_hat, _, s, _ = update(look, np.nan, one_or_all(inputs[k]))
+        y_hat, _, s, _ = update(as_compiled(look), np.nan, one_or_all(inputs[k]))
         # the forecast takes the place of the output among the lags, and is not an observation
         tile["noise"] = np.inf
-        update(tile, y_hat, one_or_all(inputs[k]))
+        update(as_compiled(tile), y_hat, one_or_all(inputs[k]))
         tile["noise"] = 1.0
         result.theta[k], result.std[k] = tile["theta"][0, :, 0], np.sqrt(tile["var"][0, :, 0])
         result.y_hat[k], result.y_std[k] = y_hat, s

@@ -1,4 +1,4 @@
-"""Predictions over a record: what they say of their errors, and what they are made of."""
+"""Predictions over a record: their errors, and their parts."""
 
 from __future__ import annotations
 

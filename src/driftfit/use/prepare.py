@@ -1,4 +1,4 @@
-"""Preparation: small functions that record what they did, so that results can be converted back to the user's units.
+"""Preparation: small functions that record their operations, so that results can be converted back to the user's units.
 
     flow = prepare.scale(prepare.remove_level(flow_raw, first=200), first=200)
     valve = prepare.scale(valve_raw, first=200)
@@ -35,7 +35,7 @@ from driftfit.run.result import Track
 class Prepared:
     """A prepared signal: raw_t = factor * value_t + offset_t.
 
-    `track` takes it like an array of its ``values`` (T,). ``notes`` lists what was done, in order.
+    `track` takes it like an array of its ``values`` (T,). ``notes`` lists the operations, in order.
     """
 
     values: Array
@@ -268,8 +268,8 @@ class Restored:
     """A run in the units of the raw signals.
 
     ``theta``, ``std`` (T, n); ``prediction``, ``innovation``, ``innovation_std`` (T,); theta was multiplied by
-    ``factors`` (n,). The intercept of a model refers to the level that was removed. ``notes`` lists for every signal
-    what was done to it.
+    ``factors`` (n,). The intercept of a model refers to the level that was removed. ``notes`` lists the operations on
+    every signal.
     """
 
     names: tuple[str, ...]

@@ -2,7 +2,7 @@
 
     y_k = phi_k' a / g_k + v_k,      g_k = 1 + psi_k' b
 
-with phi and psi functions of what was known before y_k. Multiplied by g it is linear in (a, b),
+with phi and psi functions of the data before y_k. Multiplied by g it is linear in (a, b),
 
     y_k = x_k' (a, b) + g_k v_k,     x_k = (phi_k, -y_k psi_k)
 

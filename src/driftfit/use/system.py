@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class Followed(Protocol):
-    """What has parameters over time: a `Track`, or the present of a stream (`driftfit.use.live_system`)."""
+    """Objects with parameters over time: a `Track`, or the present of a stream (`driftfit.use.live_system`)."""
 
     @property
     def names(self) -> tuple[str, ...]: ...

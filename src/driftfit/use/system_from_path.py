@@ -14,8 +14,8 @@ The constants of an exponential autoregression are fitted to y, never to the pat
 end up in r. Cost: one or a few least-squares fits.
 
 Source: the model classes of Chen et al., "augmented flexible least squares for time-varying parameter systems", section
-2; variable projection of Golub and Pereyra (1973). Departures: the lag of the exponent is explicit; what cannot be
-identified is not returned.
+2; variable projection of Golub and Pereyra (1973). Departures: the lag of the exponent is explicit; parameters that
+cannot be identified are not returned.
 """
 
 from __future__ import annotations

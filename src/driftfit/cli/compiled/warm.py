@@ -12,7 +12,7 @@ from driftfit.cli.compiled.cache import stored
 from driftfit.cli.parts.arguments import parse_model, parse_tracker
 from driftfit.cli.parts.program import app, helpful, progress, say
 from driftfit.engine.disk_cache import contents, folder
-from driftfit.run.lanes import FEWEST
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.show.parts.text import facts
 
 SAMPLES = 300
@@ -30,7 +30,7 @@ def warm(
     inputs: Annotated[int, typer.Option(help="Number of inputs of the record.")] = 1,
     fleet: Annotated[bool, typer.Option("--fleet", help="Compile for fleets as well.")] = False,
 ) -> None:
-    """Compile what models and a tracker need (record, stream, summary, verdict), and store it on disk for later."""
+    """Compile everything that models and a tracker need (record, stream, summary, verdict), and store it on disk."""
     from driftfit.streams import Live
     from driftfit.tracking import track
 

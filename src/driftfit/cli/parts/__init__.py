@@ -1,1 +1,1 @@
-"""What several commands share: parsing arguments, reading data, reporting errors."""
+"""Parts that several commands share: parsing arguments, reading data, reporting errors."""

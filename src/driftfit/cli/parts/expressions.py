@@ -24,7 +24,7 @@ CONSTRUCTORS = {("Sensor", "nominal")}
 def read(text: str, kind: type[Kind], main: Mapping[str, type[Any]]) -> Kind:
     """The model or tracker that a text describes; ``main`` are the classes that it may begin with.
 
-    ValueError says what is wrong.
+    ValueError with the reason if it is wrong.
     """
     found = _call(text, main)
     if not isinstance(found, kind):

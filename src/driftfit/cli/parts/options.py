@@ -132,7 +132,7 @@ class Given:
         return rows_of(self.file, [*self.outputs, *self.inputs, *more], self.time, self.by or [], self.part())
 
     def run(self, rows: Rows | None = None, tracker: Tracker | None = None) -> Any:
-        """Run what the options describe: a Track, an Outputs or a fleet."""
+        """Run the configuration that the options describe: a Track, an Outputs or a fleet."""
         from driftfit.tracking import track
 
         model, chosen, before = self._begun()

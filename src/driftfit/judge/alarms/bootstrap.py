@@ -1,10 +1,10 @@
 """Limits of the "glr" and "cusum" alarms by a bootstrap of the reference.
 
 Every simulated record has its own reference. The residuals x of the reference are drawn in blocks, with random signs
-(sums of fitted residuals as they are vary too little), they get the variances h of the model, and scale and variances
-are estimated from them again; so is the error of theta, from its covariance. A record of regressors and residuals drawn
-together follows, whose scores are those of the model that was estimated from its own reference. The limits so allow for
-everything that is estimated: a stream carries these errors for ever.
+(sums of fitted residuals in their order vary too little), they get the variances h of the model, and scale and
+variances are estimated from them again; so is the error of theta, from its covariance. A record of regressors and
+residuals drawn together follows, whose scores are those of the model that was estimated from its own reference. The
+limits so allow for everything that is estimated: a stream carries these errors for ever.
 
 With a deviate c as statistic the logarithm of the rate of onsets falls nearly as a straight line in c^2. A limit that
 is rarer than the simulated records can show is found along that line, which also gives the probability of an extreme.
@@ -64,9 +64,9 @@ def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> 
         levels(w, numbers, h)
         phi = rows.phi[later] / np.sqrt(h)[:, None]
         g = np.clip(w / np.sqrt(h), -numbers[CLIP], numbers[CLIP]) - numbers[K] * (phi @ (root @ z))
-        told = np.empty((T, CUSUM + n + 1))
-        scan_scores(phi, g, frozen._replace(numbers=numbers), memory_of(n, 0), told)
-        made.append((told, START))
+        findings = np.empty((T, CUSUM + n + 1))
+        scan_scores(phi, g, frozen._replace(numbers=numbers), memory_of(n, 0), findings)
+        made.append((findings, START))
     return made
 
 
@@ -95,7 +95,7 @@ def _played(frozen: Frozen, x: Array, rng: np.random.Generator) -> Array:
 
 def limits(made: Made, columns: list[int], every: float) -> tuple[Array, Array]:
     """Limits (c,) of columns for one onset in ``every`` samples, and the growth (c,) of their square with its log."""
-    parts = [(told[:, columns], start) for told, start in made]
+    parts = [(findings[:, columns], start) for findings, start in made]
     base = min(every, SAMPLES / SEEN)
     often = max(base / STEP, 10.0)
     near, nearer = limit_of(parts, base), limit_of(parts, often)

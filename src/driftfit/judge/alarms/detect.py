@@ -22,10 +22,10 @@
   inputs, its parameters at ``at``, its innovations redrawn) and tracked; onsets exceed the limit at the given rate. Any
   kind can be calibrated in this way, with ``calibrate=True``: it is slower, and does not rely on the std.
 
-What was found stands in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
+The result is in ``said.rule`` (`driftfit.run.live.rule.AlarmRule`), a small frozen object: `Live.detect`
 watches a stream by it, and ``other.detect(said.rule)`` another record.
 
-docs/alarms.md says which kind to use. A tracker that estimates its own drift mistakes a fault for drift and follows it:
+docs/alarms.md compares the kinds. A tracker that estimates its own drift mistakes a fault for drift and follows it:
 its innovations are soon normal again, so "innovation" gives an alarm, if at all, in the first samples of the fault.
 
 ``p`` is the probability that a record without a fault is as extreme as this one: from the same rates (the smallest of
@@ -50,7 +50,7 @@ from driftfit.engine.settings import numbers, one_of, whole
 from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
-from driftfit.judge.alarms.statistics import Reference, chance_of, rule_of, statistic_of, told_of
+from driftfit.judge.alarms.statistics import Reference, chance_of, findings_of, rule_of, statistic_of
 from driftfit.judge.plots import plot_alarms
 from driftfit.judge.verdict import p_text
 from driftfit.run.live.change import Change, change_of
@@ -95,8 +95,8 @@ class Alarms(Printed):
         First sample that is judged; the samples before it are the start of the run, or the reference.
     p : number
         Probability of an extreme like the largest here without a fault; NaN if nothing was judged.
-    told : (T, k)
-        For "glr" and "cusum": what `change` reads; otherwise without columns.
+    findings : (T, k)
+        For "glr" and "cusum": the numbers that `change` reads; otherwise without columns.
     """
 
     rule: AlarmRule
@@ -106,7 +106,7 @@ class Alarms(Printed):
     start: int
     p: float
     run: Track = field(repr=False, compare=False)
-    told: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False, compare=False)
+    findings: Array = field(default_factory=lambda: np.zeros((0, 0)), repr=False, compare=False)
 
     @property
     def kind(self) -> str:
@@ -135,7 +135,7 @@ class Alarms(Printed):
 
     def change(self, t: int) -> Change | None:
         """For "glr" and "cusum": what changed, by how much and since when, as known at sample t; otherwise None."""
-        return change_of(self.rule, self.told[t], t) if self.kind in FROZEN else None
+        return change_of(self.rule, self.findings[t], t) if self.kind in FROZEN else None
 
     def score(self, labels: Any) -> Score:
         """Compare with labels (T,), true where something is wrong; ValueError for another length."""
@@ -273,12 +273,12 @@ def judged(run: Track, rule: AlarmRule, start: int | None = None) -> Alarms:
     check_fits(rule, run.tracker, run.names)
     if start is None:
         start = burn(run) if run.start is None else 0
-    told = told_of(run, rule, start) if rule.kind in FROZEN else np.zeros((0, 0))
-    statistic = told[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
+    findings = findings_of(run, rule, start) if rule.kind in FROZEN else np.zeros((0, 0))
+    statistic = findings[:, rule.entries] if rule.kind in FROZEN else statistic_of(run, rule, start)
     count = int(np.isfinite(statistic[start:]).any(axis=1).sum())
     p = chance_of(run, rule)(_highest(statistic, start), count) if count else float("nan")
     active = held(rule.exceeded(statistic) & (np.arange(len(run)) >= start), rule.hold)
-    return Alarms(rule, active, onsets(active), statistic, start, p, run, told)
+    return Alarms(rule, active, onsets(active), statistic, start, p, run, findings)
 
 
 def _highest(statistic: Array, start: int) -> Array:

@@ -18,7 +18,6 @@ N every samples, N times.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +28,7 @@ from rich.text import Text
 from driftfit.engine.settings import numbers
 from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.fleet_verdict import SHOWN, discoveries
+from driftfit.judge.on_all_cores import on_all_cores
 from driftfit.judge.verdict import p_text
 from driftfit.show.parts.text import Printed, facts, key_text, table_of
 
@@ -139,8 +139,6 @@ def alarms(
     runs: Mapping[Hashable, Track], kind: str, *, every: float, level: float, reference: Any, **settings: Any
 ) -> ManyAlarms:
     """Watch runs by key; ``reference`` is the same for all, or a mapping from every key to its own."""
-    from driftfit.run.lanes import cores
-
     if not runs:
         raise ValueError("detect: no series has a result to watch.")
     level = numbers("detect", "level", level, ndim=0)
@@ -161,12 +159,9 @@ def alarms(
         except ValueError as error:
             return error
 
-    keys = list(runs)
-    said = [watch(key) for key in keys[:1]]  # one thread compiles
-    with ThreadPoolExecutor(cores()) as pool:
-        said += pool.map(watch, keys[1:])
-    good = {key: one for key, one in zip(keys, said, strict=True) if isinstance(one, Alarms)}
-    failed = {key: one for key, one in zip(keys, said, strict=True) if isinstance(one, ValueError)}
+    said = on_all_cores(runs, watch, "alarms")
+    good = {key: one for key, one in said.items() if isinstance(one, Alarms)}
+    failed = {key: one for key, one in said.items() if isinstance(one, ValueError)}
     if not good:
         raise next(iter(failed.values()))
     q = discoveries(np.array([one.p for one in good.values()]))

@@ -164,13 +164,13 @@ def statistic_of(run: Track, rule: AlarmRule, start: int) -> Array:
     return _carried(statistic)
 
 
-def told_of(run: Track, rule: AlarmRule, start: int) -> Array:
-    """What the compiled routine of "glr" and "cusum" writes for every sample, (T, k), NaN before ``start``."""
+def findings_of(run: Track, rule: AlarmRule, start: int) -> Array:
+    """The findings of "glr" and "cusum" for every sample, (T, k), NaN before ``start``."""
     n, (phi, rest), model = len(rule.parameters), samples_of(run), rule.reference
-    told = np.full((len(run), CUSUM + n + 1), np.nan)
+    findings = np.full((len(run), CUSUM + n + 1), np.nan)
     rows = np.column_stack([phi, np.ones((len(run), n - phi.shape[1])), rest])
-    scan(rows[start:], model, memory_of(n, len(model.ar)), told[start:])
-    return told
+    scan(rows[start:], model, memory_of(n, len(model.ar)), findings[start:])
+    return findings
 
 
 def _carried(statistic: Array) -> Array:

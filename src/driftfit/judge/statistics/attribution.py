@@ -28,7 +28,7 @@ from driftfit.judge.statistics.robust import robust_fit
 
 MOST = 12
 ALIKE = 4.0
-"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be told apart."""
+"""Twice the logarithm of the likelihood ratio up to which steps of two parameters cannot be distinguished."""
 AROUND = 0.03
 """Share of the record on each side of the extreme point of a path in which the date of a step is searched."""
 NEAR = 0.01
@@ -109,7 +109,7 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
 
 
 def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
-    """The interval of the date of a step, by the likelihood of every date between the steps beside it."""
+    """The interval of the date of a step, by the likelihood of every date between the neighbouring steps."""
     N, n = phi.shape
     others = [other.at for other in steps if abs(other.at - step.at) > NEAR * N]
     a, b = max((at for at in others if at < step.at), default=0), min((at for at in others if at > step.at), default=N)

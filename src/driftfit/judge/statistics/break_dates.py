@@ -20,48 +20,60 @@ import numpy as np
 from driftfit.engine.kernel import Array, Driver, shared
 from driftfit.judge.statistics.robust import cholesky
 
-
-@shared
-def _row(X: Array, y: Array, ar: Array, t: int, d: int, row: Array) -> None:
-    """Whiten row t of [left, right, y] for a break at d; rows before the first are not used."""
-    n = X.shape[1]
-    row[:] = 0.0
-    for k in range(ar.shape[0] + 1):
-        a = 1.0 if k == 0 else -ar[k - 1]
-        side = 0 if t - k < d else n
-        for i in range(n):
-            row[side + i] += a * X[t - k, i]
-        row[2 * n] += a * y[t - k]
+SWEEPS = 10
 
 
 @shared
-def _add(M: Array, row: Array, sign: float) -> None:
+def whiten(X: Array, y: Array, ar: Array, t: int, breaks: Array, row: Array) -> None:
+    """Whiten row t of [x in its segment, 0 in the others, y], row (K n + 1,), for K - 1 breaks."""
+    n, k = X.shape[1], breaks.shape[0]
+    for i in range(row.shape[0]):
+        row[i] = 0.0
+    for lag in range(ar.shape[0] + 1):
+        a = 1.0 if lag == 0 else -ar[lag - 1]
+        while k > 0 and t - lag < breaks[k - 1]:
+            k -= 1
+        if a != 0.0:
+            for i in range(n):
+                row[k * n + i] += a * X[t - lag, i]
+            row[row.shape[0] - 1] += a * y[t - lag]
+
+
+@shared
+def add(M: Array, row: Array, sign: float) -> None:
+    """M + sign row row', lower triangle."""
     for i in range(row.shape[0]):
         if row[i] != 0.0:
             for j in range(i + 1):
                 M[i, j] += sign * row[i] * row[j]
 
 
-def _dates(X: Array, y: Array, ar: Array, first: Array, loglik: Array) -> None:
-    """log L of the dates first .. first + len(loglik) - 1, rows of X (N, n) from p on."""
+def _dates(X: Array, y: Array, ar: Array, dates: Array, loglik: Array, sums: Array, row: Array) -> None:
+    """log L of the dates from ``dates`` (2, 1) on, a date and the next; rows of X (N, n) from p on.
+
+    Room for two matrices that are zero and a row, (2, 2 n + 1, 2 n + 1) and (2 n + 1,): arrays that are made in
+    compiled code take seconds to compile.
+    """
     N, n, p = X.shape[0], X.shape[1], ar.shape[0]
-    M, L, row = np.zeros((2 * n + 1, 2 * n + 1)), np.zeros((2 * n + 1, 2 * n + 1)), np.zeros(2 * n + 1)
+    M, L, here, following = sums[0], sums[1], dates[0], dates[1]
     for t in range(p, N):
-        _row(X, y, ar, t, first[0], row)
-        _add(M, row, 1.0)
+        whiten(X, y, ar, t, here, row)
+        add(M, row, 1.0)
     for place in range(loglik.shape[0]):
-        d = first[0] + place
-        L[:] = M
+        for i in range(2 * n + 1):
+            for j in range(i + 1):
+                L[i, j] = M[i, j]
         rss = cholesky(L, 2 * n)
         loglik[place] = -0.5 * rss
         for i in range(2 * n):
             if L[i, i] > 0.0:
                 loglik[place] -= np.log(L[i, i])
-        for t in range(d, min(d + p + 1, N)):
-            _row(X, y, ar, t, d, row)
-            _add(M, row, -1.0)
-            _row(X, y, ar, t, d + 1, row)
-            _add(M, row, 1.0)
+        for t in range(here[0], min(here[0] + p + 1, N)):
+            whiten(X, y, ar, t, here, row)
+            add(M, row, -1.0)
+            whiten(X, y, ar, t, following, row)
+            add(M, row, 1.0)
+        here[0], following[0] = following[0], following[0] + 1
 
 
 _run = Driver(_dates)
@@ -69,8 +81,9 @@ _run = Driver(_dates)
 
 def date_loglik(X: Array, y: Array, ar: Array, first: int, last: int) -> Array:
     """log L of the dates first .. last, X (N, n) and y (N,) in units of the white noise."""
-    loglik = np.empty(last - first + 1)
-    _run(np.ascontiguousarray(X), np.ascontiguousarray(y), np.ascontiguousarray(ar), np.array([first]), loglik)
+    loglik, k = np.empty(last - first + 1), 2 * X.shape[1] + 1
+    X, y, ar = (np.ascontiguousarray(one) for one in (X, y, ar))
+    _run(X, y, ar, np.array([[first], [first + 1]]), loglik, np.zeros((2, k, k)), np.zeros(k))
     return loglik
 
 
@@ -81,3 +94,22 @@ def smallest(loglik: Array, level: float) -> tuple[int, int]:
     count = int(np.searchsorted(np.cumsum(weight[order]), level * weight.sum())) + 1
     held = order[:count]
     return int(held.min()), int(held.max())
+
+
+def dated(
+    X: Array, y: Array, ar: Array, breaks: list[int], least: int, level: float
+) -> tuple[list[int], list[tuple[int, int]]]:
+    """The most likely dates, each between its neighbours until all are stable, and intervals of ``level``."""
+    breaks, spans = list(breaks), [(b, b) for b in breaks]
+    for _ in range(SWEEPS):
+        before = list(breaks)
+        for k in range(len(breaks)):
+            a, b = ([0, *breaks][k], [*breaks, len(y)][k + 1])
+            low, high = min(max(least // 2, len(ar) + 1), (b - a) // 3), max((b - a) - least // 2, (b - a) * 2 // 3)
+            loglik = date_loglik(X[a:b], y[a:b], ar, low, high)
+            breaks[k] = a + low + int(np.argmax(loglik))
+            first, last = smallest(loglik, level)
+            spans[k] = (a + low + first, a + low + last)
+        if breaks == before:
+            break
+    return breaks, spans

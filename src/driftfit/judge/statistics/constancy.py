@@ -18,9 +18,9 @@ record. Zero drift lies on the boundary of "q >= 0", which invalidates likelihoo
 
 L averages over the record and is most powerful against slow drift. The suprema over one break and over an interval
 (`driftfit.judge.statistics.supremum`) are most powerful against a sudden or temporary change. If the scores are white
-and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild`), which also finds a break
-in the last few samples. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, so that the error
-rate is that of all together.
+and the record is long enough, a wild bootstrap joins them (`driftfit.judge.statistics.wild_bootstrap`), which finds
+a break in the last few samples too. The Cauchy combination of Liu and Xie (2020) turns them into one p-value, whose
+error rate is that of all together.
 
 The noise is estimated under the alternative (`driftfit.judge.statistics.noise`): v_s are residuals of segments, which
 are those of constants if the record is not divided. Residuals of constants would count a large change as noise, and the
@@ -50,7 +50,7 @@ from driftfit.judge.statistics.noise import HELD, Noise, noise, whitened
 from driftfit.judge.statistics.quadratic import tail
 from driftfit.judge.statistics.robust import Fit, clipped, orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import TIED, suprema, together
-from driftfit.judge.statistics.wild import wild_supremum
+from driftfit.judge.statistics.wild_bootstrap import wild_supremum
 
 POINTS = 48
 """Largest number of points of the path for the suprema and their null; the mean squares use every second point."""
@@ -119,18 +119,18 @@ def constancy(phi: Array, y: Array, lags: int | None = None) -> Constancy:
 
 def _tested(X: Array, size: Array, fit: Fit, found: Noise, lags: int | None) -> Constancy:
     N, n = X.shape
-    still, beside = fit, np.zeros((N, 0))
+    still, added = fit, np.zeros((N, 0))
     if len(found.ar):
         c = found.level[:, None]
         rows, y = whitened(X / c, found.held / found.level, found.ar)
-        beside = c * missing_lags(X / c, rows, found) if lags is None else beside
+        added = c * missing_lags(X / c, rows, found) if lags is None else added
         X, y = rows * c, y * found.level
-        still = robust_fit(np.column_stack([X, beside]), y)
-    psi = _alternative(found, still, beside)
+        still = robust_fit(np.column_stack([X, added]), y)
+    psi = _alternative(found, still, added)
     rest = min(plugged_in(X, psi), rule_of_thumb(N)) if lags is None else 0
     m = max(24, min(POINTS, ROWS // n, N // 2))
     ends = np.linspace(0, N, m + 1).astype(int)[1:]
-    whole = np.column_stack([X, beside])
+    whole = np.column_stack([X, added])
     A = _profile(whole * still.inside[:, None], whole, ends)
     V = _profile(*(2 * (_summed(whole * psi[:, None], rest),)), ends)
     if np.linalg.matrix_rank(A[-1], 1e-12, hermitian=True) < len(A[-1]) or np.linalg.matrix_rank(V[-1], 1e-12) < n:
@@ -184,8 +184,9 @@ def missing_lags(X: Array, rows: Array, found: Noise) -> Array:
     return np.asarray(np.sqrt(N) * basis[:, n:])
 
 
-def _alternative(found: Noise, still: Fit, beside: Array) -> Array:
-    """Bounded residuals of the segments, on the rows of the test, without what regressors ``beside`` explain.
+def _alternative(found: Noise, still: Fit, added: Array) -> Array:
+    """Bounded residuals of the segments, on the rows of the test, without the part that the regressors ``lags``
+    explain.
 
     Each is the residual of a fit without its row, because a short segment fits its own rows too well (MacKinnon and
     White, 1985).
@@ -197,7 +198,7 @@ def _alternative(found: Noise, still: Fit, beside: Array) -> Array:
     if len(found.ar):
         held = np.clip(v / c, -HELD, HELD)
         v = c * whitened(np.zeros((len(v), 0)), held, found.ar)[1]
-    v = v - beside @ np.linalg.lstsq(beside, v, rcond=None)[0]
+    v = v - added @ np.linalg.lstsq(added, v, rcond=None)[0]
     return clipped(still.theta, v / np.maximum(1.0 - found.leverage, 0.05), still.scale).psi
 
 

@@ -91,7 +91,8 @@ def _windows(Q: Array, y: Array, starts: Array, ends: Array, residual: Array, le
         level[w] = huber(Q[a:b], y[a:b], theta, own) * np.sqrt((b - a) / max(b - a - n, 1.0))
         first = a if w == 0 else (a + ends[w - 1]) // 2
         final = b if w == W - 1 else (starts[w + 1] + b) // 2
-        residual[first:final] = own[first - a : final - a]
+        for t in range(first, final):
+            residual[t] = own[t - a]
         for k in range(P + 1):
             r[w, k] = lagged(own, HELD * level[w], k)
 
@@ -111,7 +112,8 @@ def _segments(Q: Array, y: Array, X: Array, z: Array, bounds: Array, order: Arra
         first = min(a + order[0], b - 1)
         huber(X[first:b], z[first:b], theta[k], own[first:b])
         lever(X[first:b], leverage[first:b])
-        leverage[a:first] = 0.0
+        for t in range(a, first):
+            leverage[t] = 0.0
     for k in range(K):
         a, b = bounds[k], bounds[k + 1]
         for t in range(a, b):
@@ -167,6 +169,13 @@ def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, 
     ``cells``: largest number of positions for breaks, evenly spaced; ``least``: rows in a segment; ``order`` of the
     autoregression, None estimates it; ``quiet``: probability that constants are divided.
     """
+    return begun(Q, y, cells, least, order, quiet)[1]
+
+
+def begun(
+    Q: Array, y: Array, cells: int, least: int, order: int | None = None, quiet: float = QUIET
+) -> tuple[Search, Noise, tuple[Array, Array]]:
+    """The search of `noise`, its result, and the autoregressions that it began with: of windows, of the whole."""
     N, n = Q.shape
     spans = _spans(N, n)
     P = max(order or 0, min(ORDER, N // 20, (spans[1][0] - spans[0][0]) // 6))
@@ -175,8 +184,8 @@ def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, 
     g = np.linalg.eigvalsh(0.5 * (Q[1:].T @ Q[:-1] + Q[:-1].T @ Q[1:]) / N)
     width = int(spans[1][0] - spans[0][0])
     c = _level(spans, level, N)
-    search = _Search(Q, y, c, spans, g, P, order, np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:],
-                     least, penalty(N, n, least, quiet))  # fmt: skip
+    search = Search(Q, y, c, spans, g, P, order, np.unique(np.linspace(0, N, min(cells, N) + 1).astype(np.int64))[1:],
+                    least, penalty(N, n, least, quiet))  # fmt: skip
     r = r[r[:, 0] > 0.0]
     pacf = np.median(_partial(r, g, width), axis=0) if len(r) else np.zeros(P)
     local = _chosen(pacf, min(N, 8 * width), order)
@@ -184,10 +193,10 @@ def noise(Q: Array, y: Array, cells: int, least: int, order: int | None = None, 
     found = search.settle(local, residual, residual)
     if len(whole) or len(local):
         found = min(found, search.settle(whole, residual, y), key=lambda one: one[0])
-    return found[1]
+    return search, found[1], (local, whole)
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """The data of a search for segments; y is the residual of constants."""
 
     Q: Array
@@ -214,28 +223,25 @@ class _Search(NamedTuple):
             X, z = whitened(Q / self.c[:, None], held / self.c, ar)
             size = self.size(near, ar)
             breaks = partition(X / size, z / size, self.grid, self.price(ar), self.least, len(ar))
-            fits = np.empty((3, N))
-            z = whitened(X[:, :0], y / self.c, ar)[1]
-            bounds = np.concatenate([[0], breaks, [N]])
-            _fit_segments(Q, y, X, z, bounds, np.array([len(ar)]), fits)
-            residual, near, leverage = fits
-            ar = self.correlation(near, breaks)
-            c = self.c * deviation(near / self.c)
-            held = y - near + np.clip(near, -HELD * c, HELD * c)
+            found = self.described(breaks, X, ar)
+            near, ar, held = found.near, found.ar, found.held
             if np.array_equal(before, breaks):
                 break
         cost = 2.0 * N * np.log(self.size(near, ar)) + len(breaks) * self.price(ar) + len(ar) * np.log(N)
-        return float(cost), Noise(
-            breaks,
-            residual,
-            c,
-            ar,
-            held,
-            near,
-            leverage,
-            self.size(near, ar) * median(self.c / c),
-            self.price(ar),
-        )
+        return float(cost), found
+
+    def described(self, breaks: Array, X: Array, ar: Array) -> Noise:
+        """The noise given its breaks; segments are fitted on X, the regressors divided by c and whitened by ``ar``."""
+        Q, y, N = self.Q, self.y, len(self.y)
+        z = whitened(X[:, :0], y / self.c, ar)[1]
+        fits = np.empty((3, N))
+        _fit_segments(Q, y, X, z, np.concatenate([[0], breaks, [N]]), np.array([len(ar)]), fits)
+        residual, near, leverage = fits
+        ar = self.correlation(near, breaks)
+        c = self.c * deviation(near / self.c)
+        held = y - near + np.clip(near, -HELD * c, HELD * c)
+        white = self.size(near, ar) * median(self.c / c)
+        return Noise(breaks, residual, c, ar, held, near, leverage, white, self.price(ar))
 
     def price(self, ar: Array) -> float:
         """The penalty, raised by the standard error of the logarithm of the noise's long-run variance."""

@@ -8,11 +8,13 @@ counts as one, whatever its value is.
 
 A start s with F(s) + C(s, t) - p >= F(t) can never be the last break of a longer record and is dropped (as soon as
 segments from t on are long enough to be allowed), so that the cost is O(T) if breaks occur regularly, and O(T^2) in the
-number of blocks if there are none. Breaks may lie between blocks only. Source: Killick, Fearnhead and Eckley (2012),
+number of blocks if there are none. Breaks can only be between blocks. Source: Killick, Fearnhead and Eckley (2012),
 PELT.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,46 +61,70 @@ def _cost(G: Array, ends: Array, s: int, t: int, p: int, total: Array, seen: Arr
         else:
             seen[s, 1] += ends[b] - begin
     seen[s, 0] = t
-    M[:] = total[s]
+    for i in range(k):
+        for j in range(i + 1):
+            M[i, j] = total[s, i, j]
     return cholesky(M, k - 1) + seen[s, 1]  # type: ignore[no-any-return]
 
 
-def _partition(G: Array, ends: Array, penalty: Array, least: Array, p: Array, F: Array, last: Array) -> None:
+class Space(NamedTuple):
+    """Room to work in, which is allocated outside of compiled code: that takes seconds to compile."""
+
+    total: Array
+    """Sums of the blocks of every segment, (m, k, k)."""
+    M: Array
+    """Those of one, (k, k)."""
+    seen: Array
+    """See `_cost`, (m, 2)."""
+    alive: Array
+    """Starts that can be the last break, (m,)."""
+    expired: Array
+    """The end at which a start ceased to be one, or -1, (m,)."""
+    value: Array
+    """The total with each start, at the end where it was computed last, (m,)."""
+
+    @classmethod
+    def of(cls, m: int, k: int) -> Space:
+        """For m blocks of k columns."""
+        seen = np.zeros((m, 2), np.int64)
+        seen[:, 0] = np.arange(m)
+        alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, -np.inf)
+        return cls(np.zeros((m, k, k)), np.zeros((k, k)), seen, alive, expired, value)
+
+
+def _partition(G: Array, ends: Array, penalty: float, least: int, p: int, F: Array, last: Array, space: Space) -> None:
     """F (m + 1,), and the start of the last segment of the first t blocks, last (m + 1,).
 
-    The cost of a segment never falls as it grows, so what it was at an earlier end is a bound, and where that exceeds
+    The cost of a segment never falls as it grows, so its value at an earlier end is a bound, and where that exceeds
     the best total so far it is not computed again.
     """
-    m, k = G.shape[1], G.shape[2]
-    total, M = np.zeros((m, k, k)), np.zeros((k, k))
-    alive, expired, value = np.zeros(m, np.int64), np.full(m, -1), np.full(m, -np.inf)
-    seen, count, chosen = np.zeros((m, 2), np.int64), 0, -1
-    seen[:, 0] = np.arange(m)
-    F[0] = -penalty[0]
-    for t in range(1, m + 1):
+    total, M, seen, alive, expired, value = space
+    count, chosen = 0, -1
+    F[0] = -penalty
+    for t in range(1, G.shape[1] + 1):
         end = ends[t - 1]
-        if np.isfinite(F[t - 1]):
+        if abs(F[t - 1]) < np.inf:
             alive[count] = t - 1
             count += 1
         best, bound = np.inf, np.inf
         if chosen >= 0:
-            bound = value[chosen] = F[chosen] + _cost(G, ends, chosen, t, p[0], total, seen, M)
+            bound = value[chosen] = F[chosen] + _cost(G, ends, chosen, t, p, total, seen, M)
         for a in range(count):
             s = alive[a]
             start = ends[s - 1] if s > 0 else 0
-            if end - start >= least[0] and value[s] <= bound:
+            if end - start >= least and value[s] <= bound:
                 if seen[s, 0] < t:
-                    value[s] = F[s] + _cost(G, ends, s, t, p[0], total, seen, M)
+                    value[s] = F[s] + _cost(G, ends, s, t, p, total, seen, M)
                 if value[s] < best:
                     best, bound, chosen = value[s], min(value[s], bound), s
-        F[t] = best + penalty[0]
+        F[t] = best + penalty
         last[t] = chosen if best < np.inf else -1
         kept = 0
         for a in range(count):
             s = alive[a]
-            if expired[s] < 0 and value[s] - p[0] >= F[t]:
+            if expired[s] < 0 and value[s] - p >= F[t]:
                 expired[s] = end
-            if expired[s] < 0 or end - expired[s] < least[0]:
+            if expired[s] < 0 or end - expired[s] < least:
                 alive[kept] = s
                 kept += 1
         count = kept
@@ -118,7 +144,7 @@ def partition(phi: Array, y: Array, ends: Array, penalty: float, least: int, p: 
     G, F, last = np.zeros((2, m, k, k)), np.empty(m + 1), np.zeros(m + 1, np.int64)
     ends, order = np.ascontiguousarray(ends, np.int64), np.array([p])
     _blocks(phi, y, ends, order, G)
-    _best(G, ends, np.array([penalty]), np.array([least]), order, F, last)
+    _best(G, ends, float(penalty), int(least), int(p), F, last, Space.of(m, k))
     breaks, t = [], m
     while last[t] > 0:
         t = int(last[t])

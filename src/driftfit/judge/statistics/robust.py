@@ -3,7 +3,7 @@
     theta solves sum phi_t psi(e_t) = 0,    e_t = y_t - phi_t' theta,    psi(e) = e clipped at 1.5 scales of the noise
 
 solved by iteratively reweighted least squares. The scale is 1.4826 times the median of the absolute residuals. Normal
-equations are solved in an orthonormal basis of the regressors, so that their conditioning is that of what changes
+equations are solved in an orthonormal basis of the regressors, so that their conditioning is that of the variation
 within the record; a direction that a part of the record does not excite stays at zero there. Source: Huber (1964).
 Cost: O(N n^2) per iteration, usually ten.
 """
@@ -91,17 +91,49 @@ def solved(M: Array, theta: Array) -> None:
 
 
 @shared
+def middle(x: Array) -> float:
+    """Median of x (N,), whose order changes: Hoare's selection. `numpy.median` takes seconds to compile."""
+    low, high, k = 0, x.shape[0] - 1, x.shape[0] // 2
+    while low < high:
+        pivot, i, j = x[(low + high) // 2], low, high
+        while i <= j:
+            while x[i] < pivot:
+                i += 1
+            while pivot < x[j]:
+                j -= 1
+            if i <= j:
+                x[i], x[j] = x[j], x[i]
+                i, j = i + 1, j - 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    if x.shape[0] % 2 == 1:
+        return x[k]  # type: ignore[no-any-return]
+    below = x[0]
+    for i in range(1, k):
+        below = max(below, x[i])
+    return 0.5 * (below + x[k])  # type: ignore[no-any-return]
+
+
+@shared
 def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
     """Fit y (N,) on Q (N, n): fills theta (n,) and residual (N,), returns the scale."""
     N, n = Q.shape
-    M, step, weight = np.zeros((n + 1, n + 1)), np.zeros(n), np.ones(N)
-    theta[:] = 0.0
+    M, step, weight, size = np.empty((n + 1, n + 1)), np.empty(n), np.empty(N), np.empty(N)
     scale, level = 0.0, 0.0
+    for i in range(n):
+        theta[i] = 0.0
     for t in range(N):
+        weight[t] = 1.0
         level += y[t] * y[t]
     level = 1e-12 * np.sqrt(level / max(N, 1))
     for round in range(ROUNDS):
-        M[:] = 0.0
+        for i in range(n + 1):
+            for j in range(n + 1):
+                M[i, j] = 0.0
         for t in range(N):
             w = weight[t]
             for i in range(n):
@@ -117,14 +149,16 @@ def huber(Q: Array, y: Array, theta: Array, residual: Array) -> float:
                 fitted += Q[t, i] * step[i]
                 change += Q[t, i] * (step[i] - theta[i])
             residual[t] = y[t] - fitted
+            size[t] = abs(residual[t])
             moved = max(moved, abs(change))
-        theta[:] = step
-        scale = 1.4826 * np.median(np.abs(residual))
+        for i in range(n):
+            theta[i] = step[i]
+        scale = 1.4826 * middle(size)
         if not scale > level or (round > 0 and moved < 1e-8 * scale):
             break
         for t in range(N):
-            size = abs(residual[t])
-            weight[t] = CLIP * scale / size if size > CLIP * scale else 1.0
+            large = abs(residual[t])
+            weight[t] = CLIP * scale / large if large > CLIP * scale else 1.0
     return scale
 
 

@@ -49,7 +49,7 @@ def averaged(
     structures: list[Structure], predictions: list[Predicted], y: Array, scored: Array, forgetting: float,
     regressors: tuple[str, ...],
 ) -> Average:  # fmt: skip
-    """Average predictions; ``scored`` (T,) says where they are judged."""
+    """Average predictions; ``scored`` (T,) marks the samples that count."""
     terms = np.stack([p.loglik for p in predictions], axis=1)
     known = np.isfinite(terms).all(axis=1)
     seen = terms[known]

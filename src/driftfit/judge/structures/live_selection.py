@@ -1,16 +1,16 @@
-"""Orders and bases chosen on line: candidates followed side by side, each weighed by what it predicted of late.
+"""Orders and bases chosen on line: candidates tracked in parallel, each weighted by its recent predictions.
 
     log w_k <- a log w_k + log p_k(y_t | past),      p_k from before the sample, a just below 1
 
-A candidate that predicts better gains weight; what is long past is forgotten, so that the choice may change: a valve
-that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, as each
-density stands for a prediction that was made before its output was seen. A sample that one candidate cannot use moves
-no weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
+A candidate that predicts better gains weight; old predictions are forgotten, so that the choice may change: a valve
+that begins to stick, an order that a new load asks for. Useless parameters cost weight without a penalty, because each
+density is that of a prediction made before its output was observed. A sample that one candidate cannot use moves no
+weights. The tracker should follow: parameters that a tiny q has frozen cost nothing when they are useless, and take
 long to come right when a candidate becomes true. Over the same samples the weights are those of
 ``select(..).average(a)``.
 
-Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is what Feng
-and Hong (2021), section 6, leave open. Cost: that of the candidates.
+Source: Raftery, Karny and Ettler (2010), Technometrics 52(1); the choice of r, m, p, q and bases on line is left open
+by Feng and Hong (2021), section 6. Cost: that of the candidates.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from driftfit.trackers.parts.student import log_student
 
 
 class LiveSelection(Kept):
-    """Follow several models of one stream and say which predicts best now.
+    """Track several models of one stream and choose the one that predicts best at present.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class LiveSelection(Kept):
     tracker : Tracker
         How their parameters are followed, with a variance; its settings fit every number of parameters.
     forgetting : number in (0, 1]
-        What a log-likelihood is worth one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
+        The weight of a log-likelihood one sample later: 1 / (1 - forgetting) samples are weighed. A smaller one finds a
         change sooner and is led astray by noise more often.
     dt : as for `Live`
 
@@ -59,7 +59,8 @@ class LiveSelection(Kept):
             raise ValueError("LiveSelection: takes at least one model, each with one output.")
         if not tracker.covariance or tracker.density:
             raise ValueError(
-                f"LiveSelection: {type(tracker).__name__} has no prediction with one variance to weigh; use Kalman, RLS or FLS."
+                f"LiveSelection: {type(tracker).__name__} has no prediction with one variance to weigh; use "
+                "Kalman, RLS or FLS."
             )
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"LiveSelection: forgetting must be in (0, 1]; got {forgetting!r}.")

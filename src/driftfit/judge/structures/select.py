@@ -43,10 +43,12 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.plots import plot_selection
 from driftfit.judge.statistics.paired import newey_west
 from driftfit.judge.structures.candidates import Pool, Predicted, Structure, pool_of, price
+from driftfit.judge.structures.several_outputs import pools_of
 from driftfit.judge.structures.subsets import subsets
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.run.track import records_of
+from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, table_of
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.base import Tracker
@@ -208,7 +210,7 @@ def select(
     drift: Any = 1.0,
     limits: Any = None,
     exclude: Any = None,
-) -> Selection:
+) -> Selection | ByOutput[Selection]:
     """Compare structures by predictive likelihood.
 
     Parameters
@@ -228,6 +230,10 @@ def select(
     most : int or None
         Largest number of regressors in a subset.
 
+    Returns
+    -------
+    Selection. Models with several outputs give one for each, by name (if they share one theta, one for all).
+
     Raises
     ------
     ValueError
@@ -244,8 +250,11 @@ def select(
     if not candidates:
         raise ValueError("select: there is no candidate; grid(ARX, na=[1, 2], nb=[1, 2]) makes some.")
     reading = Reading(time, dt, weights, drift, limits=limits, exclude=exclude)
+    search = (keep, most) if isinstance(models, Model) else None
     if any(len(model.outputs) > 1 for model in candidates):
-        raise ValueError("select: structures are compared for one output at a time.")
+        pools = pools_of(candidates, y, u, reading, data, by)
+        found = {name: _selected(*pool, tracker, search) for name, pool in pools.items()}
+        return found["rows"] if candidates[0].shared else ByOutput(found)
     _, records, _ = records_of(candidates[0], y, u, reading, data, by)
     if data is None and by is None:
         factor("drift", drift, len(records.y))
@@ -254,14 +263,20 @@ def select(
     named = max(candidates, key=lambda model: len(model.input_names))
     records = records.for_model(named, reading, max(model.reach for model in candidates))
     bound = [_bound(model, records.labels.u or records.u.shape[1]) for model in candidates]
-    if isinstance(models, Model) and bound[0].n > MOST:
-        raise ValueError(f"select: at most {MOST} regressors can be searched; there are {bound[0].n}.")
     names = [repr(model) for model in candidates]
     pool, structures = pool_of(bound, names, [replace(records.part(k), time=None) for k in range(len(records.keys))])
-    if isinstance(models, Model):
-        structures, predictions = subsets(pool, tracker, structures[0], keep, most)
-    else:
-        predictions = pool.predict(tracker, structures)
+    return _selected(pool, structures, tracker, search)
+
+
+def _selected(
+    pool: Pool, structures: list[Structure], tracker: Tracker, search: tuple[Sequence[str], int | None] | None
+) -> Selection:
+    """Compare structures, or with ``search`` = (keep, most) subsets of the regressors of the first."""
+    if search is None:
+        return _judged(pool, tracker, structures, pool.predict(tracker, structures))
+    if structures[0].n > MOST:
+        raise ValueError(f"select: at most {MOST} regressors can be searched; there are {structures[0].n}.")
+    structures, predictions = subsets(pool, tracker, structures[0], *search)
     return _judged(pool, tracker, structures, predictions)
 
 

@@ -52,7 +52,7 @@ def usable(m: Array, at: int, count: int) -> bool:
 def values_of(kind: Kind, numbers: int, following: int, count: int, bends: bool = True) -> Any:
     """A part (m, p, x, at, slopes) that fills two arrays with the functions of a block at x, and their slopes.
 
-    Without ``bends`` the slopes are not needed and may be left as they are.
+    Without ``bends`` the slopes are not needed and may be left unchanged.
     """
     evaluate, code = kind
 

@@ -2,7 +2,7 @@
 
     F(y_t; d) = sum_j sum_k (b_j c_k) f_k(u_(t-nk-j+1)) - sum_i sum_k (a_i d_k) g_k(y_(t-i)) - l - v_t
 
-with the products as they are in theta, so that nothing needs to be separated. F is inverted on a grid over a span of
+with the products of theta themselves, so that nothing needs to be separated. F is inverted on a grid over a span of
 outputs, widened by a fifth; if it does not increase, its monotone envelope is inverted. Cost per sample and system:
 O(n + 64).
 """
@@ -25,7 +25,7 @@ INSIDE = 0.97
 
 
 class Blocks(Protocol):
-    """What a `HammersteinWiener` model has for this."""
+    """The parts of a `HammersteinWiener` model that this uses."""
 
     @property
     def structure(self) -> Structure: ...

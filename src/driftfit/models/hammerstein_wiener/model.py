@@ -310,7 +310,8 @@ class HammersteinWiener(Model):
         return found
 
     def log_jacobian(self, theta: Array, y: Array) -> Array:
-        """log max(F'(y_t; d_t), 1e-3) with the estimate after the sample: what turns the density of z into that of y.
+        """log max(F'(y_t; d_t), 1e-3) with the estimate after the sample: the factor that converts the density of z
+        into that of y.
 
         The integral of a function linear in d over the posterior is its value at the posterior mean, so the density of
         y integrates to 1 with the estimate after the sample, and to more with the one before.

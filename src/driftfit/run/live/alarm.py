@@ -70,7 +70,7 @@ class LiveAlarm:
             self._frozen = rule.reference
             self._memory = memory_of(len(rule.parameters), len(self._frozen.ar))
             self._row = np.ones((1, len(rule.parameters) + len(ROW)))
-            self._told = self._memory.told[None].copy()
+            self._findings = self._memory.findings[None].copy()
 
     def __repr__(self) -> str:
         return f"LiveAlarm({self.rule!r}, {'on' if self.active else 'off'} after {self.samples} samples)"
@@ -86,7 +86,7 @@ class LiveAlarm:
         """For "glr" and "cusum": what changed, by how much and since when; otherwise None."""
         if self.rule.kind not in FROZEN:
             return None
-        return change_of(self.rule, self._told[0], self.samples - 1)
+        return change_of(self.rule, self._findings[0], self.samples - 1)
 
     def onsets(self) -> list[Onset]:
         """The alarms that began since the last call; at most the last 256."""
@@ -118,8 +118,8 @@ class LiveAlarm:
             row[: len(phi)] = phi
             for place, name in enumerate(ROW, len(rule.parameters)):
                 row[place] = tile[name][0, lane]
-            scan(self._row, self._frozen, self._memory, self._told)
-            self.statistic = self._told[0, rule.entries]
+            scan(self._row, self._frozen, self._memory, self._findings)
+            self.statistic = self._findings[0, rule.entries]
         elif rule.kind == "band":
             theta, var = (tile[name][0, self._columns, lane] for name in ("theta", "var"))
             self.statistic = rule.outside(theta, np.sqrt(var))
@@ -153,7 +153,7 @@ class LiveAlarm:
         for part, stored in zip(alarm._memory if state.get("memory") else (), state.get("memory", ()), strict=True):
             part[...] = np.frombuffer(b64decode(stored)).reshape(part.shape)
         if state.get("memory"):
-            alarm._told[0] = alarm._memory.told
+            alarm._findings[0] = alarm._memory.findings
         return alarm
 
 

@@ -6,7 +6,6 @@ It gives the same bits as `update` for one sample after the other, because both 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -122,7 +121,7 @@ def with_ignored(out: Array, before: Array, taken: Array) -> Array:
 class Batched(ABC):
     """A stream that takes several samples at once."""
 
-    programs: Sequence[Program]
+    programs: tuple[Program, ...]
     model: Model
     _rows: Model
     _tile: Array

@@ -1,4 +1,4 @@
-"""What changed, by how much and since when: what an alarm with a frozen reference model can tell."""
+"""A change that an alarm with a frozen reference model found: what changed, by how much and since when."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ class Change(NamedTuple):
     since: int
 
 
-def change_of(rule: AlarmRule, told: Array, t: int) -> Change:
-    """The change that the statistics ``told`` of sample t show."""
+def change_of(rule: AlarmRule, findings: Array, t: int) -> Change:
+    """The change that the statistics ``findings`` of sample t show."""
     model = rule.reference
-    cause = rule.names[rule.cause(told[rule.entries])]
-    if cause == "noise" and np.isfinite(told[RATIO]):
-        L = told[NOISE_WINDOW]
+    cause = rule.names[rule.cause(findings[rule.entries])]
+    if cause == "noise" and np.isfinite(findings[RATIO]):
+        L = findings[NOISE_WINDOW]
         error = 0.5 * np.sqrt(model.numbers[SPREAD] / L) / model.numbers[RAW]
-        size, half = told[RATIO], SURE * told[RATIO] * error
-    elif np.isfinite(told[WHICH]) and (rule.kind == "glr" or cause == rule.parameters[int(told[WHICH])]):
-        which, L = int(told[WHICH]), told[WINDOW]
+        size, half = findings[RATIO], SURE * findings[RATIO] * error
+    elif np.isfinite(findings[WHICH]) and (rule.kind == "glr" or cause == rule.parameters[int(findings[WHICH])]):
+        which, L = int(findings[WHICH]), findings[WINDOW]
         unit = model.numbers[SCALE] / model.unit[which]
-        cause, size, half = rule.parameters[which], told[SIZE] * unit, SURE * told[STD] * unit
+        cause, size, half = rule.parameters[which], findings[SIZE] * unit, SURE * findings[STD] * unit
     else:
         return Change(cause, np.nan, np.nan, np.nan, t)
     return Change(cause, float(size), float(size - half), float(size + half), max(t + 1 - int(L), 0))

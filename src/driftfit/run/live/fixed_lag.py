@@ -21,7 +21,7 @@ from driftfit.smooth.parts.walk import Walk
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.information import triangular_root
 
-SAMPLES = ("phi", "y", "weight", "drift", "each", "trend")
+SAMPLES = ("phi", "y", "weight", "drift", "drift_root", "trend")
 
 
 class FixedLag(NamedTuple):
@@ -83,7 +83,7 @@ class Window:
         walk.phi[k], walk.y[k] = s["phi"][:, lane], s["y"][lane]
         walk.weight[k] = s["ok"][lane] / noise
         walk.drift[k] = dt * factor if self.drifts else 0.0
-        walk.each[k] = s["each"][:, lane] if "each" in fields(tile) else 1.0
+        walk.drift_root[k] = s["drift_root"][:, lane] if "drift_root" in fields(tile) else 1.0
         walk.trend[k : k + 1] = dt if self.drifts else 0.0
         self.drifts = self.drifts or dt > 0.0
         self.count += 1

@@ -1,4 +1,4 @@
-"""What an operator can tell a stream; `driftfit.run.live.live.Live` inherits it."""
+"""Interventions of an operator in a stream; `driftfit.run.live.live.Live` inherits it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Operated(ABC):
         return bool(self._tile["noise"][0, 0] == np.inf)
 
     def reset(self, which: str | int | Sequence[str | int] | None = None, p: Any = None, theta: Any = None) -> None:
-        """Tell the tracker what an operator knows: these parameters may have changed, or have new values.
+        """Pass an operator's knowledge to the tracker: these parameters may have changed, or have new values.
 
         Parameters
         ----------

@@ -24,11 +24,13 @@ class _Later:
 LATER: Any = _Later()
 
 NOTHING, INPUT, IGNORED = 0, 1, 2
-"""What `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored sample."""
+"""The input that `Live.apply` is expected to receive: nothing, the input of the last sample, or that of an ignored
+sample.
+"""
 
 
 def applier(model: Model, tracker: Tracker, tile: Array) -> Any:
-    """``apply(tile, u)`` for the tiles of this type; ValueError if outputs need the input of their own sample."""
+    """``apply(as_compiled(tile), u)`` for this type of tile; ValueError if outputs need the input of their sample."""
     step = tracker.apply_for(model)
     if step is None:
         raise ValueError(

@@ -40,7 +40,8 @@ LEVELS, BLOCKS, SHORT = 6, 12, 8
 GAP = 1.5
 """An interval longer than this breaks an autoregression."""
 SHIFT = 0.5
-"""What the score CUSUM waits for, in standard deviations of the noise per root mean square regressor."""
+"""The shift for which the score CUSUM is designed, in standard deviations of the noise per root mean square regressor.
+"""
 FLAT = 1e-9
 WIDE = 30.0
 """x is limited to this for the size of a change."""
@@ -51,7 +52,7 @@ mean and variance of x^2, LONGEST is the longest window that judges the noise, N
 SINCE, LEVEL, COUNT = range(3)
 """Entries of `Memory.counts`: usable samples in a row, h, samples that were used."""
 ONE, JOINT, NOISE, WHICH, SIZE, STD, WINDOW, RATIO, NOISE_WINDOW, CUSUM = range(10)
-"""Entries of what is written for a sample; the CUSUM of n parameters and of the noise come last."""
+"""Entries of the findings of a sample; the CUSUM of n parameters and of the noise come last."""
 
 
 class Frozen(NamedTuple):
@@ -76,7 +77,7 @@ class Memory(NamedTuple):
     counts: Array
     work: Array
     sample: Array
-    told: Array
+    findings: Array
 
 
 def memory_of(n: int, p: int) -> Memory:
@@ -84,9 +85,9 @@ def memory_of(n: int, p: int) -> Memory:
     last = np.full((LEVELS, 2, CUSUM), np.nan)
     sums = np.zeros((LEVELS, BLOCKS, size_of(n)))
     work = np.zeros((2 * n + 4, size_of(n)))
-    counts, told = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
+    counts, findings = np.array([0.0, 1.0, 0.0]), np.full(CUSUM + n + 1, np.nan)
     past, cusum = np.zeros((p + 1, n + 1)), np.zeros((n + 1, 2))
-    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), told)
+    return Memory(past, sums, last, cusum, counts, work, np.zeros(size_of(n)), findings)
 
 
 def size_of(n: int) -> int:
@@ -174,8 +175,8 @@ def solve(work: Array, n: int, given: Array, into: Array) -> None:
 
 
 @shared
-def compare(total: Array, L: int, frozen: Frozen, work: Array, told: Array) -> None:
-    """The statistics of one window into told."""
+def compare(total: Array, L: int, frozen: Frozen, work: Array, findings: Array) -> None:
+    """The statistics of one window into findings."""
     n = frozen.theta.shape[0]
     numbers = frozen.numbers
     variance(total, frozen, work)
@@ -186,8 +187,8 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, told: Array) -> N
     square = 0.0
     for i in range(n):
         square += z[i] * z[i]
-    told[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
-    best, told[ONE] = -1.0, np.nan
+    findings[JOINT] = cube_deviate(square / rank, 0.5 * rank) if rank > 0 else np.nan
+    best, findings[ONE] = -1.0, np.nan
     for j in range(n):
         solve(work, n, work[n + j, :n], g)
         length, score, raw = 0.0, 0.0, 0.0
@@ -197,15 +198,16 @@ def compare(total: Array, L: int, frozen: Frozen, work: Array, told: Array) -> N
             raw += g[i] * u[i]
         if length > 0.0 and score * score > best * length:
             best = score * score / length
-            told[WHICH], told[SIZE], told[STD] = j, raw / length, np.sqrt(numbers[RAW] / (numbers[V] * length))
+            findings[WHICH], findings[SIZE] = j, raw / length
+            findings[STD] = np.sqrt(numbers[RAW] / (numbers[V] * length))
     if best >= 0.0:
-        told[ONE] = np.sqrt(best)
-    told[NOISE], told[WINDOW] = np.nan, L
+        findings[ONE] = np.sqrt(best)
+    findings[NOISE], findings[WINDOW] = np.nan, L
     if numbers[LONGEST] >= L:
         ratio = total[2 * n] / (L * numbers[V])
         z_noise = cube_deviate(ratio, L * numbers[V] * numbers[V] / numbers[KAPPA])
-        told[NOISE] = abs(z_noise) / np.sqrt(1.0 + L / numbers[NORMAL])
-        told[RATIO] = np.sqrt(total[2 * n + 1] / (L * numbers[RAW]))
+        findings[NOISE] = abs(z_noise) / np.sqrt(1.0 + L / numbers[NORMAL])
+        findings[RATIO] = np.sqrt(total[2 * n + 1] / (L * numbers[RAW]))
 
 
 @shared
@@ -259,8 +261,8 @@ def enter_scores(phi: Array, g: float, x: float, sample: Array) -> None:
 
 
 @shared
-def judge(memory: Memory, frozen: Frozen, told: Array) -> None:
-    """Take in the sample whose sums are in memory.sample, and write its statistics."""
+def judge(memory: Memory, frozen: Frozen, findings: Array) -> None:
+    """Add the sample whose sums are in memory.sample, and write its statistics."""
     n = frozen.theta.shape[0]
     sums, last = memory.sums, memory.last
     memory.counts[COUNT] += 1.0
@@ -268,20 +270,20 @@ def judge(memory: Memory, frozen: Frozen, told: Array) -> None:
     enter(sums, memory.sample, count)
     windows(memory, frozen, count)
     accumulate(memory.sample, frozen, memory.cusum)
-    for i in range(told.shape[0]):
-        told[i] = np.nan
+    for i in range(findings.shape[0]):
+        findings[i] = np.nan
     for j in range(last.shape[0]):
         for kind in range(2):
             one = last[j, kind]
-            if one[JOINT] > told[JOINT] or np.isnan(told[JOINT]):
-                told[JOINT] = one[JOINT]
-            if one[ONE] > told[ONE] or np.isnan(told[ONE]):
+            if one[JOINT] > findings[JOINT] or np.isnan(findings[JOINT]):
+                findings[JOINT] = one[JOINT]
+            if one[ONE] > findings[ONE] or np.isnan(findings[ONE]):
                 for i in (ONE, WHICH, SIZE, STD, WINDOW):
-                    told[i] = one[i]
-            if one[NOISE] > told[NOISE] or np.isnan(told[NOISE]):
-                told[NOISE], told[RATIO], told[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
+                    findings[i] = one[i]
+            if one[NOISE] > findings[NOISE] or np.isnan(findings[NOISE]):
+                findings[NOISE], findings[RATIO], findings[NOISE_WINDOW] = one[NOISE], one[RATIO], one[WINDOW]
     for j in range(n + 1):
-        told[CUSUM + j] = np.sqrt(2.0 * max(memory.cusum[j, 0], memory.cusum[j, 1]))
+        findings[CUSUM + j] = np.sqrt(2.0 * max(memory.cusum[j, 0], memory.cusum[j, 1]))
 
 
 @shared
@@ -323,21 +325,21 @@ def enter_row(row: Array, frozen: Frozen, memory: Memory) -> bool:
 
 
 @Driver
-def scan(rows: Array, frozen: Frozen, memory: Memory, told: Array) -> None:
-    """Judge rows (T, n + 4) = [phi, y, ok, noise, dt]: told (T, CUSUM + n + 1), repeated where a row is not used."""
+def scan(rows: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
+    """Judge rows (T, n + 4) = [phi, y, ok, noise, dt]: findings (T, CUSUM + n + 1), repeated at unused rows."""
     for t in range(rows.shape[0]):
         if enter_row(rows[t], frozen, memory):
-            judge(memory, frozen, memory.told)
-        for i in range(told.shape[1]):
-            told[t, i] = memory.told[i]
+            judge(memory, frozen, memory.findings)
+        for i in range(findings.shape[1]):
+            findings[t, i] = memory.findings[i]
 
 
 @Driver
-def scan_scores(phi: Array, g: Array, frozen: Frozen, memory: Memory, told: Array) -> None:
+def scan_scores(phi: Array, g: Array, frozen: Frozen, memory: Memory, findings: Array) -> None:
     """The same for whitened regressors phi (T, n) and scores g (T,), all of them used."""
     for t in range(phi.shape[0]):
         enter_scores(phi[t], g[t], g[t], memory.sample)
-        judge(memory, frozen, told[t])
+        judge(memory, frozen, findings[t])
 
 
 @Driver

@@ -15,11 +15,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.data.arguments import check_roles
+from driftfit.data.clock import instant
 from driftfit.data.labels import by_name
 from driftfit.data.signals import noise_of
 from driftfit.data.storage import Kept
 from driftfit.engine.arrays import as_numbers, factor
-from driftfit.engine.drivers import one_or_all
+from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import LiveAlarm
@@ -93,7 +94,10 @@ class Live(Operated, Stream):
         self._m = self.model.m
         self._unknown = np.full(self._m, np.nan)
         self._shape = (self._m,)
+        self._interval = tile["interval"][0]
+        self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
         self._update = self.program.drivers().updater(tile, self._m)
+        self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
     def _expect(self, what: int) -> None:
@@ -126,31 +130,60 @@ class Live(Operated, Stream):
         (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
-            return self._update_told(y, u, time, weight, drift, prob)
-        if time is not None or weight != 1.0 or drift != 1.0 or self._careful:
+            return self._update_with_extra(y, u, time, weight, drift, prob)
+        if weight != 1.0 or drift != 1.0 or self._careful:
             return self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
-        if type(u) is float and self._m == 1:
-            return self._update(self._tile, y, u)  # type: ignore[no-any-return]
-        if u is LATER and self._m:
-            return self._update_later(y)
-        # the compiled step reads m floats from any address, so they must exist
-        if not (type(u) is np.ndarray and u.dtype is _FLOAT and u.shape == self._shape):
-            u = self._inputs(u)
-        # as `one_or_all`, whose call would take 30 ns
-        return self._update(self._tile, y, u.item() if self._m == 1 else u)  # type: ignore[no-any-return]
+        if type(u) is not float or self._m != 1:
+            if u is LATER and self._m:
+                return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
+            u = self._floats(u)
+        if time is None:
+            return self._update(self._seen, y, u)  # type: ignore[no-any-return]
+        return self._update_at(y, u, time)
 
-    def _update_told(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+    def _floats(self, u: Any) -> Any:
+        """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
+        if type(u) is np.ndarray:
+            if self._m == 1 and u.size == 1:
+                u = u.item()
+                return u if type(u) is float else self._inputs(u).item()
+            if u.dtype is _FLOAT and u.shape == self._shape:
+                return u if self._m != 1 else u.item()
+        return one_or_all(self._inputs(u))
+
+    def _update_at(self, y: float, u: Any, time: Any) -> Step:
+        """A sample whose only known factor is its time: the interval is written for this step alone."""
+        last = self._last
+        if type(time) is float and type(last) is float and self._unit:  # `Clock.since` for the commonest case
+            interval = (time - last) / self._unit if last < time < np.inf else np.nan
+        else:
+            clock, time = self._clock.at(time), instant(time)
+            interval = clock.since(last, time)
+            self._clock = clock
+        if not interval >= 0.0:
+            self._ignored += 1
+            return self._nothing()
+        self._last = time
+        self._pace.see(interval)
+        resting = self._interval[0]
+        if resting:  # 0 while the stream is held: no time passes
+            self._interval[0] = interval
+        step: Step = self._update(self._seen, y, u)
+        self._interval[0] = resting
+        return step
+
+    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
         """A sample with more known factors than interval, noise and drift."""
         each = np.ndim(drift) == 1
         if each or prob is not None:
-            self.tracker.tell(self.lane(), self.model, prob, drift if each else None)
+            self.tracker.set_extra(self.lane(), self.model, prob, drift if each else None)
         try:
             return self._sample(y, u, time, weight, 1.0 if each else float(drift))  # type: ignore[no-any-return]
         finally:
             if each or prob is not None:
-                self.tracker.tell(self.lane(), self.model, None, None)
+                self.tracker.set_extra(self.lane(), self.model, None, None)
 
     def _factors(self, interval: float, weight: Any, drift: Any) -> tuple[float, float, float]:
         noise = 1.0 if weight == 1.0 else float(noise_of(weight))
@@ -168,7 +201,7 @@ class Live(Operated, Stream):
     def _step(self, y: float, u: Array, known: tuple[float, float, float], time: Any) -> Step:
         known = HELD if self.held else known
         self._rest(known)
-        step: Step = self._update(self._tile, y, one_or_all(u))
+        step: Step = self._update(self._seen, y, one_or_all(u))
         for _, alarm in self._watching:
             alarm.take(self._tile, 0, step[1], step[2], time)
         if known is not HELD:
@@ -180,12 +213,12 @@ class Live(Operated, Stream):
     def _settle(self, held: bool, told: bool) -> None:
         self._rest(HELD if held else ORDINARY)
         if told:
-            self.tracker.tell(self.lane(), self.model, None, None)
+            self.tracker.set_extra(self.lane(), self.model, None, None)
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
         self._placing()
-        step: Step = self._update(self._tile, y, one_or_all(self._unknown))
+        step: Step = self._update(self._seen, y, one_or_all(self._unknown))
         self._expect(INPUT)
         return step
 
@@ -197,13 +230,13 @@ class Live(Operated, Stream):
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
-        y_hat, _, s, _ = self._update(self._scratch, np.nan, one_or_all(inputs))
+        y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
         return y_hat, s
 
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
 
-        Row 0 is what `Track.smooth` would give for that sample of a record that ends now.
+        Row 0 equals the result of `Track.smooth` at that sample for a record that ends now.
         """
         ((_, window),) = self._windowed()
         return window.smooth(self._tile)
@@ -276,8 +309,8 @@ class Live(Operated, Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations, (n,): inf for parameters that are not determined yet, NaN without a covariance."""
-        std: Array = np.sqrt(np.diag(self.cov))
-        return std
+        var: Array = self._tile["var"][0, :, 0]
+        return np.sqrt(var) if self.tracker.covariance else np.full(len(var), np.nan)
 
     @property
     def cov(self) -> Array:

@@ -30,7 +30,7 @@ Steps = tuple[Array, Array, Array, Array]
 
 
 class LiveOutputs(Stream):
-    """Track a stream with several outputs; what `Live` gives for a model with ``ny`` above 1.
+    """Track a stream with several outputs; `Live` returns it for a model with ``ny`` above 1.
 
     ``theta`` and ``std`` are (ny, n), or (n,) where the outputs share one theta. ``tracker`` is one for all, or a
     mapping from the name of each output to its tracker. Times and drifts are those of `Live`; so are weights, or there
@@ -87,7 +87,7 @@ class LiveOutputs(Stream):
         return given.reshape(shape)
 
     def _factors(self, interval: float = 1.0, weight: Any = 1.0, drift: Any = 1.0) -> Array:
-        """What the driver knows of one sample, (k, ny)."""
+        """The known numbers of one sample, (k, ny)."""
         ny = len(self.model.outputs)
         each = np.ndim(drift) == 1
         known = np.ones((3, ny))
@@ -95,13 +95,13 @@ class LiveOutputs(Stream):
         known[2] = 1.0 if each else factor("drift", drift)
         if not each:
             return known
-        columns = self.trackers[0].beside(self._rows, 1, None, np.asarray(drift)[None])
+        columns = self.trackers[0].extra_columns(self._rows, 1, None, np.asarray(drift)[None])
         return np.vstack([known, np.repeat(columns.T, ny, axis=1)])
 
     def predict(self, u: Any = None) -> tuple[Array, Array]:
-        """(y_hat, s), each (ny,): what the next outputs are expected to be; the state stays as it is.
+        """(y_hat, s), each (ny,): the forecast of the next outputs; the state does not change.
 
-        While `apply` is outstanding u stands for what it would bring.
+        While `apply` is outstanding, u is the input that it would receive.
         """
         missing, tile = np.full(len(self.model.outputs), np.nan), self._tile.copy()
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
@@ -112,7 +112,7 @@ class LiveOutputs(Stream):
     def detect(self, rules: Mapping[str, AlarmRule] | AlarmRule, wait: int | None = None) -> dict[str, LiveAlarm]:
         """Watch outputs by the rules of reference runs, by name: ``{"flow": run["flow"].detect(...).rule}``.
 
-        One rule per output, a later one in the place of an earlier; ``wait`` and the alarms are those of `Live.detect`.
+        One rule per output; a later rule replaces an earlier one; ``wait`` and the alarms are those of `Live.detect`.
         Outputs that share one theta have one rule, of ``run.detect(...)``, and ``wait`` counts their rows. ValueError
         for an unknown name.
         """
@@ -167,20 +167,20 @@ class LiveOutputs(Stream):
         return y_hat, e, s, ok
 
     def _rest(self, tile: Array) -> None:
-        """Reset what was known of one sample, because it does not hold for the next."""
-        if "each" in storage.fields(tile):
-            tile["each"] = 1.0
+        """Reset the drift factors of one sample, which do not apply to the next."""
+        if "drift_root" in storage.fields(tile):
+            tile["drift_root"] = 1.0
 
     def _settle(self, held: bool, told: bool) -> None:
         self._rest(self._tile)
 
     def _result(self) -> Steps:
-        """What the driver wrote, one number per lane."""
+        """The results of the driver, one number per lane."""
         out = self._out[0]
         return out["y_hat"].copy(), out["e"].copy(), out["s"].copy(), out["ok"] > 0.0
 
     def alone(self) -> list[tuple[Program, Array]]:
-        """Each output with its state as a tile of its own; none where outputs are regressors of each other."""
+        """Each output with its state in a separate tile; none where outputs are regressors of each other."""
         found = [(one.alone, lane) for lane, one in enumerate(self.programs)]
         return [(one, one.resting(state_of(self._tile, lane))) for one, lane in found if one is not None]
 
@@ -221,8 +221,9 @@ class LiveOutputs(Stream):
     @property
     def std(self) -> Array:
         """Their standard deviations."""
-        std: Array = np.sqrt(np.einsum("...ii->...i", self.cov))
-        return std
+        var: Array = self._tile["var"][0].T
+        std = np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
+        return std[0] if self.model.shared else std
 
     @property
     def names(self) -> tuple[Any, ...]:

@@ -1,4 +1,5 @@
-"""The rule of an alarm: what is compared with which limits, taken from a reference, for any run or stream after it.
+"""The rule of an alarm: what is compared with which limits; estimated from a reference, and applied to later runs and
+streams.
 
     band          z_ti = max(theta_ti - high_i, low_i - theta_ti) / std_ti
     innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
@@ -36,7 +37,7 @@ CHANGE, REPORT = "window", "report"
 
 @dataclass(frozen=True)
 class AlarmRule(Settings):
-    """What `Track.detect` estimated from its reference: `Alarms.rule`. Frozen, equal by value, saved as plain data.
+    """The results of `Track.detect` on its reference: `Alarms.rule`. Frozen, equal by value, saved as plain data.
 
     Attributes
     ----------
@@ -91,7 +92,7 @@ class AlarmRule(Settings):
 
     @property
     def entries(self) -> list[int]:
-        """Which entries of what the compiled routine writes are the statistics of "glr" or "cusum"."""
+        """Indices of the statistics of "glr" or "cusum" among the findings."""
         return [ONE, JOINT, NOISE] if self.kind == "glr" else [CUSUM + j for j in range(len(self.names))]
 
     @property
@@ -191,4 +192,4 @@ def change_probability(tracker: Any, fields: Any) -> float:
     """The probability of a change in the tracker's window, from the fields of one lane."""
     if CHANGE in tracker.outputs:
         return float(np.reshape(fields[CHANGE], -1)[0])
-    return float(tracker.told(fields[REPORT], CHANGE))
+    return float(tracker.reported(fields[REPORT], CHANGE))

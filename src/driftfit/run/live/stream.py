@@ -1,4 +1,4 @@
-"""What streams of one and of several outputs have in common: time, limits, late inputs, windows, alarms, files."""
+"""The common part of streams with one and with several outputs: time, limits, late inputs, windows, alarms, files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from driftfit.data import storage
 from driftfit.data.clock import Clock, Pace, instant
 from driftfit.data.limits import Gate
+from driftfit.engine.drivers import as_compiled
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
@@ -29,7 +30,7 @@ from driftfit.trackers.base import Tracker
 class Stream(Batched, Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
-    A class of streams says how a sample goes through the tile (`_step`), and what a sample that is ignored returns.
+    Subclasses define how a sample is processed (`_step`), and what an ignored sample returns.
     """
 
     def _begin(
@@ -72,7 +73,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     @abstractmethod
     def _factors(self, interval: float, weight: Any, drift: Any) -> Any:
-        """What is known of a sample."""
+        """The known numbers of a sample."""
 
     @abstractmethod
     def _checked(self, y: Any, u: Any) -> tuple[Any, Array]:
@@ -80,7 +81,7 @@ class Stream(Batched, Plain, storage.Kept):
 
     @abstractmethod
     def _nothing(self) -> Any:
-        """What a sample returns that is ignored."""
+        """The result of a sample that is ignored."""
 
     @abstractmethod
     def _fields(self) -> Mapping[str, Array]:
@@ -119,7 +120,7 @@ class Stream(Batched, Plain, storage.Kept):
         return self._place
 
     def _expect(self, what: int) -> None:
-        """Note whether an input is outstanding."""
+        """Record whether an input is outstanding."""
         self._awaits = what
 
     def apply(self, u: Any) -> None:
@@ -146,7 +147,7 @@ class Stream(Batched, Plain, storage.Kept):
     def _put(self, tile: Array, inputs: Array) -> None:
         """Store the outstanding input in a tile."""
         if self._awaits == INPUT:
-            self._placing()(tile, inputs)
+            self._placing()(as_compiled(tile), inputs)
 
     def _within(self, inputs: Array) -> Array:
         """Inputs with NaN outside their limits, which are counted."""

@@ -1,1 +1,1 @@
-"""States as bytes, and many of them continued side by side."""
+"""States as bytes, and many of them continued in parallel."""

@@ -12,12 +12,12 @@ import numpy as np
 
 from driftfit.data.record import Records
 from driftfit.engine.kernel import Array, Driver
-from driftfit.run.lanes import Job, prepare, run_jobs
+from driftfit.run.parallel_lanes import Job, prepare, run_jobs
 from driftfit.run.program import Program
 
 
 class Advanced:
-    """What a driver wrote for all series of ``records``, and where they ended."""
+    """The results of a driver for all series of ``records``, and their final states."""
 
     def __init__(self, programs: Sequence[Program], records: Records, jobs: Sequence[Job]) -> None:
         self.programs, self.records, self.jobs = programs, records, jobs

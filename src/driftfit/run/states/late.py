@@ -1,4 +1,5 @@
-"""Late rows: samples wait until the newest time of their series is ``hold`` after them, and go on in order of time.
+"""Late rows: samples wait until the newest time of their series is ``hold`` after them, and are released in order of
+time.
 
 With W the newest time minus hold, before some rows arrive and of what is known by then,
 
@@ -22,12 +23,12 @@ import numpy as np
 from driftfit.engine.kernel import Array
 
 RELEASED, WAITING, LATE, REPEATED, UNTIMED = range(5)
-"""What becomes of a row."""
+"""Fates of a row."""
 REASONS = {LATE: "late", REPEATED: "at a repeated time", UNTIMED: "without a time"}
 
 
 class Fates(NamedTuple):
-    """What becomes of rows."""
+    """Fates of rows."""
 
     order: Array
     """The rows, sorted by series and by time; rows without a time come last in their series."""
@@ -92,7 +93,7 @@ class HoldBack:
         return len(self.rows)
 
     def take(self, times: Sequence[Any], rows: Sequence[Any]) -> tuple[Array, list[Any]]:
-        """Give rows with their times; returns those whose turn it is now, in the order of their times."""
+        """Give rows with their times; returns those that are released now, in the order of their times."""
         given = np.asarray(times)
         given = given.astype("M8[us]" if given.dtype.kind == "M" else float)
         time = np.concatenate([self.times.astype(given.dtype), given])
@@ -109,7 +110,7 @@ class HoldBack:
         return time[going], [every[k] for k in going]
 
     def rest(self) -> tuple[Array, list[Any]]:
-        """What still waits, when nothing more will come."""
+        """The rows that still wait, when no more will arrive."""
         found = self.times, self.rows
         self.times, self.rows = self.times[:0], []
         return found

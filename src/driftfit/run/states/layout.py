@@ -36,7 +36,7 @@ from driftfit.engine.kernel import Array
 MAGIC, FORMAT = b"DFst", 1
 HEAD = Struct("<4sHHI8sI")
 CHECKED = 12
-"""Where that begins which the CRC covers."""
+"""The first byte that the CRC covers."""
 MANY = 512
 """From this number of words on, zeros are left out where that makes the bytes fewer."""
 WORD = np.dtype("<i8")
@@ -88,6 +88,15 @@ class Layout:
     def put(self, tile: Array, lanes: Any, words: Array) -> None:
         """Set lanes of a tile to states, (W,) or (lanes, W)."""
         words_of(tile)[self.held[:, None], lanes] = words.reshape(-1, len(self.held)).T
+
+    def field(self, words: Array, name: str) -> Array:
+        """A field of numbers of states (.., W), as (.., k)."""
+        at = 0
+        for one, (_, shape) in self.shapes.items():
+            if one == name:
+                return np.ascontiguousarray(words[..., at : at + prod(shape)]).view(np.float64)
+            at += prod(shape)
+        raise KeyError(name)
 
     def pack(self, words: Array) -> bytes:
         """A state (W,) as bytes."""

@@ -1,4 +1,4 @@
-"""Old journals: exported to Parquet, then deleted, a piece at a time; results that nobody waits for are deleted.
+"""Old journals: exported to Parquet, then deleted, a piece at a time; results that no sink waits for are deleted.
 
 A piece is written under a temporary name and moved into place before its rows leave the database, so a crash at any
 moment leaves every sample in at least one of the two, and a piece that is written again replaces itself.
@@ -20,7 +20,7 @@ from driftfit.service.settings.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
 EVERY = 60.0
-"""Seconds between two looks."""
+"""Seconds between two searches."""
 PIECE = 2_000
 """Groups of one piece."""
 DAY = 86_400.0
@@ -35,7 +35,9 @@ class Archive:
         self._writing: Future[int] | None = None
 
     def forget(self, pending: Pending, journal: Journal, sinks_at: int) -> None:
-        """Add what may be deleted to the next transaction; start to export what may be deleted later."""
+        """Add the rows that may be deleted to the next transaction, and start to export those that may be deleted
+        later.
+        """
         if self._writing is not None and self._writing.done():
             if self._writing.exception() is not None:
                 log.error("archive", extra={"detail": str(self._writing.exception())})
@@ -45,20 +47,20 @@ class Archive:
         if time.monotonic() - self._looked < EVERY or self._writing is not None:
             return
         self._looked = time.monotonic()
-        self.begin(pending, journal.floor(), sinks_at)
+        self.begin(pending, journal.first_needed(), sinks_at)
 
-    def begin(self, pending: Pending, floor: int, sinks_at: int) -> None:
-        """Look for what is old."""
+    def begin(self, pending: Pending, needed: int, sinks_at: int) -> None:
+        """Look for old rows."""
         now = time.time()
         pending.forget += [
-            ("delete from result where at < ? and first < ?", (now - 60.0, min(floor, sinks_at))),
+            ("delete from result where at < ? and first < ?", (now - 60.0, min(needed, sinks_at))),
             ("delete from result where at < ?", (now - DAY * self.options.results,)),
             ("delete from block where stop < ? and stop > 1e8", (now - DAY * self.options.history,)),
         ]
-        self._writing = self._pool.submit(export, self.folder, floor, now - DAY * self.options.keep)
+        self._writing = self._pool.submit(export, self.folder, needed, now - DAY * self.options.keep)
 
 
-def export(folder: Path, floor: int, before: float) -> int:
+def export(folder: Path, needed: int, before: float) -> int:
     """Write the oldest piece of the log, if all of it is older than ``before`` seconds and stored in states.
 
     Returns the number up to which the log may be deleted; 0 if nothing was written.
@@ -66,7 +68,7 @@ def export(folder: Path, floor: int, before: float) -> int:
     journal = Journal(folder, read_only=True)
     try:
         query = "select first, count from log where at < ? and first + count <= ? order by first limit ?"
-        found = journal.db.execute(query, (before, floor, PIECE)).fetchall()
+        found = journal.db.execute(query, (before, needed, PIECE)).fetchall()
         if not found:
             return 0
         first, upto = found[0][0], found[-1][0] + found[-1][1]

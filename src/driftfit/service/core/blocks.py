@@ -24,8 +24,8 @@ class Blocks:
         self.unit = unit
         self._rows: list[list[Any]] = []
 
-    def add(self, told: list[Any]) -> None:
-        self._rows.append(told)
+    def add(self, result: list[Any]) -> None:
+        self._rows.append(result)
 
     def flush(self, all_of_it: bool = False) -> list[tuple[Any, ...]]:
         """Rows of the table ``block``: full blocks, or everything so far."""
@@ -57,7 +57,7 @@ def columns_of(rows: list[list[Any]]) -> Array:
 
 
 def extremes_of(values: Array) -> Array:
-    """Least, largest and mean (3, c) of columns, without what is not finite; NaN if nothing is."""
+    """Least, largest and mean (3, c) of columns, over finite numbers; NaN if there are none."""
     fine = np.isfinite(values)
     count = fine.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):

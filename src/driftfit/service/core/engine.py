@@ -1,4 +1,4 @@
-"""The engine: one thread that journals what arrives, and then lets the trackers see it.
+"""The engine: one thread that journals the samples that arrive, and then passes them to the trackers.
 
     gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
 
@@ -23,7 +23,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import Item, Journal, Pending
+from driftfit.service.core.journal import NEEDED_FROM, Item, Journal, Pending
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -32,7 +32,9 @@ log = logging.getLogger("driftfit.service")
 BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
-"""Seconds that the engine waits for samples before it looks after other things."""
+"""Seconds that the engine waits for samples before it does other work."""
+RETRY = 1.0
+"""Seconds between two attempts to write the journal."""
 
 
 class Engine:
@@ -50,7 +52,7 @@ class Engine:
         """Notified when results have been stored."""
         self.problem = ""
         self.samples = 0
-        self.told = 0
+        self.last_stored = 0
         """The last group whose results were stored by this process."""
         self.next = self.journal.next_number()
         self.latencies: deque[float] = deque(maxlen=2000)
@@ -64,14 +66,14 @@ class Engine:
 
     def _recover(self) -> int:
         """Bring all states to the end of the log; the number of samples that were processed again."""
-        told, again = self.journal.told(), 0
-        for first, items in self.journal.groups(self.journal.floor()):
+        unstored, again = self.journal.first_without_results(), 0
+        for first, items in self.journal.groups(self.journal.first_needed()):
             out, number = Out(), first
             for item in items:
                 if self._apply(number, item, out, replay=True):
                     again += item.length
                 number += item.length
-            if first >= told:
+            if first >= unstored:
                 self._pending.add_results(first, out.results, out.events, time.time())
             self._flush_blocks(items)
         for unit in self.units.resident:
@@ -79,7 +81,7 @@ class Engine:
         return again
 
     def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> bool:
-        """Let a unit see an entry of the log, unless its stored state already contains it."""
+        """Pass an entry of the log to its unit, unless the unit's stored state already contains it."""
         unit = self.units.get(item.unit)
         if replay and number < self.units.since[item.unit]:
             return False
@@ -94,25 +96,25 @@ class Engine:
         """Work until `stop`."""
         while not self._stop.is_set():
             self.step(IDLE)
-        if not self.problem:  # otherwise nothing more may be written: what was not acknowledged comes again
+        if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
             self._commit()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def stop(self) -> None:
-        """Let `run` return after what has arrived is stored."""
+        """Let `run` return after the samples that have arrived are stored."""
         self._stop.set()
         self.intake.close()
 
     def close(self) -> None:
-        """Store how far the sinks have come, and close the journal."""
+        """Store the positions of the sinks, and close the journal."""
         if not self.problem:
             self._commit()
         self.journal.close()
 
     def step(self, wait: float) -> int:
-        """Take, journal and process what has arrived; the number of samples."""
+        """Take, journal and process the batches that have arrived; the number of samples."""
         arrived = self.intake.take(self.config.service.group, 0.0 if self._pending else wait)
         first, items = self.next, self._admit(arrived)
         now = time.time()
@@ -204,9 +206,9 @@ class Engine:
             self._pending.snapshots.append((number, upto, unit.state()))
             self._pending.blocks += unit.blocks.flush(all_of_it=True)
         upto = self._pending.log[0] if self._pending.log is not None else self.next
-        floor = next(iter(self._dirty.values()))[0] if self._dirty else upto
+        needed = next(iter(self._dirty.values()))[0] if self._dirty else upto
         if self._pending:
-            self._pending.meta["floor"] = str(floor)
+            self._pending.meta[NEEDED_FROM] = str(needed)
 
     def _commit(self) -> bool:
         """Write the next transaction; wait while that is impossible. False if the service was stopped meanwhile."""
@@ -222,14 +224,14 @@ class Engine:
                 if not self.problem:
                     log.error("journal", extra={"detail": str(error)})
                 self.problem = f"the journal cannot be written: {error}; sources are held back."
-                if self._stop.wait(1.0):
+                if self._stop.wait(RETRY):
                     return False
                 continue
             break
         self.problem = ""
         self.positions |= self._pending.positions
         results = bool(self._pending.results)
-        self.told = max([self.told, *(first for first, *_ in self._pending.results)])
+        self.last_stored = max([self.last_stored, *(first for first, *_ in self._pending.results)])
         self._pending = Pending()
         if results:
             with self.news:
@@ -237,7 +239,7 @@ class Engine:
         return True
 
     def _sinks_at(self) -> int:
-        """The group up to which all sinks have come."""
+        """The last group that all sinks have written."""
         found = [self.positions.get(f"sink:{sink.name}", 0) for sink in self.config.sinks]
         return min(found, default=self.next)
 

@@ -1,4 +1,4 @@
-"""What waits for the journal: batches of sources, and actions, bounded in number.
+"""Batches that wait for the journal: batches of sources, and actions, bounded in number.
 
 A source that delivers faster than the journal takes is held back in `put`. Nothing is dropped here.
 """
@@ -15,16 +15,16 @@ from driftfit.service.sources.samples import Batch
 
 
 class Action(NamedTuple):
-    """What an operator, or the service itself, wants to do to a unit."""
+    """An action on a unit, by an operator or by the service itself."""
 
     unit: str
     what: dict[str, Any]
     done: Callable[[], None] = lambda: None
-    """Called once it is in the journal."""
+    """Called when it is in the journal."""
 
 
 class Arrived(NamedTuple):
-    """What is to be journaled together."""
+    """Batches and actions that are journaled together."""
 
     batches: list[tuple[str, Batch]]
     actions: list[Action]
@@ -66,7 +66,7 @@ class Intake:
             self._changed.notify_all()
 
     def take(self, most: int, wait: float) -> Arrived:
-        """What has arrived, up to about ``most`` samples; empty after ``wait`` seconds."""
+        """The batches that have arrived, up to about ``most`` samples; empty after ``wait`` seconds."""
         until = time.monotonic() + wait
         with self._changed:
             while not (self._batches or self._actions or self._closed):
@@ -84,7 +84,7 @@ class Intake:
         return Arrived(batches, actions)
 
     def close(self) -> None:
-        """Let nobody wait any more."""
+        """Release everyone who waits."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

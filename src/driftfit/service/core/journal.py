@@ -8,9 +8,9 @@
     event      alarms, failures, operator's actions
     position   where sources continue, and how far sinks have come
 
-Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker sees it, and acknowledged
-after that. The next transaction contains the results of the group. After a crash the results that are missing are
-computed again from snapshots and log, bit for bit.
+Journal before update: a group is committed (WAL, ``synchronous=FULL``) before any tracker processes it, and
+acknowledged after that. The next transaction contains the results of the group. After a crash the results that are
+missing are computed again from snapshots and log, bit for bit.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
 FORMAT = "1"
+RESULTS_FROM, NEEDED_FROM = "told", "floor"
+"""Keys of ``meta``, as format 1 has them: of `Journal.first_without_results` and `Journal.first_needed`."""
 NAME = "driftfit.db"
 
 
@@ -50,11 +52,11 @@ class Item(NamedTuple):
     rows: list[list[float]]
     """y, u_1 .. u_m of each sample, NaN where missing."""
     action: dict[str, Any] | None = None
-    """What an operator, or the service itself, did; then there are no rows."""
+    """An action of an operator, or of the service itself; then there are no rows."""
 
     @property
     def length(self) -> int:
-        """How many numbers of the journal the entry takes."""
+        """How many sample numbers of the journal the entry uses."""
         return 1 if self.action is not None else len(self.rows)
 
 
@@ -95,16 +97,16 @@ class Journal:
         row = self.db.execute("select first + count from log order by first desc limit 1").fetchone()
         return max(int(row[0]) if row else 1, int(self.meta("next") or 1))
 
-    def told(self) -> int:
+    def first_without_results(self) -> int:
         """The first group whose results are not yet stored."""
-        return int(self.meta("told") or 1)
+        return int(self.meta(RESULTS_FROM) or 1)
 
-    def floor(self) -> int:
+    def first_needed(self) -> int:
         """The number from which the log is needed, because some state is not stored after it."""
-        return int(self.meta("floor") or 1)
+        return int(self.meta(NEEDED_FROM) or 1)
 
     def positions(self) -> dict[str, Any]:
-        """Where sources and sinks have come to."""
+        """The positions of sources and sinks."""
         return {name: msgspec.json.decode(value) for name, value in self.db.execute("select * from position")}
 
     def groups(self, first: int) -> Iterator[tuple[int, list[Item]]]:
@@ -144,7 +146,7 @@ class Journal:
 
 
 class Pending:
-    """What the next transaction will contain."""
+    """The contents of the next transaction."""
 
     def __init__(self) -> None:
         self.units: list[tuple[int, str, int, str, int, str]] = []
@@ -171,7 +173,7 @@ class Pending:
         if rows or events:
             self.results.append((first, len(rows), at, _encode((rows, events))))
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
-        self.meta["told"] = str(first + 1)
+        self.meta[RESULTS_FROM] = str(first + 1)
 
     def commit(self, db: sqlite3.Connection) -> None:
         """Write everything in one transaction; on an error nothing is written, and it can be tried again."""
@@ -202,7 +204,7 @@ def _json(value: Any) -> str:
 
 
 class Names:
-    """Units by number, as the database knows them; new ones are read when they are asked for."""
+    """Units by number, as the database knows them; new ones are read when they are needed."""
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal

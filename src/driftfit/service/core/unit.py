@@ -1,4 +1,4 @@
-"""One unit: a stream, its late samples, limits, alarms, and what the page keeps of it.
+"""One unit: a stream, its late samples, limits, alarms, and its history for the page.
 
 Everything that changes the state comes from the journal in one order, so that the journal alone determines it: samples,
 and actions (hold, reset, new limits, the rule of an alarm). Samples with times wait until the newest time is
@@ -98,7 +98,7 @@ class Unit:
             return
         try:
             self._process(self._released(first, times, rows), out)
-        except Exception as error:  # whatever it is, the other units go on
+        except Exception as error:  # whatever the error is, the other units continue
             self.fail(first, error, out)
 
     def fail(self, number: int, error: Exception, out: Out) -> None:
@@ -162,11 +162,11 @@ class Unit:
         self.counts["used"] += results[3]
         if self.last is not None and self.last[10] and not on:
             out.event(number, self.number, "over", {"time": time})
-        told = [number, self.number, time, row[0], *results, on]
-        self.last = told
+        result = [number, self.number, time, row[0], *results, on]
+        self.last = result
         self.seen += 1
-        self.blocks.add(told)
-        out.results.append(told)
+        self.blocks.add(result)
+        out.results.append(result)
         if not self.calibrated:
             self._remember(time, row, out)
 
@@ -190,7 +190,7 @@ class Unit:
                 out.to_calibrate.append(self.number)
 
     def act(self, number: int, action: dict[str, Any], out: Out) -> None:
-        """Do what an operator asked for, or what the service itself decided; problems become an event."""
+        """Carry out an action of an operator, or of the service itself; problems become an event."""
         what = action["do"]
         detail: dict[str, Any] = {key: value for key, value in action.items() if key != "rules"}
         try:
@@ -231,7 +231,7 @@ class Unit:
             raise ValueError(f"there is no action {what!r}.")
 
     def plain(self) -> dict[str, Any]:
-        """What the page shows beside the results."""
+        """The facts that the page shows besides the results."""
         live = self.live
         return {
             "counts": dict(self.counts), "failure": self.failure, "acknowledged": self.acknowledged,
@@ -276,7 +276,7 @@ class Unit:
 
 
 class Out:
-    """What processing a group has given."""
+    """Results and events of processing a group."""
 
     def __init__(self) -> None:
         self.results: list[list[Any]] = []

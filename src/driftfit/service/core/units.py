@@ -1,4 +1,4 @@
-"""The units of a service: found by topic, made as they appear, revived from the database when they are needed."""
+"""The units of a service: found by topic, created when they appear, loaded from the database when they are needed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Units:
         self._routes: OrderedDict[str, tuple[int, ...]] = OrderedDict()
         self._tokens: dict[int, tuple[float, float]] = {}
         self.since: dict[int, int] = {}
-        """Number up to which samples are in the state of a unit that was revived."""
+        """Number up to which samples are in the state of a unit that was loaded."""
         for unit, name, section, _, born, _ in journal.units():
             if section >= len(settings):
                 raise ValueError(
@@ -116,7 +116,7 @@ class Units:
         return unit
 
     def admitted(self, unit: Unit, samples: Samples) -> tuple[list[float] | None, list[list[float]]]:
-        """The rows of a message that a unit takes; what it does not take is counted."""
+        """The rows of a message that a unit takes; samples that it does not accept are counted."""
         if not self._paid(unit, samples.length):
             unit.counts["flood"] += samples.length
             return None, []

@@ -1,4 +1,4 @@
-"""The process of the page; the service starts it, and tells it on its standard input what to show."""
+"""The process of the page; the service starts it and sends it its settings on standard input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may do what: the first thing that sees a request.
+"""Access control: every request passes it first.
 
 1. the host must be one under which the page is known (a name that someone points at 127.0.0.1 is not);
 2. a request that changes something, and a WebSocket, must come from the page itself (Origin) or from a program;
@@ -38,7 +38,7 @@ HEADERS = [
 
 @dataclass(frozen=True)
 class User:
-    """Who asks."""
+    """The user of a request."""
 
     name: str
     role: str

@@ -1,4 +1,4 @@
-"""What the page knows: it follows the stored results of the journal, as a sink does, and asks the engine for the rest.
+"""The data of the page: it follows the stored results of the journal, as a sink does, and asks the engine for the rest.
 
 It runs in the page's process and reads the database, so viewers never slow the tracking. Memory: the last result of
 every unit, and the recent results of the units that someone looks at.
@@ -19,13 +19,13 @@ from driftfit.service.control import packed
 from driftfit.service.core.journal import Journal, Names
 
 TICK = 0.25
-"""Seconds between two looks."""
+"""Seconds between two reads."""
 CHECK = 60.0
 """Seconds after which the parameters to which drift refers are renewed: drift is that of one to two minutes."""
 RECENT = 512
 """Results of a watched unit that are kept."""
 FORGET = 120.0
-"""Seconds after which a unit that nobody asks for is no longer watched."""
+"""Seconds without a request after which a unit is no longer watched."""
 SHOWN = 200
 """Units of the overview."""
 BACK = 400
@@ -134,7 +134,7 @@ class Feed:
         return list(rows)
 
     def _watch(self, unit: int) -> None:
-        """Read what the blocks of the history do not yet have."""
+        """Read the results that are not yet in blocks of the history."""
         row = self.journal.db.execute("select last from block where unit = ? order by first desc limit 1", (unit,))
         found = row.fetchone()
         after = max(0, (found[0] if found else 0) - 1)
@@ -168,5 +168,5 @@ class Feed:
 
 
 def finite(value: Any) -> Any:
-    """NaN and infinity as None, which JSON can say."""
+    """NaN and infinity as None, which JSON can represent."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

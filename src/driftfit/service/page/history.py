@@ -1,6 +1,6 @@
 """The past of a unit, reduced on the server: least, largest and mean of every column in at most ``points`` parts.
 
-A range of up to as many samples as points is sent as it is. Beyond that, whole blocks are represented by their
+A range with no more samples than points is sent unchanged. Beyond that, whole blocks are represented by their
 extremes, so a million samples cost the reading of 16,000 short rows.
 """
 
@@ -31,7 +31,7 @@ def reduced(
     if total <= 2 * points:
         values = samples(journal, unit, recent, start, stop)
         parts = _parts(values, points)
-        return _told([extremes_of(part) for part in parts], [len(part) for part in parts])
+        return _as_lists([extremes_of(part) for part in parts], [len(part) for part in parts])
     low_high_mean, counts, end = [], [], -1
     query = "select last, count, extremes from block where unit = ? and stop >= ? and start <= ? order by first"
     for last, count, extremes in journal.db.execute(query, (unit, start, stop)):
@@ -42,7 +42,7 @@ def reduced(
     if tail:
         low_high_mean.append(extremes_of(columns_of(tail)))
         counts.append(len(tail))
-    return _told(*_joined(low_high_mean, counts, points))
+    return _as_lists(*_joined(low_high_mean, counts, points))
 
 
 def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, stop: float) -> Array:
@@ -64,7 +64,7 @@ def samples(journal: Journal, unit: int, recent: list[list[Any]], start: float, 
 
 
 def latest(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 10) -> Array:
-    """All columns (T, c) of the last blocks, and of what came after them."""
+    """All columns (T, c) of the last blocks, and of the samples after them."""
     query = "select last, count, rows from block where unit = ? order by first desc limit ?"
     found = journal.db.execute(query, (unit, blocks)).fetchall()[::-1]
     end = max((last for last, _, _ in found), default=-1)
@@ -108,7 +108,7 @@ def _one(found: list[Array], counts: list[int]) -> Array:
     return np.where(fine.any(axis=0), np.stack([low, high, mean]), np.nan)
 
 
-def _told(found: list[Array], counts: list[int]) -> dict[str, Any]:
+def _as_lists(found: list[Array], counts: list[int]) -> dict[str, Any]:
     """Columns as lists, None where there is no number."""
     if not found:
         return {"count": 0, "low": [], "high": [], "mean": []}

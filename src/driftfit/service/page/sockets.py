@@ -1,7 +1,7 @@
-"""What open pages are sent: two and a half times a second the overview, or what is new of one unit.
+"""Messages to open pages: two and a half times a second the overview, or the new results of one unit.
 
-A page says what it looks at: {"view": "fleet"} or {"view": "unit", "unit": "pump 7"}. Each viewer has a task of
-its own, which waits for that viewer alone; one that is slow is sent less often.
+A page states what it shows: {"view": "fleet"} or {"view": "unit", "unit": "pump 7"}. Each viewer has a separate task,
+which waits for that viewer only; one that is slow is sent less often.
 """
 
 from __future__ import annotations

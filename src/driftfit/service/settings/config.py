@@ -33,7 +33,7 @@ Made = TypeVar("Made")
 
 
 class ProblemsError(ValueError):
-    """What is wrong with a configuration, one message per problem."""
+    """The problems of a configuration, one message for each."""
 
     def __init__(self, messages: list[str]) -> None:
         super().__init__("\n".join(messages))
@@ -141,7 +141,7 @@ class _Reader:
         self.problems.append(f"{self.name}:{self.lines.of(path)}: {' '.join(message.split())}")
 
     def tried(self, path: tuple[Any, ...], make: Callable[[], Made]) -> Made | None:
-        """What is made; None if that is a problem, which is then noted with its line."""
+        """The constructed object; None if there is a problem, which is reported with its line."""
         try:
             return make()
         except KeyProblemError as problem:
@@ -234,7 +234,7 @@ class KeyProblemError(ValueError):
 
 
 def at(key: str, make: Callable[[], Made]) -> Made:
-    """What is made; a problem is that of this key."""
+    """The constructed object; a problem is reported for this key."""
     try:
         return make()
     except (ValueError, TypeError) as error:

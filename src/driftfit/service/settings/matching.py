@@ -1,6 +1,6 @@
 """Patterns of topics: ``plant/{pump}/sensors`` matches plant/7/sensors, with pump = 7.
 
-A name in braces stands for one level of a topic, a part between two slashes. Names of units come from outside: they
+A name in braces matches one level of a topic, the part between two slashes. Names of units come from outside: they
 are bounded in length and contain no control characters.
 """
 

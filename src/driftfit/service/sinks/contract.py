@@ -1,4 +1,4 @@
-"""What a sink is: options, and ``write``. A new sink is one file in this folder, with a class of its name.
+"""A sink consists of options and of ``write``. A new sink is one file in this folder, with a class of its name.
 
     class Mine(Sink):                           # src/driftfit/service/sinks/mine.py, kind = "mine"
         url: str                                # options are the fields of a frozen dataclass
@@ -6,8 +6,8 @@
                                                 # Writer.write(batch) returns once the batch is safe
 
 A sink reads the stored results from where it stopped, so one that is away or slow never delays the tracking and loses
-nothing. After a crash the last batches come again: every result has a ``number``, by which a sink that can be
-idempotent leaves out what it has. An exception means that the sink is away; the batch is written again after a pause.
+nothing. After a crash the last batches come again: every result has a ``number``, by which an idempotent sink skips
+results that it already has. An exception means that the sink is away; the batch is written again after a pause.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 
 
 class Result(NamedTuple):
-    """What the tracker said about one sample."""
+    """The tracker's result for one sample."""
 
     number: int
     """Number of the sample in the journal."""

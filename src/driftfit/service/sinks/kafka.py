@@ -21,8 +21,8 @@ class Kafka(Sink):
 
     brokers: str
     topic: str = "driftfit"
-    each: bool = True
-    """Whether every result is sent, or of each batch only the last of a unit."""
+    every_result: bool = True
+    """Whether every result is sent, or only the last result of each unit in a batch."""
     settings: dict[str, str] = field(default_factory=dict)
 
     def check(self) -> None:
@@ -43,7 +43,7 @@ class _Kafka(Writer):
 
     def write(self, batch: Outcome) -> None:
         """Send, and wait until the cluster has it."""
-        units = [one.unit for one in (batch.results if self.options.each else _last(batch))]
+        units = [one.unit for one in (batch.results if self.options.every_result else _last(batch))]
         keys = [*units, *(one.unit for one in batch.events)]
         for key, (topic, body) in zip(keys, messages(self.options, batch), strict=True):
             event = topic.endswith("/event")

@@ -19,34 +19,27 @@ from typing import Any
 import msgspec
 
 from driftfit.service.settings.matching import Pattern
-from driftfit.service.settings.options import Secret
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 from driftfit.service.sinks.sqlite import by_name
-from driftfit.service.sources.mqtt import connected, paho, secure
+from driftfit.service.sources.mqtt import Broker, connected, paho, secure
 
 TIMEOUT = 20.0
 """Seconds in which the broker must have acknowledged a batch."""
 
 
-@dataclass(frozen=True)
-class Mqtt(Sink):
+@dataclass(frozen=True, kw_only=True)
+class Mqtt(Broker, Sink):
     """Topics of a broker."""
 
-    url: str
     topic: str = "driftfit/{unit}"
     """With {unit}, and the names in braces of the unit's pattern."""
     status: str = "driftfit/status"
-    each: bool = True
-    """Whether every result is sent, or of each batch only the last of a unit."""
-    qos: int = 1
-    user: str = ""
-    password: Secret | None = None
-    client: str = ""
-    authority: str = ""
+    every_result: bool = True
+    """Whether every result is sent, or only the last result of each unit in a batch."""
 
     def check(self) -> None:
         """The address, the topic and the client library."""
-        connected(self.url)
+        super().check()
         Pattern(self.topic)
 
     def open(self) -> Writer:
@@ -79,7 +72,7 @@ class _Mqtt(Writer):
                 raise ConnectionError(f"{self.options.url} does not acknowledge")
 
     def close(self) -> None:
-        """Say goodbye."""
+        """Publish the status and disconnect."""
         self.client.publish(self.options.status, "offline", qos=1, retain=True)
         self.client.disconnect()
         self.client.loop_stop()
@@ -87,7 +80,7 @@ class _Mqtt(Writer):
 
 def messages(options: Any, batch: Outcome) -> Iterator[tuple[str, bytes]]:
     """(topic, payload) of a batch."""
-    results = batch.results if options.each else {one.unit: one for one in batch.results}.values()
+    results = batch.results if options.every_result else {one.unit: one for one in batch.results}.values()
     for one in results:
         plain = {key: _finite(value) for key, value in one._asdict().items()}
         plain |= {"theta": by_name(batch, one.unit, one.theta), "std": by_name(batch, one.unit, one.std)}

@@ -26,7 +26,7 @@ TIMEOUT = 10.0
 
 @dataclass(frozen=True)
 class Webhook(Sink):
-    """An address that is told of events."""
+    """An address to which events are posted."""
 
     url: str
     events: list[str] = field(default_factory=lambda: ["alarm", "failed"])

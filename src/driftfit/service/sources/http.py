@@ -16,7 +16,7 @@ class Http(Source):
     """Samples over HTTP; host, port and tokens are those of [page]."""
 
     def open(self, position: Any) -> Reader:
-        """Begin to take samples; the clients keep what is not yet answered."""
+        """Begin to take samples; the clients keep samples that are not yet acknowledged."""
         return _Http()
 
 

@@ -23,7 +23,7 @@ class Incoming:
         self.queue: queue.Queue[Batch] = queue.Queue(most)
 
     def offer(self, topic: str, body: bytes) -> dict[str, Any]:
-        """Decode a request, wait until it is in the journal, and say what was received."""
+        """Decode a request, wait until it is in the journal, and report what was received."""
         samples, refused = decoded(topic, body)
         done = threading.Event()
         try:

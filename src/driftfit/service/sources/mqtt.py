@@ -1,7 +1,7 @@
 """MQTT, by paho-mqtt: a persistent session, acknowledged by hand after the samples are in the journal.
 
 With ``qos = 1`` (the default) and ``time`` in the units, nothing is lost while the service or the broker is away, and
-what the broker sends again is recognised by its time. A retained message is a sample like any other.
+samples that the broker sends again are recognised by their time. A retained message is a sample like any other.
 """
 
 from __future__ import annotations
@@ -22,25 +22,35 @@ AWAY = 20.0
 """Seconds without a connection after which the source is reported to be away."""
 
 
-@dataclass(frozen=True)
-class Mqtt(Source):
-    """Topics of a broker."""
+@dataclass(frozen=True, kw_only=True)
+class Broker:
+    """A broker, and how to log in there."""
 
     url: str
     """mqtt://host:port or mqtts://host:port"""
-    topic: str
-    """Filter with the wildcards + and #; several are separated by spaces."""
     qos: int = 1
     user: str = ""
     password: Secret | None = None
     client: str = ""
-    """Name of the session at the broker; empty: driftfit- and the name of the source."""
+    """Name of the session at the broker; empty: driftfit- and the name of the source, or of the sink and -sink."""
     authority: str = ""
     """File of the certificate authority, if it is not one of the system's."""
 
     def check(self) -> None:
         """The address and the client library."""
         connected(self.url)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mqtt(Broker, Source):
+    """Topics of a broker."""
+
+    topic: str
+    """Filter with the wildcards + and #; several are separated by spaces."""
+
+    def check(self) -> None:
+        """The address, the client library, and a level at which the broker waits for acknowledgements or does not."""
+        super().check()
         if self.qos not in (0, 1):
             raise ValueError(f"mqtt: qos must be 0 or 1; got {self.qos}.")
 
@@ -71,7 +81,7 @@ class _Mqtt(Reader):
             client.subscribe([(topic, self.options.qos) for topic in self.options.topic.split()])
 
     def read(self, wait: float) -> Batch | None:
-        """What has arrived."""
+        """The messages that have arrived."""
         if self.client.is_connected():
             self.lost = time.monotonic()
         elif time.monotonic() - self.lost > AWAY:

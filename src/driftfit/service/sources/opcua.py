@@ -2,7 +2,7 @@
 
 Each entry of ``nodes`` is a unit's topic with its variables by field: the last known values of all of them become a
 sample whenever one of them, or the one named ``trigger``, changes. The time is the source timestamp, in the field
-``time``. A subscription begins with the present values and has no past, so samples during an absence are not seen.
+``time``. A subscription begins with the present values and has no past, so samples during an absence are lost.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class _Plant(Reader):
         return GAIN + share * (CLOSED - GAIN)
 
     def read(self, wait: float) -> Batch | None:
-        """What has been measured since the last call."""
+        """The samples measured since the last call."""
         step = self.options.interval
         due = int((time.time() - self.zero) / step) + self.options.before
         if due <= self.count:

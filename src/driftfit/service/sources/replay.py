@@ -14,7 +14,7 @@ from typing import Any
 
 import polars as pl
 
-from driftfit.service.sources.contract import END, Reader, Source
+from driftfit.service.sources.contract import END, FileSource, Reader
 from driftfit.service.sources.samples import Batch, Samples, seconds
 
 PIECE = 1000
@@ -22,14 +22,9 @@ PIECE = 1000
 
 
 @dataclass(frozen=True)
-class Replay(Source):
+class Replay(FileSource):
     """A recorded file."""
 
-    path: str
-    topic: str = ""
-    """Topic of the samples; empty: the name of the file."""
-    by: str = ""
-    """Column that names the unit; it is added to the topic after a slash."""
     time: str = ""
     speed: float = 0.0
 
@@ -53,7 +48,7 @@ class Replay(Source):
 
 class _Replay(Reader):
     def __init__(self, options: Replay, table: pl.DataFrame, at: int) -> None:
-        self.options, self.table, self.at, self.topic = options, table, at, options.topic or Path(options.path).name
+        self.options, self.table, self.at = options, table, at
         self.clock = [seconds(_plain(cell), 1.0) for cell in table[options.time]] if options.time else []
         self.begun, self.first = time.monotonic(), at
 
@@ -83,7 +78,7 @@ class _Replay(Reader):
         parts = piece.partition_by(by, maintain_order=True) if by else [piece]
         samples = [
             Samples(
-                f"{self.topic}/{part[by][0]}" if by else self.topic, len(part),
+                self.options.topic_of(part[by][0] if by else ""), len(part),
                 {name: [_plain(cell) for cell in part[name]] for name in part.columns},
             )
             for part in parts
@@ -92,5 +87,5 @@ class _Replay(Reader):
 
 
 def _plain(cell: Any) -> Any:
-    """A date as text; anything else as it is."""
+    """A date as text; anything else unchanged."""
     return cell.isoformat() if hasattr(cell, "isoformat") else cell

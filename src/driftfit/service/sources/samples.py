@@ -1,4 +1,4 @@
-"""What sources deliver: samples by topic, decoded from JSON, with an acknowledgement.
+"""The data that sources deliver: samples by topic, decoded from JSON, with an acknowledgement.
 
 A payload is an object of numbers (one sample), an object of lists of equal length (many samples; numbers beside them
 are repeated), or a list of objects:
@@ -39,7 +39,7 @@ class Samples(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What a source has read at once."""
+    """The samples that a source read at once."""
 
     samples: list[Samples]
     acknowledge: Callable[[], None] = lambda: None

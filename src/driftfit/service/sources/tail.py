@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from driftfit.service.sources.contract import Reader, Source
+from driftfit.service.sources.contract import FileSource, Reader
 from driftfit.service.sources.samples import Batch, Samples, decode
 
 PIECE = 1 << 20
@@ -23,14 +23,9 @@ LOOK = 0.05
 
 
 @dataclass(frozen=True)
-class Tail(Source):
+class Tail(FileSource):
     """A file that grows."""
 
-    path: str
-    topic: str = ""
-    """Topic of the samples; empty: the name of the file."""
-    by: str = ""
-    """Field that names the unit; it is added to the topic after a slash."""
     separator: str = ","
 
     def open(self, position: Any) -> Reader:
@@ -42,7 +37,6 @@ class _Tail(Reader):
     def __init__(self, options: Tail, position: Any) -> None:
         self.options = options
         self.path = Path(options.path)
-        self.topic = options.topic or self.path.name
         self._open(position)
 
     def _open(self, position: Any) -> None:
@@ -116,7 +110,7 @@ class _Tail(Reader):
         return Batch(samples, position=position, refused=refused, arrived=time.monotonic())
 
     def _topic(self, row: Any) -> str:
-        return f"{self.topic}/{row.get(self.options.by, '')}" if self.options.by else self.topic
+        return self.options.topic_of(row.get(self.options.by, ""))
 
     def close(self) -> None:
         """Close the file."""

@@ -1,1 +1,1 @@
-"""What the tables and pictures of all results share; it uses runs only, and no function that analyses them."""
+"""The common style of the tables and pictures of all results; it uses runs only, and no function that analyses them."""

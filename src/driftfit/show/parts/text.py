@@ -18,7 +18,7 @@ WIDTH = 96
 
 
 def printed(*parts: Any) -> str:
-    """What a console of `WIDTH` columns shows, as plain text, the same wherever Python runs.
+    """The output of a console of `WIDTH` columns as plain text, the same wherever Python runs.
 
     By default rich sends output to the display of a notebook, and takes colours and widths from the environment.
     """

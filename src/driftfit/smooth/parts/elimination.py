@@ -1,7 +1,7 @@
 """The fast path of the exact smoother: elimination of one increment at a time, a refinement, and a test of both.
 
 For a diagonal q, with U, z the information on theta_t (U theta = z), the increment of parameter i before sample t has
-variance g = q_i drift_t each_ti^2, and leaves
+variance g = q_i drift_t drift_root_ti^2, and leaves
 
     f = 1 / (1 + g U_ii);   a_i = f,  a_j = -g f U_ji;   b = g f z_i
     U_jk <- U_jk + a_j U_ik,  U_ij <- f U_ij;   z_j <- z_j + a_j z_i,  z_i <- f z_i          forwards
@@ -58,8 +58,8 @@ def smooth_and_weigh(walk: Walk) -> tuple[Path, float] | None:
     work = workspace(n).copy()
     work["q"] = np.diag(walk.q)
     steps, samples = np.empty(T, step_type(n)), np.stack([walk.y, walk.weight, walk.drift], axis=1)
-    each = np.ascontiguousarray(walk.each if len(walk.each) else np.ones((1, n)))
-    least = forwards(work, walk.phi, samples, each, steps)
+    drift_root = np.ascontiguousarray(walk.drift_root if len(walk.drift_root) else np.ones((1, n)))
+    least = forwards(work, walk.phi, samples, drift_root, steps)
     C = inverse(work["U"][0])
     if C is None or least < CANCELLED:
         return None
@@ -67,8 +67,8 @@ def smooth_and_weigh(walk: Walk) -> tuple[Path, float] | None:
     volume = float(np.linalg.slogdet(work["U"][0])[1]) - float(np.sum(np.log(pivots)))
     work["C"], work["theta"] = C, C @ work["z"][0]
     theta, var, left = np.empty((T, n)), np.empty((T, n)), np.empty(T)
-    backwards(work, walk.phi, samples, each, steps, theta, var, left)
-    cost = residuals(work, walk.phi, samples, each, steps, theta)
+    backwards(work, walk.phi, samples, drift_root, steps, theta, var, left)
+    cost = residuals(work, walk.phi, samples, drift_root, steps, theta)
     work["theta"] = C @ work["z"][0]
     correct(work, steps, theta)
     correction = work["correction"][0] / np.maximum(work["size"][0], 1e-300)
@@ -106,16 +106,16 @@ def step_type(n: int) -> np.dtype[Any]:
 
 
 @Driver
-def forwards(work: Array, phi: Array, samples: Array, each: Array, steps: Array) -> float:
+def forwards(work: Array, phi: Array, samples: Array, drift_root: Array, steps: Array) -> float:
     """Eliminate every increment; leaves the last U and z in the scratch space and returns the smallest f."""
     s = work[0]
     n = s.z.shape[0]
-    many = 1 if each.shape[0] > 1 else 0
+    many = 1 if drift_root.shape[0] > 1 else 0
     least = 1.0
     for t in range(phi.shape[0]):
         a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
+            g = s.q[i] * samples[t, DRIFT] * drift_root[t * many, i] ** 2
             f = 1.0 / (1.0 + g * s.U[i, i])
             least = min(least, f)
             for j in range(n):
@@ -145,12 +145,12 @@ def forwards(work: Array, phi: Array, samples: Array, each: Array, steps: Array)
 
 @Driver
 def backwards(
-    work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array, var: Array, left: Array
+    work: Array, phi: Array, samples: Array, drift_root: Array, steps: Array, theta: Array, var: Array, left: Array
 ) -> None:
     """theta, variances and 1 - leverage, from the last theta and C in the scratch space."""
     s = work[0]
     n = s.z.shape[0]
-    many = 1 if each.shape[0] > 1 else 0
+    many = 1 if drift_root.shape[0] > 1 else 0
     for t in range(phi.shape[0] - 1, -1, -1):
         a, b = steps[t].a, steps[t].b
         h = 0.0
@@ -167,7 +167,7 @@ def backwards(
             for j in range(n):
                 x += a[i, j] * s.theta[j]
             s.theta[i] = x
-            own = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2 * a[i, i]
+            own = s.q[i] * samples[t, DRIFT] * drift_root[t * many, i] ** 2 * a[i, i]
             for j in range(n):
                 total = 0.0
                 for k in range(n):
@@ -182,18 +182,18 @@ def backwards(
 
 
 @Driver
-def residuals(work: Array, phi: Array, samples: Array, each: Array, steps: Array, theta: Array) -> float:
+def residuals(work: Array, phi: Array, samples: Array, drift_root: Array, steps: Array, theta: Array) -> float:
     """The forward pass of the refinement: b of the residuals; returns the cost of the path."""
     s = work[0]
     n = s.z.shape[0]
-    many = 1 if each.shape[0] > 1 else 0
+    many = 1 if drift_root.shape[0] > 1 else 0
     cost = 0.0
     for i in range(n):
         s.z[i] = 0.0
     for t in range(phi.shape[0]):
         a, b = steps[t].a, steps[t].b
         for i in range(n):
-            g = s.q[i] * samples[t, DRIFT] * each[t * many, i] ** 2
+            g = s.q[i] * samples[t, DRIFT] * drift_root[t * many, i] ** 2
             x = theta[t, i] - theta[t - 1, i] if t > 0 else 0.0
             shift = x / g if g > 0.0 else 0.0
             cost += x * shift

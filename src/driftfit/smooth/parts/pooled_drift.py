@@ -13,8 +13,8 @@ by the likelihood L of the record, which integrates theta out (`driftfit.smooth.
     q = sum_k p_k q_k,    p_k proportional to L_k exp(-penalty_k)
 
 q_t as estimated was fitted to the record, and its likelihood is too large by an amount that grows with the record; the
-penalty, PRICE + T / SHARE, is what that came to in simulations of constant drift. A record with jumps of several
-standard deviations exceeds it many times.
+penalty, PRICE + T / SHARE, was found in simulations of constant drift. A record with jumps of several standard
+deviations exceeds it many times.
 
 Source: averaging over models by their likelihood, Hoeting, Madigan, Raftery and Volinsky (1999); the two shapes are
 ours. Cost: eight smoothers.
@@ -54,18 +54,18 @@ def pooled(rate: Array) -> Array:
 def average_drift(walk: Walk, time: Array) -> Walk:
     """The walk with the average of the drifts, where ``time`` (T,) are the intervals of drift before each sample.
 
-    It is returned as it was if the likelihood cannot be computed accurately.
+    It is returned unchanged if the likelihood cannot be computed accurately.
     """
-    q, span = walk.each**2, time[:, None]
+    q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))
     log_p = np.full((len(shapes), len(SCALES)), -np.inf)
     for k, (one, price) in enumerate(shapes):
         for j, scale in enumerate(SCALES):
-            solved = smooth_and_weigh(walk._replace(each=np.sqrt(scale * one)))
+            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)))
             if solved is None:
                 return walk
             log_p[k, j] = solved[1] - price
     p = np.exp(log_p - log_p.max())
     share = (p / p.sum()) @ np.array(SCALES)
-    return walk._replace(each=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))
+    return walk._replace(drift_root=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))

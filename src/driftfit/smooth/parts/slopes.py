@@ -49,16 +49,16 @@ def smooth(walk: Walk, keep: str = "std") -> Path:
 
 def expanded(walk: Walk) -> Walk:
     """The problem in terms of level and slope."""
-    each = walk.each if len(walk.each) else np.ones(walk.phi.shape)
+    drift_root = walk.drift_root if len(walk.drift_root) else np.ones(walk.phi.shape)
     return walk._replace(
         phi=np.hstack([walk.phi, np.zeros_like(walk.phi)]),
         theta0=np.append(walk.theta0, np.zeros_like(walk.theta0)),
-        each=np.hstack([walk.trend[:, None] * each, each]),
+        drift_root=np.hstack([walk.trend[:, None] * drift_root, drift_root]),
     )
 
 
 def root(g: Array) -> Array:
-    """The triangle through which level and slope receive the noise of the slope, before ``each`` scales its rows."""
+    """The triangle through which the noise of the slope enters level and slope; ``drift_root`` then scales its rows."""
     return np.block([[np.zeros_like(g), g], [np.zeros_like(g), g]])
 
 

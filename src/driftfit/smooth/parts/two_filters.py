@@ -12,8 +12,9 @@ The last rotation yields rho and the product c of the cosines, which give withou
     with t left out         y_t - phi_t' theta_t(without t) = rho / (c sqrt(weight_t))
 
 It handles every ratio of drift to noise, any prior, zero and singular q, a separate drift for every parameter and
-sample (rows of G scaled by ``each``), slopes (a shear of S by ``trend``), collinear and badly scaled regressors. Both
-filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), 8 (n + 1) (n + 2) bytes per sample.
+sample (rows of G scaled by ``drift_root``), slopes (a shear of S by ``trend``), collinear and badly scaled regressors.
+Both filters run in one loop as two lanes, the meeting as `WIDTH` lanes. Cost: O(T n^3), and 8 (n + 1) (n + 2) bytes
+per sample.
 
 Sources: Fraser and Potter (1969) for the two filters; Bierman (1977) for the rotations
 (`driftfit.trackers.parts.information`). Departure: leverage and leave-one-out residuals from the cosines.
@@ -60,7 +61,7 @@ def smooth(walk: Walk, scale: Array, G: Array, begin: Start, keep: str = "std") 
 
 
 def meeting(walk: Walk, G: Array, rows: Array, values: Array, keep: str = "std") -> tuple[Path, Array]:
-    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return what they know."""
+    """Run both filters from ``rows theta_1 = values`` with G G' = q, and combine them; also return their blocks."""
     T, n = walk.phi.shape
     blocks = np.zeros(-(-T // WIDTH), block_type(n))
     pair = workspace(n, 2).copy()
@@ -90,10 +91,10 @@ def _weighted(walk: Walk) -> Array:
 
 
 def _changes(walk: Walk) -> tuple[Array, Array]:
-    """``each`` and ``trend`` with an entry after the last sample, where nothing changes."""
-    each, trend = walk.each, walk.trend.ravel()
-    each = np.vstack([each, np.ones((1, each.shape[1]))]) if len(each) else each
-    return each, np.append(trend, 0.0) if len(trend) else trend
+    """``drift_root`` and ``trend`` with an entry after the last sample, where nothing changes."""
+    drift_root, trend = walk.drift_root, walk.trend.ravel()
+    drift_root = np.vstack([drift_root, np.ones((1, drift_root.shape[1]))]) if len(drift_root) else drift_root
+    return drift_root, np.append(trend, 0.0) if len(trend) else trend
 
 
 def start(walk: Walk, scale: Array, unseen: Array) -> Start:
@@ -145,8 +146,8 @@ def gains(walk: Walk, G: Array, blocks: Array) -> Array:
     M[:, rows, columns] = np.moveaxis(blocks["S"][:, 0], 1, 2).reshape(-1, len(rows))[:T]
     M[:, n] = np.sqrt(walk.weight)[:, None] * walk.phi
     g = G * np.sqrt(walk.drift[1:, None, None])
-    if len(walk.each):
-        g = walk.each[1:, :, None] * g
+    if len(walk.drift_root):
+        g = walk.drift_root[1:, :, None] * g
     back = np.broadcast_to(np.eye(n), (T - 1, n, n))
     if len(walk.trend):
         back = back - np.eye(n, k=n // 2) * walk.trend[1:, None, None]
@@ -185,7 +186,7 @@ def _filters() -> Driver:
 
     @Driver
     def filters(
-        work: Array, samples: Array, drift: Array, each: Array, trend: Array, rows: Array, blocks: Array
+        work: Array, samples: Array, drift: Array, drift_root: Array, trend: Array, rows: Array, blocks: Array
     ) -> float:
         """Lane 0 goes forwards, lane 1 backwards; returns the sum of rho^2 of lane 0.
 
@@ -200,11 +201,11 @@ def _filters() -> Driver:
             absorb(s.S, s.d, s.row, rows[k, n], 0)
         cost = 0.0
         for t in range(T):
-            if each.shape[0] > 0:
+            if drift_root.shape[0] > 0:
                 for l in range(2):
                     for i in range(n):
                         for j in range(i, n):
-                            s.H[i, j, l] = each[t if l == 0 else T - t, i] * s.G[i, j, l]
+                            s.H[i, j, l] = drift_root[t if l == 0 else T - t, i] * s.G[i, j, l]
             if trend.shape[0] > 0:
                 shear(s.S, -trend[t], 0)
             for l in range(2):

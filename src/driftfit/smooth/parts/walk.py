@@ -1,7 +1,7 @@
 """The problem that smoothers solve: a regression whose coefficients walk at random. Arrays only, no runs.
 
 y_t = phi_t' theta_t + v_t,          v_t ~ N(0, r / weight_t)
-theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(each_t)
+theta_t = theta_{t-1} + w_t,         w_t ~ N(0, r drift_t E_t q E_t),  E_t = diag(drift_root_t)
 theta_0 ~ N(theta0, r p0),           p0 = None: nothing is known
 """
 
@@ -38,7 +38,7 @@ class Walk(NamedTuple):
     """(n, n), or None for the diffuse start."""
     r: float | None
     """Noise variance; None if it is to be estimated."""
-    each: Array = NONE
+    drift_root: Array = NONE
     """(T, n): square roots of the factors of each parameter's drift before each sample; empty if there are none."""
     trend: Array = NONE
     """(T,): intervals of motion along a slope before each sample, if q is the drift of that slope; otherwise empty."""
@@ -69,8 +69,8 @@ class Walk(NamedTuple):
         """
         if len(self.trend):
             pull = np.cumsum((self.trend[:, None] * pull)[::-1], axis=0)[::-1]
-        each = self.each[1:] if len(self.each) else 1.0
-        moves: Array = self.drift[1:, None] * each * ((each * pull[1:]) @ self.q)
+        drift_root = self.drift_root[1:] if len(self.drift_root) else 1.0
+        moves: Array = self.drift[1:, None] * drift_root * ((drift_root * pull[1:]) @ self.q)
         return moves
 
 
@@ -125,6 +125,6 @@ def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
     drift[:1] = 0.0 if walk.p0 is None else 1.0
     trend = drift.copy() if len(walk.trend) else NONE
     arranged = walk._replace(
-        phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift, each=NONE, trend=trend
+        phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift, drift_root=NONE, trend=trend
     )
     return arranged, order

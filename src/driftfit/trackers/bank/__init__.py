@@ -1,1 +1,1 @@
-"""Banks of hypotheses: the events that may happen at a sample, and how the tree of their histories is kept small."""
+"""Banks of hypotheses: the events that may happen at a sample, and the reductions of the tree of their histories."""

@@ -14,11 +14,11 @@ Jumps are visible only through the regressors: without excitation there is no de
 `Bank()` alone depends on no scale: see `driftfit.trackers.bank.change`. If the noise variance is unknown (r of the
 nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it is given.
 
-A sample that is not used changes no weight: the leaves become wider by what may have happened, and depth counts used
-samples. Until there are four residuals (with known noise: full rank, or four samples without a new direction) only the
-first change acts. The tree then grows in the directions that the regressors span, and a later direction enters as the
-exact limit of a wide prior. A bank with changes that forget, with leaves that have their own output lags, or with
-form="sqrt" waits for full rank.
+A sample that is not used changes no weight: the leaves are widened by the changes that may have happened, and depth
+counts used samples. Until there are four residuals (with known noise: full rank, or four samples without a new
+direction) only the first change acts. The tree then grows in the directions that the regressors span, and a later
+direction enters as the exact limit of a wide prior. A bank with changes that forget, with leaves that have their own
+output lags, or with form="sqrt" waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -54,9 +54,9 @@ from driftfit.trackers.bank.layout import (
     LAST,
     LEAVES,
     LIMIT,
+    MOST_REPORTED,
     ROW,
     SIZE,
-    TOLD,
     WHOLE,
     R,
 )
@@ -86,7 +86,7 @@ class Bank(Tracker):
     Parameters
     ----------
     changes : list of Change
-        What may happen to theta between samples; the first is the normal course. None: a small drift, and a rare
+        Changes of theta between samples; the first is the normal course. None: a small drift, and a rare
         jump of any parameter, both scale-free.
     sensors : list of Sensor
         How the sensor may behave; the first must be nominal. None: nominal, with unknown noise variance.
@@ -221,7 +221,7 @@ class Bank(Tracker):
 
     @property
     def chained(self) -> bool:
-        """Whether a gap is a chain of changes, all of them walks, of which leaves tell two courses apart."""
+        """Whether a gap is a chain of changes, all of them walks, of which leaves distinguish two courses."""
         merging = isinstance(self.reduction, reductions.IMM | reductions.FirstFloor)
         walks = not any(one.forgets for one in self.all_changes)
         return len(self.all_changes) > 1 and not self._apart and not merging and walks
@@ -312,7 +312,7 @@ class Bank(Tracker):
             "keep0": 1.0 if self.all_changes[0].kind == "directional" else arrays["maps"][0, forget.KEEP],
         }  # fmt: skip
 
-    def beside(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
+    def extra_columns(self, model: Model, T: int, prob: Any, drift: Any) -> Array:
         """Priors of the joint events (T, H) and chains of the changes (T, H_d H_d), NaN where none are given; then
         factors of the changes (T, H_d).
         """
@@ -332,9 +332,9 @@ class Bank(Tracker):
             columns[:, H + Hd * Hd :] = factors.reshape(-1, Hd)
         return columns
 
-    def tell(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
+    def set_extra(self, lane: Mapping[str, Array], model: Model, prob: Any, drift: Any) -> None:
         prob = np.asarray(prob)[None] if np.ndim(prob) == 2 else prob
-        columns, Hd = self.beside(model, 1, prob, drift)[0], len(self.all_changes)
+        columns, Hd = self.extra_columns(model, 1, prob, drift)[0], len(self.all_changes)
         given = np.split(columns, (self._count, len(columns) - Hd))
         for name, values in zip(("given", "given_chain", "drift"), given, strict=True):
             start = lane["table"][ROW[name], 0] // 8
@@ -372,24 +372,22 @@ class Bank(Tracker):
         B: Array = lane["memory"][start // 8 : start // 8 + rows * columns].reshape(rows, columns)
         return B[:, : max(int(lane["counters"][LEAVES]), 1)]
 
-    def told(self, report: Array, name: str) -> Array:
-        """evidence, window, kept, leaves, lag_prob (of the levels `floors_told`, H) or decided (held, 3) from reports
-        (.., size).
-        """
+    def reported(self, report: Array, name: str) -> Array:
+        """A quantity of reports (.., size): lag_prob (.., levels, H), decided (.., held, 3), or a number."""
         if name in SINGLE:
             return report[..., SINGLE.index(name)]
         shape = self._shape
-        floors = len(self.floors_told)
+        levels = len(self.reported_levels)
         start, rows, columns = {
-            "lag_prob": (HEAD, floors, self._count), "decided": (HEAD + floors * self._count, shape.held, 3),
+            "lag_prob": (HEAD, levels, self._count), "decided": (HEAD + levels * self._count, shape.held, 3),
         }[name]  # fmt: skip
         return report[..., start : start + rows * columns].reshape(*report.shape[:-1], rows, columns)
 
     @property
-    def floors_told(self) -> tuple[int, ...]:
+    def reported_levels(self) -> tuple[int, ...]:
         """The levels of the tree that a report contains, counted back from the present: the newest, and the oldest."""
-        W = self._shape.floors
-        return (*range(min(W, TOLD) - 1), W - 1)
+        W = self._shape.levels
+        return (*range(min(W, MOST_REPORTED) - 1), W - 1)
 
     def array(self, model: Model, lane: Mapping[str, Array], name: str) -> Array:
         """One of the packed arrays of a lane, as a view."""
@@ -399,15 +397,15 @@ class Bank(Tracker):
         return part.view(np.int64) if name in WHOLE else part
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
-        told = run.hypotheses
-        kinds = [event.kind for event in told.found()]
+        hypotheses = run.hypotheses
+        kinds = [event.kind for event in hypotheses.found()]
         wrong = f", {kinds.count('sensor')} faults of the sensor" if len(self.all_sensors) > 1 else ""
         said = [("Events", f"{kinds.count('change')} changes{wrong}; see run.hypotheses.events()")]
         faults = int(run.state["counters"][FAULTS])
         if faults:
             said.append(("Fault codes", f"{faults} samples beyond {self.all_sensors[0].limit:g} standard deviations"))
-        if told.impossible:
-            said.append(("Impossible", f"{told.impossible} samples that every hypothesis ruled out, left unused"))
+        if hypotheses.impossible:
+            said.append(("Impossible", f"{hypotheses.impossible} samples that every hypothesis ruled out, left unused"))
         lane = run.state
         if (never := np.isinf(lane["var"])).any():
             names = ", ".join(np.array(run.names)[never])

@@ -1,4 +1,4 @@
-"""Change hypotheses: what may happen to theta between two samples.
+"""Change hypotheses: a possible change of theta between two samples.
 
     theta <- theta,       C <- C + Q                  random walk ("linear forgetting"); Q = 0: nothing
     theta <- theta,       C <- C / forget + Q         exponential forgetting, and two other kinds of forgetting
@@ -121,7 +121,7 @@ class Change(Settings):
         return keep, float(keep == 0.0), float(kind), float(np.log(self.forget))
 
     def anchors(self, n: int, unit: float) -> Array:
-        """(n, n): what that module stores of it; covariances are multiplied by ``unit``."""
+        """(n, n): the numbers that the module stores of it; covariances are multiplied by ``unit``."""
         rows = np.zeros((n, n))
         if self.anchor is not None:
             rows = forget.anchors_of(matrix("Change", "anchor", self.anchor, n) * unit)

@@ -1,4 +1,4 @@
-"""The table of a bank: where its arrays lie, and what its counters and the numbers of a sample are called.
+"""The table of a bank: the places of its arrays, and the names of its counters and of the numbers of a sample.
 
 Every part of the compiled routine is given the table alone (`driftfit.trackers.bank.table`) and reads from it by name.
 Rows of leaves, events of all tables, and parameters are counted as in `driftfit.trackers.bank.leaves.leaf_matrix`.
@@ -28,7 +28,7 @@ With n parameters, tri = n (n + 1) / 2 and H joint events, H_d changes and H_m s
     ring                    recent samples for events of a stream
     new_events              what an event adds to a history
     gap, path               what may have happened since the last used sample (`machine.gaps`)
-    lag_prob, newest        marginals of the events of all floors; of those that are reported
+    lag_prob, newest        marginals of the events of all levels; of those that are reported
     C, m, z, g              of the columns that a sample meets: covariance, mean, regressor, C z
     expected                their z'C z and z'm
     scores                  their unit of covariance or log density; then two rows to spare
@@ -45,15 +45,15 @@ from driftfit.engine.kernel import kernel
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
-    LEAVES, PARENTS, GROUPS, FLOORS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED, OPEN,
-    REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, COUNT,
+    LEAVES, PARENTS, GROUPS, TREE_LEVELS, HELD, EXPANDED, CLOCK, IMPOSSIBLE, STORED, SETTLED, REPORTED_TO, FLIPPED,
+    OPEN, REFUSED, FAULTS, AGAIN, TAKEN, CHAINED, ALIKE, WIDE, PARTED, COUNT,
 ) = range(22)  # fmt: skip
 """Counters of a bank; COUNT is how many there are. SETTLED is 1 once the tree grows, WAITING before, READY where
-it begins with the next sample. OPEN floors have passed since the last used sample
+it begins with the next sample. OPEN levels have passed since the last used sample
 (`driftfit.trackers.bank.machine.gaps`); REFUSED samples in a row were too far from what was expected, FAULTS in all;
 AGAIN says that the present one was just refused; TAKEN steps of its interval are in the table of a gap already. Of the
-present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its floor
-is another than that of one nominal interval, PARTED that leaves go on as two (`machine.gaps.chain_gap`).
+present sample: CHAINED that the user gave a chain of changes, ALIKE that all leaves have one prior, WIDE that its level
+is another than that of one nominal interval, PARTED that leaves are continued as two (`machine.gaps.chain_gap`).
 """
 WAITING, READY = 0, -1
 (
@@ -65,15 +65,15 @@ prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). F
 variance before the tree grows: the residuals until then; inf for a variance that is given.
 """
 NEVER = 1e9
-"""Floors since the last change of a leaf that has none, or more."""
+"""Levels since the last change of a leaf that has none, or more."""
 HEAD = 4
 """Entries of the report before its arrays: evidence, probability of a change in the window, mass kept, leaves."""
-BESIDE = 3
+SAMPLE_HEAD = 3
 """Entries of a remembered sample before its probabilities: that of a change in the window, whether it was used, and how
 many nominal intervals had passed.
 """
-TOLD = 8
-"""Floors that a report tells of: all, or where more are remembered the newest and the oldest."""
+MOST_REPORTED = 8
+"""Levels in a report: all, or where more are remembered the newest and the oldest."""
 
 MATRICES = (
     "parents", "leaves", "history", "history_2", "prior", "walks", "fixed_walks", "relative_walks", "maps",
@@ -84,7 +84,7 @@ VECTORS = ("drift", "initial", "row", "given", "given_chain", "reduction", "base
 WHOLE = ("parent", "event", "start", "order", "group", "slots")
 """Arrays of whole numbers."""
 REPORTED = ("newest", "decided")
-"""Arrays that lie in the report."""
+"""Arrays that are part of the report."""
 WINDOWS = ("C", "m", "z", "g", "from_g", "expected", "scores", "spare", "spare_lags", "narrow", "said")
 """Rows of the scratch that have names."""
 OUTSIDE = {
@@ -93,14 +93,14 @@ OUTSIDE = {
 }  # fmt: skip
 """Arrays that are fields of the state themselves."""
 NUMBERS = ("n", "output_lags", "unknown", "independent", "plain", "walks_only", "apart", "own_likelihoods")
-"""n; how many output lags of their own leaves have; whether the noise is unknown, events are independent; whether all
+"""n; the number of separate output lags of leaves; whether the noise is unknown, events are independent; whether all
 leaves have one regressor, all changes are walks and all sensors differ in their noise alone; whether all changes are
-walks; whether what may have happened since the last used sample is one floor; and the address of the user's own
+walks; whether what may have happened since the last used sample is one level; and the address of the user's own
 likelihoods, while the compiled routine runs.
 """
 BASES = ("memory", *(f"{name}_at" for name in OUTSIDE))
-"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of many
-shapes have one type of record and one driver; and of the other arrays.
+"""Rows with addresses: of the field `memory`, in which most arrays lie one after the other, so that banks of all
+shapes have one driver; and of the other arrays. In those of `memory` and `report` the last column is their length.
 """
 PACKED = (*MATRICES, *VECTORS, *WHOLE, *REPORTED)
 TABLE = Table(
@@ -119,9 +119,21 @@ table_at = TABLE.at
 
 
 @kernel
+def report_at(s: Any) -> int:
+    """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
+    return s.report.ctypes.data  # type: ignore[no-any-return]
+
+
+@kernel
+def memory_at(s: Any) -> int:
+    """Where the field `memory` begins, behind the report."""
+    return s.report.ctypes.data + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
+
+
+@kernel
 def first(t: Any) -> bool:
-    """Whether this is the first floor of the tree."""
-    return t.counters[FLOORS] == 0  # type: ignore[no-any-return]
+    """Whether this is the first level of the tree."""
+    return t.counters[TREE_LEVELS] == 0  # type: ignore[no-any-return]
 
 
 @kernel

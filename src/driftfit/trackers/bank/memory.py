@@ -1,4 +1,4 @@
-"""The memory of a bank: its arrays before the first sample, and how they lie one after the other in one field."""
+"""The memory of a bank: its arrays before the first sample, and their places in one field."""
 
 from __future__ import annotations
 
@@ -10,7 +10,19 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.change import Change
-from driftfit.trackers.bank.layout import BESIDE, COUNT, HEAD, PACKED, REPORTED, ROW, ROWS, SIZE, TOLD
+from driftfit.trackers.bank.layout import (
+    COUNT,
+    HEAD,
+    MEMORY_AT,
+    MOST_REPORTED,
+    PACKED,
+    REPORT_AT,
+    REPORTED,
+    ROW,
+    ROWS,
+    SAMPLE_HEAD,
+    SIZE,
+)
 from driftfit.trackers.bank.leaves import forget
 from driftfit.trackers.bank.leaves.forecast import FROZEN, VALUE
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
@@ -24,7 +36,7 @@ from driftfit.trackers.bank.sensor import Sensor, table_of
 SINGLE = ("evidence", "window", "kept", "leaves")
 """Entries of the head of a report, in its order."""
 SAID = 3
-"""Numbers that a likelihood of the user's own says of each leaf."""
+"""Numbers that a likelihood of the user's own returns for each leaf."""
 RING = 256
 """Samples of which a stream remembers probabilities, for events."""
 
@@ -54,7 +66,7 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
     """
     Hd, Hm, twice = len(bank.all_changes), len(bank.all_sensors), 2 if bank.chained else 1
     shape, H = bank.reduction.shape(Hd, Hm), Hd * Hm
-    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.floors
+    tri, K, W = n * (n + 1) // 2, shape.children * twice, shape.levels
     rows = FIRST + n + tri + na + (na * (na + 1) // 2 if bank.lag_variance else 0)
     forgets = any(one.forgets for one in bank.all_changes)
     more = na + (tri + 2 * n if forgets else 0)
@@ -76,13 +88,14 @@ def arrays_of(bank: Settings, n: int, na: int, unit: float, theta0: Array) -> di
         "components": np.zeros((4 + NODES, K * H if waits else 1)), "root": np.zeros((rows, WIDTH)),
         "samples": np.zeros((int(shape.knobs[selection.DEPTH]) + 1 if refilters or waits else 1, 3 + n)),
         "path": path_of(H, Hd, _whole_vectors(tri) if bank.chained else 0),
-        "ring": np.zeros((RING, BESIDE + H)), "new_events": news_of(H, Hm, remembered), "lag_prob": np.zeros((W, H)),
-        "newest": np.zeros((min(W, TOLD), H)), "decided": np.full((shape.held, 3), -1.0),
+        "ring": np.zeros((RING, SAMPLE_HEAD + H)), "new_events": news_of(H, Hm, remembered),
+        "lag_prob": np.zeros((W, H)), "newest": np.zeros((min(W, MOST_REPORTED), H)),
+        "decided": np.full((shape.held, 3), -1.0),
     }  # fmt: skip
 
 
 def _of_changes(bank: Settings, n: int, unit: float, theta0: Array) -> dict[str, Array]:
-    """Those that say what may happen to theta."""
+    """The arrays of the changes of theta."""
     changes, Hd, tri = bank.all_changes, len(bank.all_changes), n * (n + 1) // 2
     steps, lower, wide = [one.increments(n) for one in changes], np.tril_indices(n), _whole_vectors(tri)
     scaled, forgets = any(sizes.any() for _, sizes in steps), any(one.forgets for one in changes)
@@ -119,7 +132,7 @@ def windows(n: int, na: int, rows: int) -> dict[str, tuple[int, int]]:
 
 
 def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str, Any]:
-    """The fields memory, report and table; sizes are rounded up, so that banks of many shapes share a driver.
+    """The fields memory, report and table; sizes are rounded up, so that records of many banks have one type.
 
     ``numbers`` are those of the table (`layout.NUMBERS`) but for two that the arrays say.
     """
@@ -142,14 +155,15 @@ def packed(arrays: Mapping[str, Array], numbers: Mapping[str, int]) -> dict[str,
     table[ROW["counters"]], table[ROW["sample"]] = (0, 1, COUNT), (0, 1, SIZE)
     walks = (arrays["maps"][:, (forget.KEEP, forget.RESET, forget.KIND)] == (1.0, 0.0, 0.0)).all()
     noises = not arrays["sensors"][:, (VALUE, FROZEN)].any()
+    memory, report = (_padded(np.concatenate(parts), least) for parts, least in zip(flat, (8192, 32), strict=True))
+    table[MEMORY_AT], table[REPORT_AT] = (0, 1, len(memory)), (0, 1, len(report))
     for name, value in {**numbers, "walks_only": walks, "plain": numbers["plain"] and walks and noises}.items():
         table[ROW[name], 0] = value
-    memory, report = (np.concatenate(parts) for parts in flat)
-    return {"memory": _padded(memory, 8192), "report": _padded(report, 32), "table": table, "flat": np.zeros(1)}
+    return {"memory": memory, "report": report, "table": table, "flat": np.zeros(1)}
 
 
 def path_of(H: int, Hd: int, wide: int) -> Array:
-    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty where there is none."""
+    """The table of `driftfit.trackers.bank.machine.gaps.chain_gap`; empty if there is none."""
     return np.zeros((3 * H + Hd + 1 if wide else 0, max(H, wide) + 1))
 
 

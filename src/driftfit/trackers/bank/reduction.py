@@ -25,13 +25,13 @@ MOST = 4096
 
 
 class Shape(NamedTuple):
-    """What a reduction requires of the compiled code: leaves before and after growth, levels remembered, its vector of
-    settings, and the limits of the codes of joint events, sensors and changes.
+    """The requirements of a reduction on the compiled code: leaves before and after growth, levels remembered, its
+    vector of settings, and the limits of the codes of joint events, sensors and changes.
     """
 
     parents: int
     children: int
-    floors: int
+    levels: int
     held: int
     knobs: Array
     bases: Array

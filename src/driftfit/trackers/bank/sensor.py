@@ -144,12 +144,12 @@ class Sensor(Settings):
         Parameters
         ----------
         likelihood : function of the module, of
-            y : the reading; y_hat, h : mean and variance of what a leaf expects of the output, before any noise;
-            r : noise variance of the nominal sensor; last : the last reading that was seen (NaN: none),
+            y : the reading; y_hat, h : mean and variance of a leaf's forecast of the output, without noise;
+            r : noise variance of the nominal sensor; last : the last reading (NaN: none),
             all in units of y. It returns
             log_p : log density of y, -inf where it cannot be;
             noise : the variance of the measurement y as which the leaf is updated (``np.inf``: nothing is learned);
-            clean : what the output was, for the lags of a leaf that believes it, with ``cleans=True``.
+            clean : the true output under this hypothesis, which enters the leaf's lags with ``cleans=True``.
             It may use numbers, `math` and other such functions, and has no state.
         prob : float
             Prior probability.
@@ -158,7 +158,8 @@ class Sensor(Settings):
         cleans : bool
             Whether ``clean`` takes the place of y in the leaf's output lags.
 
-        Cost: the function once for every leaf and sample; about a minute of compiling on each computer. Saved runs keep the function's name, and import it again.
+        Cost: the function once for every leaf and sample; about a minute of compiling on each computer. Saved runs keep
+        the function's name, and import it again.
         """
         scale = numbers("Sensor.own", "scale", scale, ndim=0, low=0.0, strict=True)
         return cls("own", prob=prob, factor=scale * scale, likelihood=likelihood, own_lags=bool(cleans))
@@ -170,7 +171,7 @@ class Sensor(Settings):
         return plain
 
     def row(self) -> list[float]:
-        """What compiled code knows of it: the columns of `driftfit.trackers.bank.leaves.forecast`, but for its number
+        """The numbers for compiled code: the columns of `driftfit.trackers.bank.leaves.forecast`, but for its number
         among the user's own.
         """
         width = -STUCK if self.resolution is None else self.resolution**2 / (2.0 * math.pi)
@@ -184,7 +185,7 @@ class Sensor(Settings):
 
 
 def table_of(sensors: Sequence[Sensor]) -> Array:
-    """What compiled code knows of the sensors of a bank, one a row."""
+    """The numbers of the sensors of a bank for compiled code, one row per sensor."""
     number = np.cumsum([sensor.kind == "own" for sensor in sensors])
     numbered = zip(sensors, number, strict=True)
     return np.array([[*sensor.row(), float(k) if sensor.kind == "own" else 0.0] for sensor, k in numbered])

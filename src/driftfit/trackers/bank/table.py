@@ -67,9 +67,9 @@ def _read(context: Any, builder: Any, table: TableType, value: Any, name: str) -
 
 
 class Table:
-    """The fields of a table: their kinds, their rows, and what gives compiled code a table from its address.
+    """The fields of a table: their kinds and rows, and the intrinsic that returns a table at an address.
 
-    ``based`` says which fields count their offsets from another base than the first.
+    ``based`` maps fields to their base if it is not the first one.
     """
 
     def __init__(self, name: str, fields: Mapping[str, str], bases: tuple[str, ...], based: Mapping[str, str]) -> None:

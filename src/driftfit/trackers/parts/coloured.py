@@ -5,7 +5,7 @@
         with y*_t = y_t - c y*_(t-1),  phi*_t = phi_t - c phi*_(t-1)
 
 because v_(t-1) = y*_(t-1) - phi*_(t-1)' theta, for a theta that hardly moves from one sample to the next. The filters
-therefore take phi* as regressor and c y*_(t-1) as known, so theta is not biased by a lag of y that contains v_(t-1), and
+therefore take phi* as regressor and c y*_(t-1) as known: theta is not biased by a lag of y that contains v_(t-1), and
 no parameter is added. c is estimated by weighted least squares on the derivative psi of the prediction,
 
     psi_t = v_(t-1) - c psi_(t-1),    A <- f A + psi^2 / s,    b <- f b + psi (e + c psi) / s
@@ -19,20 +19,21 @@ Identification (1983), section 3.7; the shrinkage is ours. Cost per sample: O(n)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import Array, State, kernel
 
-FADE = 0.998
+FADE = 0.995
 """Factor of the sums A and b at every sample."""
-SURE = 9.0
+SURE = 5.0
 """Square of the estimate in standard deviations below which innovations count as white."""
 MOST = 0.95
 """Largest size of c: the past is forgotten at this rate at least."""
 GAP = 1.5
-"""A longer interval, in nominal ones, separates a sample from its past."""
+"""Intervals longer than this, in nominal ones, separate a sample from its past."""
 
 
 def white(n: int) -> dict[str, Any]:
@@ -61,7 +62,7 @@ def whiten_noise(s: State, l: int) -> None:
 
 @kernel
 def learn_colour(s: State, l: int) -> None:
-    """c, and the past of the next sample; s.theta is still what was predicted."""
+    """Update c, and store the past of the next sample; s.theta is still the prediction."""
     c, v = s.colour_used[l], s.past_y[l]
     ordinary = s.weighed[l] * (1.0 - s.odd[l])
     for i in range(s.theta.shape[0]):
@@ -77,3 +78,9 @@ def learn_colour(s: State, l: int) -> None:
     square = b * b / A if A > 0.0 else 0.0
     known = b / A * (1.0 - SURE / square) if square > SURE else 0.0
     s.colour[l] = max(-MOST, min(MOST, known))
+
+
+def colour(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
+    """What a summary says of it: nothing where innovations are white."""
+    c = float(lane["colour"])
+    return (("Coloured noise", f"v + {c:.2g} v of the sample before; the previous innovation is used"),) if c else ()

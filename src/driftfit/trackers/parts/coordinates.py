@@ -14,7 +14,7 @@ the rest of phi,
 
     rho = phi - sum_{i<j} x_i M_i.,    z_j = rho' theta,    y = sum_{i<j} x_i z_i + z_j + v
 
-and every filter estimates z_j from what remains of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
+and every filter estimates z_j from the rest of the innovation: m_j = e, C_jj = h + var v, C_ij = -g_i. This is the
 limit of any prior of z_j whose variance grows without bound, also for a rho_j close to rounding: nothing is divided by
 it. The same rule applies if a sample carries so much more information on z_j than all earlier ones that a covariance
 would keep no digits of the difference (`outgrown`).
@@ -43,8 +43,9 @@ from driftfit.trackers.parts.diffuse import (
 )
 
 OUTGROWN = 1e12
-"""Information that one sample may add to what is known of a coordinate, as a multiple of it: what is known before is
-dropped above it, which moves an estimate by less than a millionth of its standard deviation."""
+"""Largest information that one sample may add to a coordinate, as a multiple of the earlier information: above it the
+earlier information is dropped, which moves an estimate by less than a millionth of its standard deviation.
+"""
 
 
 @shared
@@ -66,7 +67,7 @@ def machine_place(S: int, phi: int, work: int, now: int, n: int, L: int, l: int)
 
 @machine
 def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l: int) -> None:
-    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has told apart."""
+    """R and Q for lane l of L: the inverse of M, and a basis of what no sample has determined."""
     S_l, R_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l]
     refresh(S_l, R_l, cubes(work, WORK, n, L)[:, :, l])
     floats(now, NOW, L)[VOLUME, l] = unseen(S_l, R_l, cubes(Q, n, n, L)[:, :, l], 0.0)
@@ -74,7 +75,7 @@ def machine_frame(S: int, R: int, Q: int, work: int, now: int, n: int, L: int, l
 
 @machine
 def machine_estimate(S: int, z: int, Q: int, theta: int, work: int, n: int, L: int, l: int) -> None:
-    """theta for lane l of L: M^-1 z, and what it was in the directions of Q."""
+    """theta for lane l of L: M^-1 z, unchanged in the directions of Q."""
     estimate(
         cubes(S, n, n, L)[:, :, l], floats(z, n, L)[:, l], cubes(Q, n, n, L)[:, :, l], floats(theta, n, L)[:, l],
         cubes(work, WORK, n, L)[ROW, :, l], 0.0,
@@ -82,12 +83,12 @@ def machine_estimate(S: int, z: int, Q: int, theta: int, work: int, n: int, L: i
 
 
 FRAME = (*MACHINES, machine_place, machine_frame, machine_estimate)
-"""What the steps of a tracker in these coordinates call."""
+"""The routines that steps in these coordinates call."""
 
 
 @kernel
 def whiten(s: State, l: int) -> None:
-    """x = M^-T phi, where no column is free."""
+    """x = M^-T phi, if no column is free."""
     for j in range(s.theta.shape[0]):
         u = s.white[j, l]
         for i in range(j):
@@ -97,7 +98,7 @@ def whiten(s: State, l: int) -> None:
 
 @kernel
 def whiten_within(s: State, l: int) -> int:
-    """x where columns are free; returns the one by which phi leaves the span of what was seen, or -1."""
+    """x if columns are free; returns the column along which phi leaves the span of earlier regressors, or -1."""
     n, L = s.d.shape
     machine_place(s.S.ctypes.data, s.white.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
     for i in range(n):
@@ -107,7 +108,7 @@ def whiten_within(s: State, l: int) -> int:
 
 @kernel
 def frame(s: State, l: int) -> None:
-    """After a change of M: its inverse R, and s.H, a basis of what is not told apart."""
+    """After a change of M: its inverse R, and s.H, a basis of what is not determined."""
     n, L = s.d.shape
     machine_frame(
         s.S.ctypes.data, s.R.ctypes.data, s.H.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l
@@ -117,7 +118,7 @@ def frame(s: State, l: int) -> None:
 
 @kernel
 def new_row(s: State, j: int, l: int) -> float:
-    """Let the rest of phi be row j of M; returns its sign there, which the row does not have."""
+    """Make the rest of phi row j of M; returns the sign by which that row was multiplied."""
     n = s.theta.shape[0]
     rest = s.white[j, l]
     for i in range(j):
@@ -141,7 +142,7 @@ def new_row(s: State, j: int, l: int) -> float:
 
 @kernel
 def located(s: State, l: int) -> None:
-    """theta = M^-1 d, where no column is free."""
+    """theta = M^-1 d, if no column is free."""
     n = s.theta.shape[0]
     for i in range(n - 1, -1, -1):
         t = s.d[i, l]
@@ -152,7 +153,7 @@ def located(s: State, l: int) -> None:
 
 @kernel
 def located_within(s: State, l: int) -> None:
-    """theta = M^-1 d where columns are free: it stays where it was in the directions that nothing is known of."""
+    """theta = M^-1 d where columns are free: it does not change in the directions without information."""
     n, L = s.d.shape
     machine_estimate(
         s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.theta.ctypes.data, s.work.ctypes.data, n, L, l
@@ -179,7 +180,7 @@ def in_units_of_theta(s: State, l: int) -> None:
 
 @kernel
 def unseen_variance(s: State, l: int) -> None:
-    """An infinite variance for what no sample has told apart yet."""
+    """An infinite variance for what no sample has determined yet."""
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i, n):

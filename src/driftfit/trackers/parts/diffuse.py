@@ -30,29 +30,33 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, shared
+from driftfit.engine.kernel import Array, State, cubes, exp, floats, kernel, log, machine, packed, shared, wholes
 from driftfit.trackers.parts.information import spread
 
 ROUNDING = 1e-13
-"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, and to spare."""
+"""Share of its terms below which a sum may be rounding: 2^-53 for each of some hundred operations, with a margin."""
 
 WORST = 1e6
-"""Largest variance inflation that is left to a covariance: of sixteen digits ten remain."""
+"""Largest variance inflation for which a covariance is used: ten of sixteen digits remain."""
 
 LEFT = 1e-14
-"""Least share of a variance that one sample leaves: below it what is left is rounding, which may be negative. It takes
+"""Smallest share of a variance that one sample leaves: below it the rest is rounding, which may be negative. It takes
 a regressor ten million times as large as those before it."""
 
 ALMOST_ANY = 1e13
-"""The same for trackers whose work cannot wait: they are least squares without drift before the change of form."""
+"""The same for trackers that cannot wait longer: they are least squares without drift before the change of form."""
 
 SIZE, STD, LOOSE, ROW, WORK = range(5)
-"""Rows of ``work``: norms of the columns of S and of the rows of R, what the error of R grows with, a row to absorb."""
+"""Rows of ``work``: norms of the columns of S and of the rows of R, the scale of the error of R, a row to absorb."""
 
 Y, NOISE, OK, AGE, BEFORE, SQUARE, VOLUME, INFLATION, ENTERING, NOW = range(10)
-"""Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; out come the
-variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation,
-and the column by which a regressor enters."""
+"""Entries of ``at_start``: output, noise variance, whether there is a sample, the age of `unseen`; results: the
+variance of the prediction without noise, u^2 of a new direction or 0, log det N' N after it, the largest inflation, and
+the column by which a regressor enters.
+"""
+
+AT_S, AT_D, AT_R, AT_P, AT_THETA, AT_PHI, AT_WORK, AT_NOW, AT_VAR, ADDRESSES = range(10)
+"""Addresses that `machine_learn` is given."""
 
 
 SCRATCH = ("H", "pivot", "work", "at_start")
@@ -114,18 +118,15 @@ def prediction(s: State, l: int) -> float:
 
 
 @kernel
-def measurement(s: State, l: int) -> None:
-    """One correction with noise variance s.r: theta, the lower triangle of P, and s.y_hat, s.e, s.s.
+def corrected(s: State, y_hat: float, v: float, l: int) -> None:
+    """Correct theta and P from s.g = P h and the variance v of the innovation, and report s.y_hat, s.e, s.s.
 
     Only one triangle is updated: P - outer(k, P phi) rounds asymmetrically, and forgetting lets the antisymmetric part
     grow until it ruins a run of ten thousand steps that looked healthy at five hundred.
     """
-    n = s.theta.shape[0]
-    y_hat = prediction(s, l)
-    v = symmetric_product(s, l) + s.r[l] * s.noise[l]
     e = s.y[l] - y_hat
     gain = s.ok[l] / v
-    for i in range(n):
+    for i in range(s.theta.shape[0]):
         k = gain * s.g[i, l]
         s.theta[i, l] += k * e
         for j in range(i):
@@ -136,9 +137,16 @@ def measurement(s: State, l: int) -> None:
     s.s[l] = v
 
 
+@kernel
+def measurement(s: State, l: int) -> None:
+    """One correction with noise variance s.r."""
+    y_hat = prediction(s, l)
+    corrected(s, y_hat, symmetric_product(s, l) + s.r[l] * s.noise[l], l)
+
+
 @shared
 def refresh(S: Array, R: Array, work: Array) -> None:
-    """R = S^-1 where S has rows, its free columns the vectors that no sample has seen; and the norms of both."""
+    """R = S^-1 on the rows of S; its free columns are orthogonal to all regressors so far; and the norms of both."""
     n = len(S)
     for j in range(n):
         R[j, j] = 1.0 / S[j, j] if S[j, j] > 0.0 else 1.0
@@ -188,7 +196,9 @@ def outside(phi: Array, S: Array, work: Array) -> tuple[int, float, float]:
 
 @shared
 def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
-    """Rotate ``row' theta = y`` into (S, d), past free columns, where it holds rounding, up to the one it enters by."""
+    """Rotate ``row' theta = y`` into (S, d), skipping free columns, where it contains rounding, up to the column by
+    which it enters.
+    """
     n = len(S)
     for i in range(n):
         a, b = S[i, i], row[i]
@@ -210,7 +220,7 @@ def turn_in(S: Array, d: Array, row: Array, y: float, entering: int) -> None:
 
 @shared
 def sheared(x: Array, time: float) -> None:
-    """x = (level, slope) as it is ``time`` later."""
+    """x = (level, slope), moved by ``time``."""
     half = len(x) // 2
     for i in range(half if time != 0.0 else 0):
         x[i] += time * x[half + i]
@@ -218,9 +228,10 @@ def sheared(x: Array, time: float) -> None:
 
 @shared
 def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
-    """Q = an orthonormal basis, one column for each free column, of what no sample has seen; returns log det N' N.
+    """Q = an orthonormal basis of the directions without information, one column for each free column; returns log det
+    N' N.
 
-    Both are of the first sample, ``age`` ago, where theta is made of levels and slopes; otherwise the age is 0.
+    If theta consists of levels and slopes, both refer to the first sample, ``age`` ago; otherwise the age is 0.
     """
     n = len(S)
     volume = 0.0
@@ -229,7 +240,7 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
             for i in range(n):
                 Q[i, j] = R[i, j] if i <= j else 0.0
             sheared(Q[:, j], -age)
-            for _ in range(4):  # in units far apart these are nearly parallel, and what one pass leaves is rounding
+            for _ in range(4):  # in very different units these are nearly parallel, and one pass leaves rounding
                 for k in range(j):
                     if S[k, k] == 0.0:
                         dot = 0.0
@@ -250,7 +261,7 @@ def unseen(S: Array, R: Array, Q: Array, age: float) -> float:
 
 @shared
 def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -> None:
-    """theta that solves S theta = d and keeps what it was in the directions of Q, those that no sample has seen."""
+    """theta that solves S theta = d and is unchanged in the directions of Q, those without information."""
     n = len(S)
     for i in range(n - 1, -1, -1):
         x[i] = theta[i]
@@ -277,7 +288,7 @@ def estimate(S: Array, d: Array, Q: Array, theta: Array, x: Array, age: float) -
 
 @shared
 def covariance(S: Array, R: Array, P: Array) -> None:
-    """The lower triangle of P = R R', given the parameters of free columns."""
+    """The lower triangle of P = R R', conditional on the parameters of free columns."""
     n = len(S)
     for i in range(n):
         for j in range(i + 1):
@@ -289,7 +300,7 @@ def covariance(S: Array, R: Array, P: Array) -> None:
 
 @shared
 def learn(S: Array, d: Array, R: Array, P: Array, theta: Array, phi: Array, work: Array, now: Array) -> None:
-    """Take in a sample, if there is one, after time has passed; ``now`` is ``at_start``."""
+    """Update by a sample, if there is one, after the time update; ``now`` is ``at_start``."""
     n = len(S)
     refresh(S, R, work)
     entering, u, now[BEFORE] = outside(phi, S, work)
@@ -321,16 +332,15 @@ def spanned(S: Array, R: Array, P: Array, var: Array) -> None:
 
 
 @machine
-def machine_learn(
-    S: int, d: int, R: int, P: int, theta: int, phi: int, work: int, now: int, var: int, n: int, m: int, L: int, l: int
-) -> None:  # fmt: skip
+def machine_learn(fields: int, n: int, m: int, L: int, l: int) -> None:
     """`learn` and `spanned` for lane l of L, from the addresses of fields; var has m <= n entries."""
-    S_l, R_l, P_l = cubes(S, n, n, L)[:, :, l], cubes(R, n, n, L)[:, :, l], cubes(P, n, n, L)[:, :, l]
-    learn(
-        S_l, floats(d, n, L)[:, l], R_l, P_l, floats(theta, n, L)[:, l], floats(phi, n, L)[:, l],
-        cubes(work, WORK, n, L)[:, :, l], floats(now, NOW, L)[:, l],
-    )  # fmt: skip
-    spanned(S_l, R_l, P_l, floats(var, m, L)[:, l])
+    at = wholes(fields, 1, ADDRESSES)
+    S, R, P = cubes(at[0, AT_S], n, n, L), cubes(at[0, AT_R], n, n, L), cubes(at[0, AT_P], n, n, L)
+    S_l, R_l, P_l = S[:, :, l], R[:, :, l], P[:, :, l]
+    d, theta, phi = floats(at[0, AT_D], n, L), floats(at[0, AT_THETA], n, L), floats(at[0, AT_PHI], n, L)
+    work, now = cubes(at[0, AT_WORK], WORK, n, L), floats(at[0, AT_NOW], NOW, L)
+    learn(S_l, d[:, l], R_l, P_l, theta[:, l], phi[:, l], work[:, :, l], now[:, l])
+    spanned(S_l, R_l, P_l, floats(at[0, AT_VAR], m, L)[:, l])
 
 
 @machine
@@ -340,23 +350,29 @@ def machine_wander(S: int, d: int, H: int, pivot: int, n: int, L: int, l: int, s
 
 
 MACHINES = (machine_learn, machine_wander)
-"""What the steps of a tracker that starts here call; see `TrackerSteps`."""
+"""The routines that the steps of a tracker with a diffuse start call; see `TrackerSteps`."""
 
 
 @kernel
 def wander(s: State, size: float, l: int) -> None:
-    """Let theta move by ``size`` s.H w with w ~ N(0, I), in square-root form."""
+    """Move theta by ``size`` s.H w with w ~ N(0, I), in square-root form."""
     n, L = s.d.shape
     machine_wander(s.S.ctypes.data, s.d.ctypes.data, s.H.ctypes.data, s.pivot.ctypes.data, n, L, l, size)
 
 
 @kernel
-def drifted(s: State, time: float, l: int) -> None:
-    """What a random walk of covariance ``time`` E G G' E does to the square root, E the roots of each one's factor."""
+def scale_drift(s: State, l: int) -> None:
+    """s.H = E G, with E the diagonal matrix of the roots of the drift factors."""
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i, n):
-            s.H[i, j, l] = s.each[i, l] * s.G[i, j, l]
+            s.H[i, j, l] = s.drift_root[i, l] * s.G[i, j, l]
+
+
+@kernel
+def drifted(s: State, time: float, l: int) -> None:
+    """The time update of the square root for a random walk of covariance ``time`` E G G' E."""
+    scale_drift(s, l)
     wander(s, np.sqrt(time), l)
 
 
@@ -365,10 +381,11 @@ def call(s: State, theta: int, phi: int, ok: float, age: float, l: int) -> None:
     """`learn` from parameters and regressors at these addresses, with the sample if ok is 1."""
     n, L = s.d.shape
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[AGE, l] = s.y[l], s.r[l] * s.noise[l], ok, age
-    machine_learn(
+    fields = packed((
         s.S.ctypes.data, s.d.ctypes.data, s.R.ctypes.data, s.P.ctypes.data, theta, phi, s.work.ctypes.data,
-        s.at_start.ctypes.data, s.var.ctypes.data, n, s.var.shape[0], L, l,
-    )  # fmt: skip
+        s.at_start.ctypes.data, s.var.ctypes.data,
+    ))  # fmt: skip
+    machine_learn(fields, n, s.var.shape[0], L, l)
 
 
 @kernel
@@ -392,19 +409,19 @@ def take_in(s: State, l: int) -> None:
 
 @kernel
 def reform(s: State, l: int) -> None:
-    """P as the square root has it, after something else than a sample."""
+    """Recompute P from the square root, after a change that is not a sample."""
     call(s, s.theta.ctypes.data, s.phi.ctypes.data, 0.0, 0.0, l)
 
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """Let the covariance be the state from now on, where it will do."""
+    """Make the covariance the state from now on, if it is accurate enough."""
     s.root[l] = 0 if s.at_start[INFLATION, l] <= s.worst[l] else 1
 
 
 @kernel
 def enter(s: State, l: int) -> None:
-    """The correction while the state is in square-root form, and the change to a covariance where that will do."""
+    """The correction while the state is in square-root form, and the change to a covariance once that is accurate."""
     take_in(s, l)
     hand_over(s, l)
 

@@ -21,7 +21,7 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.outlying_readings import FIRST
 
 MEMORY = 200.0
-"""Samples over which the mean square of a regressor is remembered."""
+"""Memory of the mean square of a regressor, in samples."""
 DULL = 1e-4
 """A square below this share of the mean square counts as no excitation."""
 
@@ -30,7 +30,7 @@ LARGE = 25.0
 
 
 def window(n: int) -> int:
-    """Samples over which G looks."""
+    """Number of samples in the window of G."""
     return max(50, 10 * n)
 
 
@@ -48,13 +48,13 @@ def no_excitation(n: int) -> dict[str, Any]:
 
 @kernel
 def bounded(square: float, mean: float, count: float) -> float:
-    """A square as it counts in a mean square of ``count`` others: a fault code may not make a scale of its own."""
+    """A square, bounded for a mean square of ``count`` others: a fault code must not become the scale."""
     return min(square, LARGE * mean) if count >= FIRST else square
 
 
 @kernel
 def learn_scales(s: State, l: int) -> None:
-    """Mean squares of the regressors over the samples on which they did anything, and of y."""
+    """Update the mean squares of the regressors, over samples at which they were excited, and of y."""
     s.seen_samples[l] += s.ok[l]
     square = bounded(s.y[l] * s.y[l], s.power[l], s.seen_samples[l])
     active = s.ok[l] if square > DULL * s.power[l] else 0.0
@@ -68,7 +68,9 @@ def learn_scales(s: State, l: int) -> None:
 
 @kernel
 def learn_information(s: State, l: int) -> None:
-    """Windowed Gram matrix of the regressors in units of their scale: what the guard against dull inputs looks at."""
+    """Windowed Gram matrix of the regressors in units of their scale: the samples that the guard against constant
+    inputs examines.
+    """
     n = s.theta.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -79,7 +81,7 @@ def learn_information(s: State, l: int) -> None:
 
 
 def learned(lane: Mapping[str, Array]) -> Array:
-    """Which parameters the regressors of the window tell apart from all others, (n,) bool."""
+    """Which parameters the regressors of the window distinguish from all others, (n,) bool."""
     lower = np.tril(lane["information"])
     G = lower + np.tril(lower, -1).T
     own: Array = 1.0 / np.diag(np.linalg.inv(G + 1e-9 * np.eye(len(G))))

@@ -37,7 +37,7 @@ def not_frozen() -> dict[str, Any]:
 
 @kernel
 def leave_out_frozen(s: State, l: int) -> None:
-    """Leave a reading out that is more likely frozen than not; s.y_hat and s.s must be known."""
+    """Leave out a reading that is more likely frozen than not; s.y_hat and s.s must be known."""
     if s.seen[l] > 0.0:
         repeats = abs(s.y[l] - s.before[l]) <= ROUNDING * abs(s.y[l])
         s.before[l] = s.y[l]
@@ -59,7 +59,7 @@ def leave_out_frozen(s: State, l: int) -> None:
 
 
 def held_readings(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where no sensor was frozen."""
+    """Its remark in a summary: nothing if no sensor was frozen."""
     count = int(lane["held"])
     return (
         (("Frozen", f"{count} readings that repeat the one before where a change was expected: not used"),)

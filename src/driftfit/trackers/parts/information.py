@@ -26,7 +26,7 @@ from driftfit.engine.kernel import Array, kernel
 
 @kernel
 def absorb(S: Array, d: Array, row: Array, y: float, l: int) -> tuple[float, float]:
-    """Rotate ``row' theta = y``, with noise variance 1, into (S, d); returns (rho, c). The row is used up."""
+    """Rotate ``row' theta = y``, with noise variance 1, into (S, d); returns (rho, c). The row is overwritten."""
     n = S.shape[0]
     left = 1.0
     for i in range(n):
@@ -48,7 +48,7 @@ def absorb(S: Array, d: Array, row: Array, y: float, l: int) -> tuple[float, flo
 
 @kernel
 def spread(S: Array, d: Array, G: Array, size: float, pivot: Array, l: int) -> None:
-    """Let theta move by ``size`` G w with w ~ N(0, I); ``pivot`` (n, L) is scratch space."""
+    """Move theta by ``size`` G w with w ~ N(0, I); ``pivot`` (n, L) is scratch space."""
     n = S.shape[0]
     for q in range(n):
         for j in range(n):
@@ -73,9 +73,9 @@ def spread(S: Array, d: Array, G: Array, size: float, pivot: Array, l: int) -> N
 
 @kernel
 def shear(S: Array, time: float, l: int) -> None:
-    """S <- S [[1, time], [0, 1]], which leaves a triangle a triangle.
+    """S <- S [[1, time], [0, 1]], which keeps S triangular.
 
-    With x = (level, slope): what S says of (level + time slope, slope) it then says of x.
+    With x = (level, slope): the information of S about (level + time slope, slope) is then about x.
     """
     half = S.shape[0] // 2
     for i in range(S.shape[0]):
@@ -108,7 +108,7 @@ def invert(S: Array, R: Array, l: int) -> None:
 
 
 def widen(S: Array, d: Array, p: Array) -> None:
-    """Let theta move by variances p, in place, outside compiled code: S (n, n), d (n,)."""
+    """Add variances p to theta, in place, outside compiled code: S (n, n), d (n,)."""
     n = len(d)
     spread.py_func(S[..., None], d[..., None], np.diag(np.sqrt(p))[..., None], 1.0, np.zeros((n, 1)), 0)
 

@@ -1,4 +1,4 @@
-"""Readings and regressors out of all proportion to earlier ones: fault codes, spikes, wrong units.
+"""Readings and regressors far outside the range of earlier ones: fault codes, spikes, wrong units.
 
 A reading of 9999 where the output is near 10 carries no information about the system, and it does harm in three ways:
 as an output, as a lag in the regressors of later samples, and in every scale that is estimated from the data. With m
@@ -28,13 +28,13 @@ from typing import Any
 from driftfit.engine.kernel import Array, State, kernel
 
 REACH = 10.0
-"""Standard deviations of the readings beyond which one is out of proportion."""
+"""Standard deviations of the readings beyond which one is an outlier."""
 LEVERAGE = 100.0
 """Largest weight of one regressor, in ordinary samples."""
 FIRST = 10.0
-"""Number of first readings that are accepted as they are, for comparison with later ones."""
+"""Number of first readings that are accepted without a check, for comparison with later ones."""
 MEMORY = 1000.0
-"""Readings over which their mean and variance are remembered."""
+"""Memory of the mean and variance of the readings, in readings."""
 LONGEST = 1e12
 """Upper bound of the patience."""
 
@@ -49,7 +49,7 @@ def no_proportion() -> dict[str, Any]:
 
 @kernel
 def leave_out(s: State, l: int) -> None:
-    """Leave a reading out that is out of all proportion; s.y_hat must be known."""
+    """Leave out a reading far outside the usual range; s.y_hat must be known."""
     away, e = (s.y[l] - s.middle[l]) ** 2, (s.y[l] - s.y_hat[l]) ** 2
     e = e if s.valid[l] > 0.0 else away
     reach = REACH * REACH * s.spread[l]
@@ -65,9 +65,9 @@ def leave_out(s: State, l: int) -> None:
 
 @kernel
 def learn_proportion(s: State, l: int, outlier: float) -> None:
-    """Mean and variance of the readings that were let in, and patience, given the probability of an outlier.
+    """Update mean and variance of the accepted readings, and the patience, given the probability of an outlier.
 
-    A reading that repeats the last one has nothing new: a plant that stands still keeps its scale.
+    A reading that repeats the last one has nothing new: a plant at standstill keeps its scale.
     """
     odd = max(s.strange[l], outlier)
     if s.seen[l] > 0.0 or odd > 0.0:
@@ -91,6 +91,6 @@ def bound_leverage(s: State, l: int) -> None:
 
 
 def proportion(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where all readings were let in."""
+    """Its remark in a summary: nothing if all readings were accepted."""
     count = int(lane["left_out"])
     return (("Left out", f"{count} readings out of all proportion to those before"),) if count else ()

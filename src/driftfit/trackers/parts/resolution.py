@@ -35,7 +35,7 @@ ROUNDING = 1e-12
 """A step below this share of the reading is rounding, and the reading a repeated one."""
 
 LONGEST = 4.0
-"""More repeated readings in a row count as so many."""
+"""At most so many repeated readings in a row count."""
 
 
 def unresolved() -> dict[str, Any]:
@@ -48,7 +48,7 @@ def unresolved() -> dict[str, Any]:
 
 @kernel
 def resolve(s: State, l: int) -> None:
-    """Take in a reading."""
+    """Process a reading."""
     y, seen, quantum = s.y[l], s.seen[l], s.quantum[l]
     step = abs(y - s.reading[l])  # NaN at the first reading, which neither moves nor repeats
     moved = seen if step > ROUNDING * abs(y) else 0.0
@@ -67,15 +67,15 @@ def resolve(s: State, l: int) -> None:
 
 @kernel
 def lasting(s: State, l: int) -> float:
-    """What a reading that repeats adds to the variance of its noise: k in a row share one error of rounding.
+    """The variance that a repeated reading adds to its noise: k in a row share one error of rounding.
 
-    With coarse (k + 1)^2 in the place of coarse a run of them is worth no more than two readings.
+    With coarse (k + 1)^2 instead of coarse, a run of repeated readings counts no more than two readings.
     """
     return s.coarse[l] * s.alike[l] * (s.alike[l] + 2.0)  # type: ignore[no-any-return]
 
 
 def resolution(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where readings are fine."""
+    """Its remark in a summary: nothing if the resolution is fine."""
     if not lane["coarse"] > 0.0:
         return ()
     share = float(lane["repeats"] / (lane["repeats"] + lane["steps"]))

@@ -41,7 +41,7 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.information import shear
 from driftfit.trackers.parts.resolution import resolve
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_scale, no_scale
 
 
@@ -50,7 +50,7 @@ def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
     n = len(theta0)
     return {
         "theta": theta0, "slope": np.zeros(n), "P": np.zeros((2 * n, 2 * n)), "q": 1.0 / mu, "r": 1.0,
-        "g": np.zeros(2 * n), "each": np.ones(n), "begun": 0.0, **no_scale(),
+        "g": np.zeros(2 * n), "drift_root": np.ones(n), "begun": 0.0, **no_scale(),
         "tau": 0.0, "x": np.zeros(2 * n), "z": np.zeros(2 * n), **knowing_nothing(2 * n),
     }  # fmt: skip
 
@@ -71,7 +71,7 @@ def drift(s: State, l: int) -> None:
             top, bottom = max(i, j), min(i, j)
             s.P[n + i, j, l] += dt * s.P[n + top, n + bottom, l]
     for i in range(n):
-        q = s.q[i, l] * (s.each[i, l] * s.each[i, l]) * (dt * s.drift[l])
+        q = s.q[i, l] * (s.drift_root[i, l] * s.drift_root[i, l]) * (dt * s.drift[l])
         s.P[i, i, l] += dt * dt * q
         s.P[n + i, i, l] += dt * q
         s.P[n + i, n + i, l] += q
@@ -126,7 +126,7 @@ def drifted(s: State, l: int) -> None:
     s.tau[l] += dt
     shear(s.S, -dt, l)
     for i in range(n):
-        root = s.each[i, l] * np.sqrt(s.q[i, l])
+        root = s.drift_root[i, l] * np.sqrt(s.q[i, l])
         s.H[i, n + i, l], s.H[n + i, n + i, l] = dt * root, root
         s.theta[i, l] += dt * s.slope[i, l]
     wander(s, np.sqrt(dt * s.drift[l]), l)
@@ -158,4 +158,4 @@ def begin(s: State, l: int) -> None:
     spanned_variance(s, l)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)

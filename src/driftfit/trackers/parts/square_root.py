@@ -19,13 +19,13 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, diagonal
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.trackers.parts.diffuse import MACHINES, drifted, prediction, spanned_variance, take_in
+from driftfit.trackers.parts.diffuse import MACHINES, drifted, prediction, scale_drift, spanned_variance, take_in
 from driftfit.trackers.parts.information import absorb, invert, solve, spread, triangular_root
-from driftfit.trackers.parts.varying_drift import told
+from driftfit.trackers.parts.varying_drift import read_drift
 
 
 def state(theta0: Array, p0: Array | None) -> Mapping[str, Any]:
-    """Fields beside those of the covariance form."""
+    """Further fields of the square-root form."""
     from scipy import linalg  # a fifth of a second to import
 
     n = len(theta0)
@@ -35,10 +35,7 @@ def state(theta0: Array, p0: Array | None) -> Mapping[str, Any]:
 
 @kernel
 def grow(s: State, l: int) -> None:
-    n = s.theta.shape[0]
-    for i in range(n):
-        for j in range(i, n):
-            s.H[i, j, l] = s.each[i, l] * s.G[i, j, l]
+    scale_drift(s, l)
     spread(s.S, s.d, s.H, np.sqrt(s.dt[l] * s.drift[l]), s.pivot, l)
 
 
@@ -97,4 +94,4 @@ def begin(s: State, l: int) -> None:
     s.root[l] = 1 if s.rank[l] < s.theta.shape[0] else 0
 
 
-STEPS = TrackerSteps(grow, correct, diagonal, begin, told=told, machines=MACHINES)
+STEPS = TrackerSteps(grow, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)

@@ -1,7 +1,7 @@
 """The predictive density where the noise variance is estimated: Student's t.
 
-    y_t | past  ~  t_nu(y_hat_t, s_t),      s_t = scale s0_t,   scale = sum(e^2 / s0) / nu over the nu samples before
-    log p(y_t | past) = lgamma((nu + 1) / 2) - lgamma(nu / 2) - 1/2 log(pi nu s_t) - (nu + 1) / 2 log(1 + e^2 / (nu s_t))
+    y_t | past ~ t_nu(y_hat_t, s_t),   s_t = scale s0_t,   scale = sum(e^2 / s0) / nu over the nu samples before
+    log p = lgamma((nu + 1) / 2) - lgamma(nu / 2) - 1/2 log(pi nu s_t) - (nu + 1) / 2 log(1 + e^2 / (nu s_t))
 
 This is exact for constant parameters with the improper prior 1 / sigma^2 of the noise variance: the sum is the log
 evidence given the samples that determined the parameters and the first residual, since no density of the first

@@ -3,7 +3,7 @@
     q_t = diag(d_t)^(1/2) q diag(d_t)^(1/2),   d_t >= 0 known before sample t
 
 For flexible least squares it is a separate weight for every step and parameter, mu_i / d_ti; d = 0 keeps a parameter
-where it is. Trackers that support it have a field ``each`` (n,), the square roots of d, which are 1 by default.
+where it is. Trackers that support it have a field ``drift_root`` (n,), the square roots of d, which are 1 by default.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from driftfit.engine.kernel import Array, State, kernel
 
 
 @kernel
-def told(s: State, known: Array, t: int, l: int) -> None:
+def read_drift(s: State, known: Array, t: int, l: int) -> None:
     """Take the roots from the columns of ``known`` after the third."""
     for i in range(s.theta.shape[0]):
-        s.each[i, l] = known[t, 3 + i, l]
+        s.drift_root[i, l] = known[t, 3 + i, l]
 
 
 def roots(owner: str, names: Sequence[str], T: int, drift: Any) -> Array:
-    """The columns (T, n); ValueError where ``drift`` has another shape or cannot be a factor."""
+    """The columns (T, n); ValueError if ``drift`` has another shape or cannot be a factor."""
     factors, n = as_numbers("drift", drift), len(names)
     if factors.shape != (T, n):
         raise ValueError(

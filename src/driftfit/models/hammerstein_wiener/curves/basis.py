@@ -160,8 +160,8 @@ class Thresholds(Basis):
     """The common part of dead zone and saturation: two thresholds p2 <= 0 <= p1 among the coefficients (1, p1, p2).
 
     The functions of an input take the thresholds from the estimates of the sample before it, limited to 0 .. 0.97 u_max
-    and -0.97 u_max .. 0: a Gauss-Newton step in p. What is learned while they are wrong is wrong, so the tracker must
-    forget: with q = 0 they approach the truth only as fast as the share of those samples falls.
+    and -0.97 u_max .. 0: a Gauss-Newton step in p. Parameters learned while they are wrong are wrong, so the tracker
+    must forget: with q = 0 they approach the truth only as fast as the share of those samples falls.
     """
 
     u_max: float

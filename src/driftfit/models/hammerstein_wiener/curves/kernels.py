@@ -1,11 +1,11 @@
 """The compiled functions of all bases that the library brings, behind one for every kind.
 
 `every` fills ``out`` (n,) and ``slopes`` (n,) with the functions and their derivatives at x; p[0] is the code of the
-kind and the rest its own numbers, which is what the parts take. Steps call it as the machine `evaluate`, with addresses
-of p, out and slopes, whose elements stand ``stride`` numbers apart: it is compiled once.
+kind; the rest are its numbers, which are the arguments of the parts. Steps call it as the machine `evaluate`, with
+addresses of p, out and slopes, whose elements are ``stride`` numbers apart: it is compiled once.
 
-B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs stands at
-the end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
+B-splines after Piegl and Tiller, The NURBS Book (1997), section 2.5; the scratch that their recursion needs is at the
+end of their numbers [degree, count, knots.., scratch.., values at the anchor..].
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def machine_of(function: Any) -> Any:
     def machine_evaluate(x: float, p: int, count: int, out: int, slopes: int, n: int, stride: int) -> None:
         function(x, floats(p, count, stride)[:, 0], floats(out, n, stride)[:, 0], floats(slopes, n, stride)[:, 0])
 
-    machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a place on disk of its own
+    machine_evaluate.__qualname__ += f"_{function.identity[:12]}"  # a separate file on disk
     return machine(machine_evaluate)
 
 

@@ -89,7 +89,7 @@ def _of_minimal(run: Track, model: HammersteinWiener) -> Blocks:
     structure = model.structure
     at = structure.na + sum(structure.nb)
     leads = at + structure.leads - np.arange(model.m)
-    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 stand
+    fixed = [*leads, at + sum(structure.n_in) - model.m]  # entries of xi before which c_1 and d_1 are inserted
     var = np.insert(run.var, fixed, 0.0, axis=1)
     cov = None
     if run.keeps_cov:

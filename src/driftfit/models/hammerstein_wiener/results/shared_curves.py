@@ -30,7 +30,7 @@ def shared_curves(run: Any, method: str = "svd-joint") -> dict[str, Blocks]:
 
     Parameters
     ----------
-    run : what `track` returns for a `HammersteinWiener` with several outputs
+    run : the result of `track` for a `HammersteinWiener` with several outputs
     method : "svd-joint" or "svd"
         How a and d of each output are separated.
 

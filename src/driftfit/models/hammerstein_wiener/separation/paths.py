@@ -144,7 +144,7 @@ class Blocks:
         Parameters
         ----------
         input : "unit", "c1" or "b1"
-            What is set to 1: |c|, with the sign of a rising curve, c_1 or b_1.
+            The coefficient that is set to 1: |c|, with the sign of a rising curve, c_1 or b_1.
         output : "d1", "unit" or "slope"
             d_1 = 1, |d| = 1 with d_1 > 0, or F'(at) = 1.
         at : number

@@ -27,39 +27,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import covariance, matrix, numbers, vector
+from driftfit.engine.kernel import State, kernel
+from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
-from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.products import Structure
-from driftfit.models.hammerstein_wiener.step_memory import MINIMAL
-from driftfit.trackers.base import Tracker
+from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.trackers.kalman import drift, drift_matrix
-from driftfit.trackers.parts.diffuse import LEFT, product_with
-from driftfit.trackers.parts.varying_drift import told
-
-
-def structure_of(owner: str, model: Model) -> Structure:
-    """The structure of a Hammerstein-Wiener model; ValueError for any other model, and if xi is ambiguous."""
-    if not isinstance(model, HammersteinWiener):
-        raise ValueError(
-            f"{owner}: works on the minimal parameters of a HammersteinWiener model; got {type(model).__name__}."
-        )
-    structure = model.structure
-    if structure.n == structure.n_x and structure.names != structure.minimal_names:
-        raise ValueError(
-            f"{owner}: with na = {structure.na} and nb = {structure.nb} there are as many products as minimal "
-            "parameters, so the two cannot be distinguished; track the products with Kalman and separate them."
-        )
-    return structure
-
-
-def minimal_memory(model: Model) -> Array:
-    """The memory of the model with the mark that theta is xi."""
-    blocks = np.array(model.memory()["blocks"])
-    blocks[MINIMAL] = 1.0
-    return blocks
+from driftfit.trackers.parts.diffuse import corrected, product_with
+from driftfit.trackers.parts.varying_drift import read_drift
 
 
 @lru_cache
@@ -106,24 +81,13 @@ def _steps(structure: Structure, together: bool) -> TrackerSteps:
     def correct(s: State, l: int) -> None:
         y_hat = row(s, l)
         h = spread_of(s, l)
-        v = (1.0 + s.inflation[l]) * h + s.r[l] * s.noise[l]
-        e = s.y[l] - y_hat
-        gain = s.ok[l] / v
-        for i in range(s.theta.shape[0]):
-            k = gain * s.g[i, l]
-            s.theta[i, l] += k * e
-            for j in range(i):
-                s.P[i, j, l] -= k * s.g[j, l]
-            s.P[i, i, l] = max(s.P[i, i, l] - k * s.g[i, l], LEFT * s.P[i, i, l])
-        s.y_hat[l] = y_hat
-        s.e[l] = e
-        s.s[l] = v
+        corrected(s, y_hat, (1.0 + s.inflation[l]) * h + s.r[l] * s.noise[l], l)
 
-    return TrackerSteps(drift_matrix if together else drift, correct, told=told)
+    return TrackerSteps(drift_matrix if together else drift, correct, read_extra=read_drift)
 
 
 @dataclass(frozen=True)
-class ExtendedKalman(Tracker):
+class ExtendedKalman(Minimal):
     """Extended Kalman filter on the minimal parameters of a `HammersteinWiener` model.
 
     Parameters
@@ -131,7 +95,7 @@ class ExtendedKalman(Tracker):
     q : number, (n_x,), or (n_x, n_x)
         Drift covariance of xi per nominal sample. A number is that number times the identity.
     r : number
-        Variance of the equation error; with ``output_noise`` in the model, a factor of what that gives: 1.
+        Variance of the equation error; with ``output_noise`` in the model, a factor of its variance: 1.
     p0 : number, (n_x,) or (n_x, n_x)
         Covariance of xi before the first sample.
     theta0 : number or (n_x,)
@@ -151,22 +115,10 @@ class ExtendedKalman(Tracker):
     theta0: Any = 0.01
     inflation: float = 0.0
 
-    required: ClassVar[tuple[str, ...]] = ("q", "r")
-    drift_each: ClassVar[bool] = True
+    drift_per_parameter: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.q is not None:
-            self._set("q", covariance("ExtendedKalman", "q", self.q))
-        if self.r is not None:
-            self._set("r", numbers("ExtendedKalman", "r", self.r, ndim=0, low=0.0, strict=True))
-        self._set("p0", covariance("ExtendedKalman", "p0", self.p0))
-        self._set("theta0", numbers("ExtendedKalman", "theta0", self.theta0))
-        self._set("inflation", numbers("ExtendedKalman", "inflation", self.inflation, ndim=0, low=0.0))
-
-    @classmethod
-    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
-        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
-        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
+        self._check("inflation")
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The state for n minimal parameters."""
@@ -178,14 +130,10 @@ class ExtendedKalman(Tracker):
             "r": self.r,
             "inflation": self.inflation,
             "g": np.zeros(n),
-            "each": np.ones(n),
+            "drift_root": np.ones(n),
             "h_row": np.zeros(n),
             "var": np.zeros(n),
         }
-
-    @property
-    def steps(self) -> TrackerSteps:
-        raise ValueError("ExtendedKalman: the steps depend on the model; see steps_for.")
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("ExtendedKalman", model)
@@ -193,6 +141,3 @@ class ExtendedKalman(Tracker):
 
     def steps_for(self, model: Model) -> TrackerSteps:
         return _steps(structure_of("ExtendedKalman", model), np.ndim(self.q) == 2)
-
-    def names_for(self, model: Model) -> tuple[str, ...]:
-        return structure_of("ExtendedKalman", model).minimal_names

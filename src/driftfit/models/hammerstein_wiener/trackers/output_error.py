@@ -26,13 +26,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing
-from driftfit.engine.settings import covariance, matrix, numbers, vector
+from driftfit.engine.kernel import Array, State, Step, floats, kernel, nothing, packed
+from driftfit.engine.settings import matrix, vector
 from driftfit.models.base import Model
-from driftfit.models.hammerstein_wiener.curves.basis import PiecewiseLinear
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.step_memory import PREDICTED
-from driftfit.models.hammerstein_wiener.trackers.extended_kalman import minimal_memory, structure_of
+from driftfit.models.hammerstein_wiener.trackers.minimal import Minimal, minimal_memory, structure_of
 from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     OK,
     P_W,
@@ -47,7 +46,6 @@ from driftfit.models.hammerstein_wiener.trackers.output_error_steps import (
     follow_power,
     output_error,
 )
-from driftfit.trackers.base import Tracker
 
 
 @lru_cache
@@ -55,11 +53,11 @@ def _steps(machine: Any) -> TrackerSteps:
     @kernel
     def correct(s: State, l: int) -> None:
         s.own[TIME, l] = s.dt[l] * s.drift[l]
-        machine(
-            s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data,
-            s.w.ctypes.data, s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
-            s.theta.shape[0], s.phi.shape[0],
-        )  # fmt: skip
+        fields = packed((
+            s.blocks.ctypes.data, s.theta.ctypes.data, s.phi.ctypes.data, s.q.ctypes.data, s.w.ctypes.data,
+            s.S.ctypes.data, s.scratch.ctypes.data, s.own.ctypes.data, s.P.ctypes.data,
+        ))  # fmt: skip
+        machine(fields, s.theta.shape[0], s.phi.shape[0])
         s.valid[l], s.seen[l], s.ok[l] = s.own[VALID, l], s.own[SEEN, l], s.own[OK, l]
         s.e[l], s.s[l], s.y_hat[l] = s.own[E, l], s.own[S2, l], s.blocks[PREDICTED, l]
 
@@ -82,7 +80,7 @@ def _applying(place: Step, p: tuple[int, ...]) -> Step:
 
 
 @dataclass(frozen=True)
-class OutputError(Tracker):
+class OutputError(Minimal):
     """Output-error extended Kalman filter on the minimal parameters of a `HammersteinWiener` model.
 
     Parameters
@@ -109,24 +107,11 @@ class OutputError(Tracker):
     q_w: float = 1e-6
     p_w: float = 0.5
 
-    required: ClassVar[tuple[str, ...]] = ("q", "r")
     width: ClassVar[int] = 1
     output_error: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if self.q is not None:
-            self._set("q", covariance("OutputError", "q", self.q))
-        for name in ("r", "q_w", "p_w"):
-            if getattr(self, name) is not None:
-                strict = name == "r"
-                self._set(name, numbers("OutputError", name, getattr(self, name), ndim=0, low=0.0, strict=strict))
-        self._set("p0", covariance("OutputError", "p0", self.p0))
-        self._set("theta0", numbers("OutputError", "theta0", self.theta0))
-
-    @classmethod
-    def own_model(cls, na: int, nb: int, nk: int) -> HammersteinWiener:
-        """With a bend in the input block, whose c_2 is 0 on linear records, where there are lags to tell it from b."""
-        return HammersteinWiener(na, nb, nk, input=PiecewiseLinear([0.0]) if nb > 1 else None)
+        self._check("q_w", "p_w")
 
     def state(self, n: int) -> Mapping[str, Any]:
         """The part of the state that depends only on the number n of minimal parameters."""
@@ -136,10 +121,6 @@ class OutputError(Tracker):
             "q": matrix("OutputError", "q", self.q, n),
             "var": np.zeros(n),
         }
-
-    @property
-    def steps(self) -> TrackerSteps:
-        raise ValueError("OutputError: the steps depend on the model; see steps_for.")
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         structure = structure_of("OutputError", model)
@@ -167,9 +148,6 @@ class OutputError(Tracker):
     def apply_for(self, model: Model) -> Step | None:
         assert isinstance(model, HammersteinWiener)
         return None if model.apply is None else _applying(model.apply, model.places)
-
-    def names_for(self, model: Model) -> tuple[str, ...]:
-        return structure_of("OutputError", model).minimal_names
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         n_w = len(lane["w"])

@@ -2,8 +2,8 @@
 once for all orders.
 
 S is the covariance of [w, xi], of which the lower triangle is kept; its first n_w = max(na, 1) entries are the last
-outputs of the linear block. ``own`` holds the numbers named below. What the model says of the present input and output
-stands in its memory (`driftfit.models.hammerstein_wiener.step_memory`).
+outputs of the linear block. ``own`` holds the numbers named below. The model's values for the present input and output
+are in its memory (`driftfit.models.hammerstein_wiener.step_memory`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.drivers import LARGEST
-from driftfit.engine.kernel import Array, floats, machine, part, shared
+from driftfit.engine.kernel import Array, floats, machine, part, shared, wholes
 from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of, output_values
 from driftfit.models.hammerstein_wiener.output_curve import inverse_of, level, rises
 from driftfit.models.hammerstein_wiener.step_memory import (
@@ -52,18 +52,22 @@ FLATTEST = 0.05
 REACH = 3.0
 """Times the largest w of the outputs seen: w is held within that."""
 TINY = 1e-300
-"""Least variance of what is missing: a sample without an input is marked, also where b is 0."""
+"""Smallest variance of a missing input: a sample without an input is marked, also if b is 0."""
 WIDEST = 1e3
-"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without end in an outage.
+"""Largest standard deviation of w as a multiple of that: an unstable estimate must not grow without bound in an outage.
 The cross-covariances shrink along."""
 SHARE, LARGE = 0.01, 25.0
-"""What a sample counts in the usual power of v, and the multiple of it that its square counts as at most: a fault code
-may not make a scale of its own."""
-
-TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, V_POWER = range(11)
-"""Numbers of the filter: nominal intervals times the drift, variances, whether w stands, what comes out; from V_POWER
-on the usual power of v of each input.
+"""The weight of a sample in the usual power of v, and the largest multiple of that power that its square counts as, so
+that a fault code cannot become the scale.
 """
+
+TIME, R, Q_W, P_W, BEGUN, VALID, SEEN, OK, E, S2, R_NOW, SLOPE, V_POWER = range(13)
+"""Numbers of the filter: nominal intervals times the drift, variances, whether w has begun, the results, the noise
+variance and the slope of F at this sample; from V_POWER on the usual power of v of each input.
+"""
+
+AT_BLOCKS, AT_THETA, AT_PHI, AT_Q, AT_W, AT_S, AT_SCRATCH, AT_OWN, AT_P, ADDRESSES = range(10)
+"""Addresses that the machine is given."""
 
 
 @part
@@ -131,11 +135,9 @@ def transition(p: Places, theta: Array, phi: Array, w: Array, row: Array) -> tup
 
 
 @shared
-def advance(
-    p: Places, theta: Array, phi: Array, w: Array, S: Array, row: Array, moved: Array, q_w: float, reach: float
-) -> None:  # fmt: skip
+def advance(p: Places, theta: Array, phi: Array, w: Array, S: Array, scratch: Array, q_w: float, reach: float) -> None:
     """The time update of w, which is held within reach whatever the poles do, and of S."""
-    n_w, N = len(w), len(S)
+    n_w, N, row, moved = len(w), len(S), scratch[0], scratch[1]
     total, x_d = transition(p, theta, phi, w, row)
     for x in range(x_d + p[N_OUT] - 1, N):
         row[x] = -1.0
@@ -156,20 +158,18 @@ def advance(
 
 
 @shared
-def absorb(
-    e: float, slope: float, m: Array, p: Places, r: float, ok: bool, theta: Array, w: Array, S: Array, row: Array,
-    moved: Array,
-) -> float:  # fmt: skip
-    """The measurement update; returns the variance of the innovation."""
-    n_w, N, n_out, g = len(w), len(S), p[N_OUT], p[TRIAL]
+def absorb(m: Array, p: Places, own: Array, theta: Array, w: Array, S: Array, scratch: Array) -> None:
+    """The measurement update, and the variance of the innovation."""
+    n_w, N, n_out, g, row, moved = len(w), len(S), p[N_OUT], p[TRIAL], scratch[0], scratch[1]
+    e, slope = own[E], own[SLOPE]
     x_d = n_w + at_d(p)
     for x in range(N):
         row[x] = 0.0
     row[0] = 1.0 / slope
     for k in range(1, n_out):
         row[x_d + k - 1] = -m[g + k, 0] / slope
-    s: float = product(S, row, moved, r)
-    if ok:
+    s: float = product(S, row, moved, own[R_NOW])
+    if own[OK] > 0.0:
         for x in range(N):
             k = moved[x] / s
             if x < n_w:
@@ -179,7 +179,7 @@ def absorb(
             for z in range(x):
                 S[x, z] -= k * moved[z]
             S[x, x] = max(S[x, x] - k * moved[x], LEFT * S[x, x])
-    return s
+    own[S2] = s
 
 
 @shared
@@ -200,7 +200,7 @@ def unknown_power(m: Array, p: Places, theta: Array, own: Array) -> float:
 
 @shared
 def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
-    """The usual power of v, which stands for inputs that are missing."""
+    """Update the usual power of v, which is used for missing inputs."""
     c = p[NA] + p[NB]
     for i in range(p[INPUTS]):
         f, more_in = p[OWN + EACH * i + OWN_F], p[OWN + EACH * i + OWN_N_IN] - 1
@@ -215,7 +215,7 @@ def follow_power(m: Array, p: Places, theta: Array, own: Array) -> None:
 
 @shared
 def reach_of(m: Array, p: Places) -> float:
-    """How large w may be, by the outputs seen."""
+    """The largest |w| that the outputs observed so far allow."""
     low, high = m[LOWEST, 0], m[HIGHEST, 0]
     if p[IDENTITY] == 0:
         rising, last = rises(m, p), GRID - 1
@@ -225,19 +225,31 @@ def reach_of(m: Array, p: Places) -> float:
     return reach if reach > 0.0 and reach < LARGEST else LARGEST
 
 
+@shared
+def drift_theta(S: Array, q: Array, n_w: int, time: float) -> None:
+    """The time update of the covariance of xi."""
+    for i in range(len(q)):
+        for j in range(i + 1):
+            S[n_w + i, n_w + j] += q[i, j] * time
+
+
+@shared
+def covariance_of_theta(S: Array, n_w: int, P: Array) -> None:
+    """P, the lower triangle of the block of xi."""
+    for i in range(len(P)):
+        for j in range(i + 1):
+            P[i, j] = S[n_w + i, n_w + j]
+
+
 @lru_cache
 def _work(out: Kind) -> Any:
     """One sample, for the functions of an output basis."""
     fill_trial, invert = output_values(out), inverse_of(level_of(out))
 
     def output_error_work(
-        m: Array, p: Places, own: Array, theta: Array, phi: Array, q: Array, w: Array, S: Array, P: Array, row: Array,
-        moved: Array,
-    ) -> None:  # fmt: skip
-        n_out, d, free, n_w, n_x = p[N_OUT], p[D_NOW], at_d(p), len(w), len(theta)
-        for i in range(n_x):
-            for j in range(i + 1):
-                S[n_w + i, n_w + j] += q[i, j] * own[TIME]
+        m: Array, p: Places, own: Array, theta: Array, phi: Array, w: Array, S: Array, scratch: Array
+    ) -> None:
+        n_out, d, free = p[N_OUT], p[D_NOW], at_d(p)
         for k in range(n_out - 1):
             m[d + k + 1, 0] = theta[free + k]
         if own[BEGUN] == 0.0 and m[STARTED, 0] > 0.0:
@@ -245,7 +257,7 @@ def _work(out: Kind) -> Any:
             own[BEGUN] = 1.0
         power = unknown_power(m, p, theta, own)
         known = power == 0.0
-        advance(p, theta, phi, w, S, row, moved, own[Q_W] + power, reach_of(m, p))
+        advance(p, theta, phi, w, S, scratch, own[Q_W] + power, reach_of(m, p))
         y_hat, y = (w[0] if p[IDENTITY] > 0 else invert(m, p, w[0])), m[RAW, 0]
         able = abs(y_hat) < np.inf
         fill_trial(m, p, y_hat if able else 0.0, p[TRIAL], p[TRIAL_BEND])
@@ -256,31 +268,30 @@ def _work(out: Kind) -> Any:
         used = valid and seen and m[GIVEN, 0] < np.inf
         own[VALID], own[SEEN], own[OK] = 1.0 if valid else 0.0, 1.0 if seen else 0.0, 1.0 if used else 0.0
         own[E] = y - y_hat if used else 0.0
-        r = own[R] * m[GIVEN, 0] if used else own[R]
-        own[S2] = absorb(own[E], max(slope, FLATTEST), m, p, r, used, theta, w, S, row, moved)
+        own[R_NOW], own[SLOPE] = own[R] * m[GIVEN, 0] if used else own[R], max(slope, FLATTEST)
+        absorb(m, p, own, theta, w, S, scratch)
         m[PREDICTED, 0], m[LATE, 0] = y_hat, 0.0
         follow_power(m, p, theta, own)
-        for i in range(n_x):
-            for j in range(i + 1):
-                P[i, j] = S[n_w + i, n_w + j]
 
     return shared(output_error_work)
 
 
 @lru_cache
 def output_error(out: Kind, p: tuple[int, ...]) -> Any:
-    """The machine for the functions of an output basis and the places of a model."""
+    """The compiled routine for the functions of an output basis and the places of a model."""
     work, orders = _work(out), np.array(p)
 
-    def machine_output_error(
-        blocks: int, theta: int, phi: int, q: int, w: int, S: int, scratch: int, own: int, P: int, n_x: int, n: int,
-    ) -> None:  # fmt: skip
-        n_w, size = max(orders[NA], 1), V_POWER + orders[INPUTS]
-        N = n_w + n_x
-        work(
-            floats(blocks, 1, 1), orders, floats(own, 1, size)[0], floats(theta, 1, n_x)[0], floats(phi, 1, n)[0],
-            floats(q, n_x, n_x), floats(w, 1, n_w)[0], floats(S, N, N), floats(P, n_x, n_x), floats(scratch, 2, N)[0],
-            floats(scratch, 2, N)[1],
-        )  # fmt: skip
+    def machine_output_error(fields: int, n_x: int, n: int) -> None:
+        at, n_w, size = wholes(fields, 1, ADDRESSES), max(orders[NA], 1), V_POWER + orders[INPUTS]
+        N, own = n_w + n_x, floats(at[0, AT_OWN], 1, size)[0]
+        q, S, P = floats(at[0, AT_Q], n_x, n_x), floats(at[0, AT_S], N, N), floats(at[0, AT_P], n_x, n_x)
+        theta, phi, w = (
+            floats(at[0, AT_THETA], 1, n_x)[0],
+            floats(at[0, AT_PHI], 1, n)[0],
+            floats(at[0, AT_W], 1, n_w)[0],
+        )
+        drift_theta(S, q, n_w, own[TIME])
+        work(floats(at[0, AT_BLOCKS], 1, 1), orders, own, theta, phi, w, S, floats(at[0, AT_SCRATCH], 2, N))
+        covariance_of_theta(S, n_w, P)
 
     return machine(machine_output_error)

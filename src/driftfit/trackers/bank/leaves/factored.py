@@ -7,11 +7,11 @@ negative. So z'C z is a sum of squares, sum_j D_j (U'z)_j^2, and no rounding mak
     absorb  a measurement by z with noise a: f = U'z, and for j = 0 .. n - 1:
                 v = D_j f_j,   a' = a + f_j v,   p = f_j / a,   D_j <- D_j a / a',   a <- a'
                 U_ij <- U_ij - b_i p,   b_i <- b_i + U_ij (as it was) v,   b_j = v
-            which leaves a = z'C z + noise, and the gain b / a
+            after which a = z'C z + noise, and the gain is b / a
     condense  sum_k d_k w_k w_k' with d_k >= 0, by weighted Gram-Schmidt on the rows of W
 
-A leaf keeps D_j where a covariance has C_jj, and U_ij where it has C_ji = C_ij, i < j. Leaves are taken by SIMD
-vectors of eight, which lie in the rows of narrow matrices, eight numbers wide, from column 0.
+A leaf stores D_j in the place of C_jj, and U_ij in the place of C_ji = C_ij, i < j. Leaves are processed in SIMD
+vectors of eight, which are rows of narrow matrices, eight numbers wide, from column 0.
 
 Source: Bierman (1977), chapters 5 and 6 (Agee and Turner 1972; Thornton 1976 for Gram-Schmidt); the order of operations
 in `add` after Fletcher and Powell (1974), which keeps digits where c p^2 is much larger than D_j. Cost: O(n^2) for the
@@ -29,12 +29,12 @@ from driftfit.engine.simd import WIDTH, fill, load, minus, over, plus, reaches, 
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 ROUNDING = 4.0 * np.finfo(float).eps
-"""A pivot below n times this share of its variance is one that rounding has left."""
+"""A pivot below n times this share of its variance is rounding."""
 
 
 @kernel
 def add(C: Array, n: int, l: int, V: Array, c: Any) -> None:
-    """C + c v v' in the columns from l, v being the first n rows of V, which are used up; c is a SIMD vector."""
+    """C + c v v' in the columns from l; v are the first n rows of V, which are overwritten; c is a SIMD vector."""
     for j in range(n - 1, -1, -1):
         at = j * (j + 1) // 2
         p, was = load(V, j, 0), load(C, at + j, l)
@@ -53,7 +53,7 @@ def add(C: Array, n: int, l: int, V: Array, c: Any) -> None:
 
 @kernel
 def raised(C: Array, n: int, l: int, q: Array, share: Any, V: Array) -> None:
-    """C + share Q in the columns from l, q being the factor of Q; share is a SIMD vector, V has n narrow rows."""
+    """C + share Q in the columns from l; q is the factor of Q, share a SIMD vector, V has n narrow rows."""
     for k in range(n):
         at = k * (k + 1) // 2
         if q[at + k] > 0.0:
@@ -79,8 +79,8 @@ def along(C: Array, n: int, l: int, Z: Array, zl: int, F: Array, fl: int) -> Any
 
 @kernel
 def absorb(C: Array, l: int, n: int, b: Array, a: Any, B: Array, to: int) -> Any:
-    """A measurement: from C, column l, to B, column ``to``; the n narrow rows of b hold f = U'z and take the gain times
-    a, which is returned. a is a SIMD vector; B may be C.
+    """Measurement update from C, column l, to B, column ``to``; the n narrow rows of b hold f = U'z and receive the
+    gain times a. Returns a, a SIMD vector; B may be C.
     """
     at = 0
     for j in range(n):
@@ -128,8 +128,8 @@ def condense(W: Array, count: int, n: int, A: Array, to: int) -> None:
 def factorise(C: Array, n: int, least: float) -> None:
     """A positive semi-definite lower triangle (tri,) becomes its factor, in place.
 
-    A pivot that is nothing but rounding becomes ``least`` times what rounding is: 0 says that nothing is uncertain
-    there, and 1 that nobody knows.
+    A pivot that is only rounding becomes ``least`` times the size of rounding: 0 states that nothing is uncertain
+    there, 1 that it is unknown.
     """
     for j in range(n - 1, -1, -1):
         at = j * (j + 1) // 2

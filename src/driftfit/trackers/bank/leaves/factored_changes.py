@@ -1,10 +1,10 @@
-"""Changes on factors: what may happen to eight leaves whose covariances are U D U'.
+"""Changes of eight leaves whose covariances are factors U D U'.
 
 A random walk is an `add` for every column of its factor, exponential forgetting scales D, directional forgetting is an
-`add`, stabilised forgetting n of `absorb`, and a reset of some parameters adds up what remains of the columns. The
-formulas are those of `driftfit.trackers.bank.leaves.forget`, the operations those of
-`driftfit.trackers.bank.leaves.factored`. Every function works on the eight columns from ``l``; V are narrow rows that
-may be overwritten.
+`add`, stabilised forgetting n of `absorb`, and a reset of some parameters adds up the remaining parts of the columns.
+The formulas are those of `driftfit.trackers.bank.leaves.forget`, the operations those of
+`driftfit.trackers.bank.leaves.factored`. Every function works on eight columns from ``l``; V are narrow rows that may
+be overwritten.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def guard(C: Array, n: int, l: int, keep: float, cap: float) -> None:
 
 @kernel
 def renew(C: Array, m: Array, n: int, l: int, which: Array, mean: Array, V: Array) -> None:
-    """`forget.renew`: what is left of the columns; the new covariance is added as a walk."""
+    """`forget.renew`: the rest of the columns; the new covariance is added as a walk."""
     tri = n * (n + 1) // 2
     for k in range(tri):
         store(V, n + k, 0, load(C, k, l))
@@ -137,7 +137,8 @@ def blur(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
 
 @shared
 def average(t: Any, l: int, Hd: int, Hm: int, V: Array) -> None:
-    """`forget.average` of eight leaves. Changes are merged one after the other, with their chances p so far and now:
+    """`forget.average` of eight leaves. Changes are merged one after the other; p is the total probability so far, p_c
+    that of the present one:
 
         C <- C + p_c C_c + p p_c / (p + p_c) d d',   m <- m + p_c / (p + p_c) d,   d = m_c - m
 

@@ -19,7 +19,7 @@ FACTOR, VALUE, FROZEN, STUCK, CLEANS, OWN = range(6)
 def expect(t: Any, L: int) -> tuple[float, float]:
     """Mean and variance of the output under the mixture of leaves and sensors.
 
-    Row j of ``shares`` is w p(sensor j | leaf). A sensor that may be frozen says the last output, if there was one.
+    Row j of ``shares`` is w p(sensor j | leaf). A frozen sensor repeats the last output, if there was one.
     """
     w, h, y, factor = t.leaves[WEIGHT], t.expected[0], t.expected[1], t.scores[0]
     share, shares, prior, sensors, Hm, last = (
@@ -75,12 +75,12 @@ def weighted(B: Array, L: int, X: Array, row: int) -> float:
 
 @shared
 def expect_together(t: Any, L: int) -> tuple[float, float]:
-    """The same where leaves have one regressor, from the mean and covariance of the mixture alone:
+    """The same for leaves with one common regressor, from the mean and covariance of the mixture alone:
 
         y = z' mean,   s = z' (cov + sum_i f_i Q_i) z + sum_j f_j factor_j r,
 
-    f being the probabilities of events, times what covariances are in units of, which is the first row of `scores`; the
-    row after it, and the last of Q, are overwritten.
+    where f are the probabilities of events times the unit of covariances, which is the first row of `scores`; the next
+    row, and the last of Q, are overwritten.
     """
     theta, P, phi, Q, prior, sensors, X = t.theta, t.cov, t.phi, t.Q, t.prior, t.sensors, t.scores
     alike, Hm = t.counters[ALIKE] > 0, len(sensors)

@@ -1,4 +1,4 @@
-"""Changes that forget: what may happen to a leaf N(m, C) other than a random walk.
+"""Changes that forget: the changes of a leaf N(m, C) other than a random walk.
 
     exponential   C <- C / lam, which is a random walk with Q = (1/lam - 1) C; its trace never grows above the cap
     directional   C <- C + (1/lam - 1) g g' / (z' g),   g = C z, z the regressor of the last sample that was used
@@ -56,7 +56,7 @@ def for_interval(settings: Array, dt: float, maps: Array) -> None:
 
 @shared
 def guard(t: Any, C: Array, a: int, b: int, c: int, h: Array) -> None:
-    """Forget no more than the cap of the trace allows: lam <- min(1, max(lam, tr C / cap))."""
+    """Limit forgetting by the cap of the trace: lam <- min(1, max(lam, tr C / cap))."""
     n, keep, cap, q = t.n, t.maps[c, KEEP], t.places[CAP, 0], t.Q[c]
     for l in range(a, b):
         h[l] = 0.0
@@ -104,7 +104,7 @@ def toward(C: Array, n: int, a: int, b: int, z: Array, gain: float, work: Array)
 
 @shared
 def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float, work: Array) -> None:
-    """A measurement of w' theta with noise r that says w' mean."""
+    """Measurement update by w' theta = w' mean with noise variance r."""
     n = len(w)
     g, h = work, work[n]
     along(C, n, a, b, w, g, h)
@@ -128,7 +128,7 @@ def measure(C: Array, m: Array, a: int, b: int, w: Array, mean: Array, r: float,
 
 @shared
 def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Array) -> None:
-    """Some parameters begin anew."""
+    """Reset some parameters."""
     at = 0
     for i in range(len(which)):
         if which[i] > 0.0:
@@ -143,7 +143,7 @@ def renew(C: Array, m: Array, a: int, b: int, which: Array, mean: Array, q: Arra
 
 @shared
 def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> None:
-    """The rest of change c in the columns a .. b of C and m, which have taken in KEEP, RESET and Q.
+    """Complete change c in the columns a .. b of C and m, to which KEEP, RESET and Q have been applied.
 
     ``work`` has n rows, for C z, and one more.
     """
@@ -162,7 +162,7 @@ def apply(t: Any, C: Array, m: Array, a: int, b: int, c: int, work: Array) -> No
 
 @shared
 def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
-    """The share of one change in the first two moments about the means of the leaves."""
+    """Add the share of one change to the first two moments about the means of the leaves."""
     B, C, m, n, at = t.leaves, t.C, t.m, t.n, 0
     for i in range(n):
         for l in range(L):
@@ -176,7 +176,7 @@ def add_moments(t: Any, one: Array, mean: Array, chance: Array, L: int) -> None:
 
 @shared
 def average(t: Any, L: int, Hd: int, Hm: int) -> None:
-    """Mean m and covariance C of every leaf if any change may happen and no data come: the first two moments
+    """Mean m and covariance C of every leaf over all changes, without data: the first two moments
 
         m = sum_c p_c m_c,   C = sum_c p_c (C_c + (m_c - m) (m_c - m)'),
 
@@ -219,8 +219,8 @@ def average(t: Any, L: int, Hd: int, Hm: int) -> None:
 
 @shared
 def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
-    """The rows z'C z and z'm of `expected` for every leaf with all that may happen to it, and m; and C, which no caller
-    needs where the sample is ``used``. Only the first ``Hd`` changes may happen, under ``Hm`` sensors.
+    """Fill the rows z'C z and z'm of `expected` for every leaf over all changes, and m; also C, unless the sample is
+    ``used``. Only the first ``Hd`` changes count, under ``Hm`` sensors.
     """
     if t.walks_only > 0:
         blur(t, L, Hd, Hm)

@@ -2,15 +2,15 @@
 
 A leaf with the hypothesis of a sensor fault puts its own prediction into its lags. If a wrong prediction is treated as
 certain, it is worse than a wrong output: while a sensor is frozen, predictions are fed back, and the first good sample
-is trusted because of its huge regressor. Leaves therefore carry the covariance V of their lags too. With a the leaf's
+is trusted because of its huge regressor. Leaves therefore carry the covariance V of their lags too. If a are the leaf's
 coefficients of the output lags,
 
     s = z' C z + a' V a + r,          V+ = [[s, (V a)'], [V a, V]]  without its last row and column
 
 after a prediction was stored, and a zero row for an output that was measured. This is a plug-in approximation: joint
 errors of a and the lags are neglected, and so is the information of later outputs about earlier ones. Merged leaves add
-the spread of their lags to V. A prediction that cannot be an output (`PLAUSIBLE`) is not stored: y is, or, if there is
-none, the largest possible output.
+the spread of their lags to V. A prediction that cannot be an output (`PLAUSIBLE`) is not stored; y is stored instead
+or, without y, the largest possible output.
 """
 
 from __future__ import annotations
@@ -23,26 +23,28 @@ from driftfit.trackers.bank.layout import IN_Y, MOST, R
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST
 
 PLAUSIBLE, VAGUE = 1e4, 1e12
-"""Square of a prediction in mean squares of the outputs, and its variance in variances of the noise, beyond which it is
-no output: the lags of an unstable leaf would run away.
+"""Limits beyond which a prediction is no possible output: its square in mean squares of the outputs, and its variance
+in variances of the noise. Without them the lags of an unstable leaf would diverge.
 """
 
 
 @kernel
 def plausible(expected: Array, l: int, most: float, r: float) -> bool:
-    """Whether what leaf l expects may be an output at all."""
+    """Whether the prediction of leaf l is a possible output."""
     return expected[1, l] * expected[1, l] <= most and expected[0, l] <= VAGUE * r  # type: ignore[no-any-return]
 
 
 @shared
 def covariance_row(n: int, na: int) -> int:
-    """The first row of V, whose lower triangle is the last thing in a leaf."""
+    """The first row of V, whose lower triangle is stored last in a leaf."""
     return FIRST + n + n * (n + 1) // 2 + na
 
 
 @shared
 def push(t: Any, L: int, seen: bool, y_hat: Array, most: float) -> None:
-    """Output lags of leaves that took no sample in: y where it was seen, else what each expected, within bounds."""
+    """Store output lags of leaves without a measurement update: y if it was observed, otherwise each prediction, within
+    limits.
+    """
     B, n, na, y, limit = t.leaves, t.n, t.output_lags, t.sample[IN_Y], math.sqrt(most)
     at = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
@@ -71,8 +73,8 @@ def widen_by_lags(t: Any, B: Array, K: int, columns: int) -> None:
 
 @shared
 def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool) -> None:
-    """V of the leaves from column ``at`` on, whose parents are K columns of A: one lag later, and the variance of what
-    was put in, zero where that was measured or given up. A may be the leaves themselves.
+    """V of the leaves from column ``at`` on, whose parents are K columns of A: moved by one lag, with the variance of
+    the new entry, which is zero if it was measured or replaced. A may be the leaves themselves.
     """
     B, na, m, expected, X = t.leaves, t.output_lags, t.m, t.expected, t.spare_lags
     r, most, block = t.sample[R], t.sample[MOST], slice(at, at + columns)
@@ -104,7 +106,7 @@ def shift_covariance(t: Any, A: Array, K: int, at: int, columns: int, own: bool)
 
 @shared
 def merge_covariance(t: Any, members: Array, share: Array, to: int) -> None:
-    """A parent, column ``to``: the average of V and the spread of the lags, whose mean stands there already."""
+    """A parent, column ``to``: the average of V plus the spread of the lags, whose mean is already stored there."""
     B, A, n, na = t.leaves, t.parents, t.n, t.output_lags
     first, lags = covariance_row(n, na), FIRST + n + n * (n + 1) // 2
     if first >= len(B):

@@ -6,10 +6,9 @@ which the compiler vectorises; the rows of a column are
     log w, w, nu, S, code, age, code of sensors, code of changes, m (n), C (lower triangle), cleaned output lags
 
 nu and S are those of the inverse gamma distribution of the noise variance if that is unknown, and C is then in its
-units. Codes contain the newest events as the digits of a number, for use by the reduction. The past levels that a leaf
-remembers are needed by the user and not by the recursion; they are marginal probabilities of events in a separate
-table, which the children of a leaf share: its block k has the joint events k levels back, and the probability of no
-change since.
+units. Codes contain the newest events as the digits of a number, for use by the reduction. The history of a leaf is
+needed by the user and not by the recursion; it consists of marginal probabilities of events in a separate table, which
+the children of a leaf share: its block k has the joint events k levels back, and the probability of no change since.
 
 Everything here is compiled once for all sizes.
 """
@@ -44,7 +43,9 @@ LOG, WEIGHT, NU, S, CODE, AGE, SENSORS, CHANGES, FIRST = range(9)
 
 @kernel
 def total(x: Array, count: int) -> float:
-    """Sum of the first entries in four interleaved parts: a single chain of additions would be the longest part."""
+    """Sum of the first entries in four interleaved parts, because one chain of additions would have the latency of all
+    of them.
+    """
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     whole = count // 4 * 4
     for l in range(0, whole, 4):
@@ -74,7 +75,9 @@ def largest(x: Array, count: int) -> float:
 
 @shared
 def normalise(B: Array, L: int) -> float:
-    """Weights from their logarithms, zeros beyond; returns log sum, or NaN where no leaf is possible."""
+    """Weights from their logarithms, with zeros after the last; returns the log of their sum, NaN if no leaf is
+    possible.
+    """
     top = largest(B[LOG], L)
     if not abs(top) < np.inf:
         return np.nan
@@ -97,7 +100,7 @@ def normalise(B: Array, L: int) -> float:
 
 @shared
 def variance_factor(t: Any, X: Array, row: int, L: int) -> None:
-    """What C is in units of, in a row of X: 1, or the expected noise variance S / (nu - 2); spec, section 8."""
+    """The unit of C, in a row of X: 1, or the expected noise variance S / (nu - 2) (spec section 8)."""
     B, unknown = t.leaves, t.unknown > 0
     for l in range(0, L, WIDTH):
         ratio = over(load(B, S, l), minus(load(B, NU, l), fill(2.0))) if unknown else fill(1.0)
@@ -143,7 +146,7 @@ def mixture(n: int, t: Any, L: int) -> None:
 def priors(t: Any, L: int, expanded: bool) -> None:
     """prior[e, l] = p(next event is e | leaf): one row for all, or the row of the chain for the leaf's last event.
 
-    Where histories are ``expanded``, the last event of a leaf is known by its probabilities.
+    If histories are ``expanded``, the last event of a leaf is given by probabilities.
     """
     prior, row, P, event, H = t.prior, t.row, t.chain, t.event, len(t.row)
     history = t.history_2 if t.counters[FLIPPED] > 0 else t.history
@@ -183,7 +186,7 @@ def later(prior: Array, L: int, P: Array, steps: int, X: Array) -> None:
 
 @shared
 def standstill(prior: Array, L: int, Hm: int) -> None:
-    """No time passes, so nothing changes: the sensors keep their shares, all changes but the first have none."""
+    """The prior when no time passes: sensors keep their shares; all changes except the first have probability 0."""
     for l in range(L):
         for j in range(Hm):
             share = 0.0
@@ -212,12 +215,12 @@ def increments(t: Any, time: float, each: float) -> None:
 
 @shared
 def ready(t: Any) -> None:
-    """Covariances of changes as leaves take them in: as they are."""
+    """Prepare covariances of changes for leaves: here they are used unchanged."""
 
 
 @part
 def regressors(n: int, t: Any, B: Array, L: int, copies: int, phi: Array) -> None:
-    """The regressor of every leaf, with its own output lags where it keeps some; else phi, for the first eight."""
+    """The regressor of every leaf, with separate output lags if it has any; otherwise phi, for the first eight."""
     z, na = t.z, t.output_lags
     lags = FIRST + n + n * (n + 1) // 2
     for i in range(na):
@@ -249,7 +252,7 @@ def spread(C: Array, z: Array, m: Array, L: int, n: int, na: int, g: Array, expe
 
 @shared
 def blur(t: Any, L: int, Hd: int, Hm: int) -> None:
-    """Mean and covariance of every leaf if any walk may happen and no data come: C + sum p_i Q_i, to be exact."""
+    """Mean and covariance of every leaf over all random walks, without data: C + sum p_i Q_i, exactly."""
     B, C, m, Q, prior, chance, n = t.leaves, t.C, t.m, t.Q, t.prior, t.spare[0], t.n
     at = FIRST + n
     for i in range(n):

@@ -1,19 +1,20 @@
 """Sensors with a likelihood of the user's own: `driftfit.Sensor.own`.
 
-A plain function of numbers says, for one leaf, what a reading y is worth,
+A plain function of numbers evaluates a reading y for one leaf,
 
     log p(y),  a,  clean = likelihood(y, y_hat, h, r, last)
 
-y_hat = z'm and h = z'C z being the leaf's forecast without noise, r the noise variance of the nominal sensor (of this
-leaf, where it is unknown) and last the last output seen. The leaf is updated as by a measurement with noise variance a,
+where y_hat = z'm and h = z'C z are the leaf's forecast without noise, r is the noise variance of the nominal sensor (of
+this leaf, if it is unknown) and last is the last output observed. The leaf is updated by a measurement with noise
+variance a,
 
     K = C z / (h + a),     m+ = m + K (y - y_hat),     C+ = C - K (C z)'
 
-so that C stays a covariance whatever the function says; a = inf learns nothing of theta (it counts as `LARGEST` times
-h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
+so C remains a covariance whatever the function returns; a = inf teaches nothing about theta (it counts as `LARGEST`
+times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
 
 The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
-(`driftfit.engine.callback`); the routine is not compiled anew.
+(`driftfit.engine.callback`); the routine is not recompiled.
 """
 
 from __future__ import annotations
@@ -31,22 +32,22 @@ from driftfit.trackers.bank.layout import LAST
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 LARGEST, LEAST = 1e12, 1e-12
-"""Noise variances beyond this multiple of the forecast's count as this one, which moves nothing, and those below this
-share of the nominal one as that.
+"""Limits of noise variances: at most this multiple of the forecast's variance, which has no effect, and at least this
+share of the nominal one.
 """
 LOG_P, NOISE, CLEAN = range(3)
-"""What a function says."""
+"""Entries of what a function returns."""
 
 
 @shared
 def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array) -> None:
-    """What function ``which`` says of the leaf in column at + l, its noise variance in the units of C; r is that of the
-    nominal sensor.
+    """Evaluate function ``which`` for the leaf in column at + l, with the noise variance in the units of C; r is that
+    of the nominal sensor.
     """
     B, expected = t.leaves, t.expected
     unit = B[S, at + l] / (B[NU, at + l] - 2.0) if t.unknown > 0 else 1.0
     h = expected[0, l]
-    call(t.own_likelihoods, which, y, expected[1, l], h * unit, r * unit, t.sample[LAST], said.ctypes.data)
+    call(t.own_likelihoods, (which, y, expected[1, l], h * unit, r * unit, t.sample[LAST]), said.ctypes.data)
     most = LARGEST * (h + r)
     said[NOISE] = max(said[NOISE] / unit, LEAST * r) if said[NOISE] < most * unit else most
     said[LOG_P] = said[LOG_P] if said[LOG_P] < np.inf else -np.inf
@@ -55,8 +56,8 @@ def judge(t: Any, which: float, at: int, l: int, y: float, r: float, said: Array
 
 @shared
 def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -> None:
-    """What the function says of every leaf, three numbers for each in `said`; h + a in the place of h, which is kept in
-    the first row of `scores`.
+    """Evaluate the function for every leaf, three numbers for each in `said`, and replace h by h + a; h is kept in the
+    first row of `scores`.
 
     The columns up to a whole SIMD vector hold no leaf; their variance must not be zero, since it is divided by.
     """
@@ -72,7 +73,7 @@ def judge_all(t: Any, which: float, at: int, columns: int, y: float, r: float) -
 
 @shared
 def weigh_all(t: Any, columns: int) -> None:
-    """The log densities in the place of what `judge_all` kept, which is given back."""
+    """Restore h, which `judge_all` kept, and put the log densities in its place."""
     said = t.said.reshape(t.said.shape[0] * t.said.shape[1])
     for l in range(-(-columns // WIDTH) * WIDTH):
         t.expected[0, l] = t.scores[0, l]
@@ -82,7 +83,7 @@ def weigh_all(t: Any, columns: int) -> None:
 
 @shared
 def clean_all(t: Any, at: int, columns: int) -> None:
-    """The newest output lag as the function has it."""
+    """Store the output that the function returns as the newest lag."""
     lag, said = FIRST + t.n + t.n * (t.n + 1) // 2, t.said.reshape(t.said.shape[0] * t.said.shape[1])
     for l in range(columns):
         t.leaves[lag, at + l] = said[3 * l + CLEAN]
@@ -90,13 +91,13 @@ def clean_all(t: Any, at: int, columns: int) -> None:
 
 @kernel
 def own_address(s: State) -> int:
-    """Where the functions of a bank are: nowhere, in most."""
+    """The address of the functions of a bank; most banks have none."""
     return 0
 
 
 @cache
 def entry_of(functions: tuple[Callable[..., Any], ...]) -> tuple[Any, Any]:
-    """The functions, numbered from 1, as a machine; and what takes the place of `own_address`."""
+    """The functions, numbered from 1, as a compiled routine; and the kernel that replaces `own_address`."""
     chosen = _chosen(functions)
 
     def likelihoods(which: float, y: float, y_hat: float, h: float, r: float, last: float, out: int) -> None:

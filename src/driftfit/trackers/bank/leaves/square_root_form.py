@@ -1,12 +1,12 @@
 """The compiled routine of a bank whose leaves keep factors U D U' of their covariances: ``Bank(form="sqrt")``.
 
-It is the routine of `driftfit.trackers.bank.machine.advance` with those parts substituted that work on covariances, so
-that everything else, as growing, weighing, choosing and remembering, is one source for both. The operations are in
-`driftfit.trackers.bank.leaves.factored`; every part here says which one it takes the place of. Covariances of changes
-are factorised once a sample.
+It is the routine of `driftfit.trackers.bank.machine.advance` in which the parts that work on covariances are
+substituted; growing, weighing, choosing and histories have one source for both forms. The operations are in
+`driftfit.trackers.bank.leaves.factored`; every part here names the one that it replaces. Covariances of changes are
+factorised once per sample.
 
 Changes are in `driftfit.trackers.bank.leaves.factored_changes`; merging condenses all columns of the members and their
-distances from the mean. Until the tree begins, the one filter keeps a covariance.
+distances from the mean. Until the tree begins, the single filter keeps a covariance.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> No
 
 @shared
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
-    """`grow.ahead`. A SIMD vector may reach into the columns of the next change, which are written after it."""
+    """`grow.ahead`. A SIMD vector may extend into the columns of the next change, which are written later."""
     A, V, Hd, Hm = t.parents, t.narrow, len(t.walks), len(t.sensors)
     columns = K if own else K * Hd
     for c in range(Hd):
@@ -115,7 +115,7 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
 
 @shared
 def foresee(t: Any, L: int, Hd: int, Hm: int, used: bool) -> None:
-    """`forget.foresee`. Where all changes walk the variance of the forecast needs no factor of what may happen."""
+    """`forget.foresee`. If all changes are random walks, the variance of the forecast needs no factor."""
     B, m, n, V = t.leaves, t.m, t.n, t.narrow
     if t.walks_only == 0:
         for l in range(0, L, WIDTH):
@@ -148,7 +148,7 @@ def spill(B: Array, l: int, n: int, share: float, W: Array, to: int) -> None:
 
 @shared
 def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
-    """`merge.pool`: as many members at once as X has room for, and what they gave with the next ones."""
+    """`merge.pool`: as many members at once as X has room for; the result is pooled with the next ones."""
     A, B, n = t.parents, t.leaves, t.n
     room = X.shape[0] * X.shape[1] // ((n + 2) * WIDTH) * WIDTH
     W, count = X.reshape(X.shape[0] * X.shape[1])[: (n + 2) * room].reshape((n + 2, room)), 0
@@ -207,4 +207,4 @@ PARTS = {
     forget.foresee: foresee, grow.ahead: ahead, grow.correct: correct, merge.pool: pool,
     refilter.widen: widen, chain_gap.widen_leaf: widen_leaf, lookahead.width: width,
 }  # fmt: skip
-"""What takes whose place."""
+"""Each part with the one that replaces it."""

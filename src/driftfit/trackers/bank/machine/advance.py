@@ -1,8 +1,8 @@
-"""One sample of a bank: forecast, reduce, grow, weigh, decide which leaves go on, report.
+"""One sample of a bank: forecast, reduce, grow, weigh, select the leaves to keep, report.
 
-What a sample that is not used does is what time does: every leaf takes in the ordinary course, no weight moves, and no
-leaf is dropped; what else may have happened waits, with the reduction that was chosen, for the next sample that can be
-used (`driftfit.trackers.bank.machine.gaps.gap`).
+A sample that is not used only lets time pass: every leaf makes its time update under the nominal change, no weight
+changes, and no leaf is dropped. Other changes that may have happened, and the reduction that was planned, wait for the
+next sample that can be used (`driftfit.trackers.bank.machine.gaps.gap`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from driftfit.engine.kernel import Array, machine, shared
 from driftfit.trackers.bank.layout import (
     AGAIN,
     ALIKE,
-    BESIDE,
     CHAINED,
     CLOCK,
     ELAPSED,
@@ -22,7 +21,6 @@ from driftfit.trackers.bank.layout import (
     EXPANDED,
     FAULTS,
     FLIPPED,
-    FLOORS,
     FREEDOM,
     GROUPS,
     HELD,
@@ -43,9 +41,11 @@ from driftfit.trackers.bank.layout import (
     PARTED,
     REFUSED,
     S2,
+    SAMPLE_HEAD,
     SETTLED,
     STORED,
     TAKEN,
+    TREE_LEVELS,
     WIDE,
     WINDOW,
     Y_HAT,
@@ -92,7 +92,7 @@ from driftfit.trackers.bank.reducing.selection import (
 )
 
 FAULTS_IN_A_ROW = 3
-"""As many samples in a row may be taken for fault codes."""
+"""So many samples in a row, at most, are taken for fault codes."""
 
 
 @shared
@@ -105,14 +105,14 @@ def copy(P: Array, to: Array) -> None:
 
 @shared
 def increments_now(t: Any) -> None:
-    """Covariances of the changes in this interval; where it is one floor, a change happens in one nominal sample."""
+    """Covariances of the changes in this interval; where it is one level, a change happens in one nominal sample."""
     time, dt = t.sample[IN_TIME], t.sample[IN_DT]
     increments(t, time, time / dt if t.apart > 0 and dt > 0.0 else time)
 
 
 @shared
 def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
-    """The chain of joint events with another chain of the changes, and sensors as they are after the first change."""
+    """The chain of joint events for another chain of the changes; sensors are as after the first change."""
     H = len(P)
     Hd = H // Hm
     for j in range(Hm):
@@ -127,7 +127,7 @@ def chained(given: Array, P: Array, Hm: int, moving: Array) -> None:
 
 @shared
 def prepare(t: Any) -> None:
-    """What may happen in this interval: the prior of the events, and what changes add to a covariance."""
+    """Prepare the priors of the events in this interval, and the covariances that changes add."""
     counters, dt, used, Hm = t.counters, t.sample[IN_DT], t.sample[IN_OK] > 0.0, len(t.sensors)
     given = t.given[0] == t.given[0]
     if t.given_chain[0] == t.given_chain[0]:
@@ -170,14 +170,14 @@ def outlook(t: Any, L: int, expanded: bool, whole: bool) -> None:
 
 @shared
 def forecast(t: Any, L: int) -> None:
-    """Mean and variance of the output before it comes: every leaf with all that may happen to it.
+    """Mean and variance of the output before it is observed, over all leaves and events.
 
-    Where leaves have one regressor and all changes walk, the mixture of the last sample says all of that.
+    If leaves share one regressor and all changes are random walks, the mixture of the last sample suffices.
     """
     counters, sample = t.counters, t.sample
     used, interacts = sample[IN_OK] > 0.0, int(t.reduction[KIND]) == INTERACT
     parted = counters[PARTED] > 0
-    plain = t.plain > 0 and counters[OPEN] == 0 and not parted  # in a gap the mixture has more in it than its leaves
+    plain = t.plain > 0 and counters[OPEN] == 0 and not parted  # in a gap the mixture is wider than its leaves
     one_for_all = plain and counters[ALIKE] > 0 and used and not interacts
     outlook(t, 1 if one_for_all else L, counters[EXPANDED] > 0, True)
     variance_factor(t, t.scores, 0, L)
@@ -195,7 +195,7 @@ def forecast(t: Any, L: int) -> None:
 
 @shared
 def accept(t: Any, gone: float) -> None:
-    """Some leaf allows the sample, whose log density under all of them is ``gone``."""
+    """Accept a sample that some leaf can explain; ``gone`` is its log density under all leaves."""
     counters = t.counters
     t.sample[EVIDENCE] = gone - math.log(t.sample[KEPT])
     for i in range(t.n):
@@ -211,7 +211,7 @@ def accept(t: Any, gone: float) -> None:
 
 @shared
 def recover(A: Array, K: int, B: Array, rows: int) -> int:
-    """The parents again, as if the sample had not come."""
+    """Restore the parents, as if the sample had been missing."""
     for row in range(rows):
         for l in range(K):
             B[row, l] = A[row, l]
@@ -221,7 +221,7 @@ def recover(A: Array, K: int, B: Array, rows: int) -> int:
 
 @shared
 def reject(t: Any, K: int) -> None:
-    """No leaf allows what was seen: go on as if it had not been."""
+    """No leaf can explain the sample: continue as if it had been missing."""
     counters = t.counters
     counters[IMPOSSIBLE] += 1
     counters[OPEN], counters[TAKEN] = counters[OPEN] if t.apart > 0 else 0, 0
@@ -235,11 +235,11 @@ def reject(t: Any, K: int) -> None:
 
 @shared
 def choose(t: Any, L: int) -> None:
-    """Which leaves go on, spec section 5; `reduce` does it before the next sample that is used."""
+    """Plan the reduction (spec section 5), which `reduce` carries out before the next sample that is used."""
     counters, samples, kind = t.counters, t.samples, int(t.reduction[KIND])
     if kind == CUT:
         phi = t.phi
-        if t.reduction[WAIT] > 0.0:  # the regressor to come is like the last one that no event held has been seen with
+        if t.reduction[WAIT] > 0.0:  # the last regressor before the open events stands for the next one
             phi = samples[max(counters[STORED] - 1 - counters[HELD], 0) % len(samples), TIME + 1 :]
         decide(t, L, phi)
         counters[GROUPS] = number(t.group, L, t.order)
@@ -253,11 +253,11 @@ def choose(t: Any, L: int) -> None:
 
 @shared
 def reduce(t: Any) -> int:
-    """Carry out what `choose` said: the parents of the next floor, whose number is returned."""
+    """Carry out the reduction that `choose` planned; returns the number of parents of the next level."""
     counters, L, kind, order = t.counters, t.counters[LEAVES], int(t.reduction[KIND]), t.order
     t.sample[KEPT] = 1.0
     full = kind == REFILTER and counters[STORED] >= int(t.reduction[DEPTH])
-    alone = kind in (CUT, BEAM)  # every group is one leaf, and they are in order
+    alone = kind in (CUT, BEAM)  # every group is one leaf, in order
     if kind == REFILTER and not full:
         for l in range(L):
             order[l] = l
@@ -285,7 +285,7 @@ def reduce(t: Any) -> int:
 
 @shared
 def keep_sample(t: Any) -> None:
-    """Store the sample for growing the tree again, or for looking ahead."""
+    """Store the sample, for growing the tree again or for looking ahead."""
     kept = t.samples[t.counters[STORED] % len(t.samples)]
     kept[Y], kept[NOISE], kept[TIME] = t.sample[IN_Y], t.sample[IN_NOISE], t.sample[IN_TIME]
     for i in range(t.n):
@@ -295,7 +295,7 @@ def keep_sample(t: Any) -> None:
 
 @shared
 def take_in(t: Any) -> None:
-    """A sample that is used: reduce, grow, weigh, and decide which leaves go on."""
+    """Process a sample that is used: reduce, grow, weigh, and plan the next reduction."""
     counters, sample, prior, kind = t.counters, t.sample, t.prior, int(t.reduction[KIND])
     waits, own, again = t.reduction[WAIT] > 0.0, kind == INTERACT, kind == REFILTER
     K = reduce(t)
@@ -330,8 +330,8 @@ def take_in(t: Any) -> None:
         accept(t, gone)
     else:
         reject(t, K)
-    counters[FLOORS] += 1
-    if counters[WIDE] > 0 and waits:  # the interval to come is a nominal one
+    counters[TREE_LEVELS] += 1
+    if counters[WIDE] > 0 and waits:  # the next interval is nominal
         increments(t, 1.0, 1.0)
         ready(t)
     choose(t, counters[LEAVES])
@@ -339,14 +339,14 @@ def take_in(t: Any) -> None:
 
 @shared
 def certain(prior: Array, L: int) -> None:
-    """The first event, for sure."""
+    """The prior that is certain of the first event."""
     for l in range(L):
         prior[0, l] = 1.0
 
 
 @shared
 def let_pass(t: Any, L: int) -> None:
-    """A sample that is not used: what time does to the leaves."""
+    """Process a sample that is not used: the time update of the leaves."""
     counters, B, n, dt, seen, apart = t.counters, t.leaves, t.n, t.sample[IN_DT], t.sample[IN_SEEN] > 0.0, t.apart > 0
     shift_covariance(t, B, L, 0, L, not seen)
     push(t, L, seen, t.expected[1], t.sample[MOST])
@@ -360,7 +360,7 @@ def let_pass(t: Any, L: int) -> None:
     if counters[PARTED] > 0:
         counters[OPEN] += 1
         counters[TAKEN] = 0
-    if apart:  # leaves take in the ordinary course only
+    if apart:  # leaves make the update of the nominal change only
         certain(t.prior, L)
         foresee(t, L, 1, 1, False)
         extend(t.gap)
@@ -372,14 +372,13 @@ def let_pass(t: Any, L: int) -> None:
     for k in range(0 if counters[PARTED] > 0 else n * (n + 1) // 2):
         for l in range(L):
             B[FIRST + n + k, l] = t.C[k, l]
-    counters[FLOORS] += 1
+    counters[TREE_LEVELS] += 1
 
 
 @shared
 def refused(sample: Array, counters: Array) -> bool:
-    """Whether a sample is so far from what was expected that it is taken for a fault code: it counts as missing.
-
-    What keeps coming is no fault code.
+    """Whether a sample is so far from the forecast that it is taken for a fault code, and counts as missing. A value
+    that persists is not a fault code.
     """
     far = sample[IN_Y] - sample[Y_HAT]
     if counters[REFUSED] < FAULTS_IN_A_ROW and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
@@ -394,7 +393,7 @@ def refused(sample: Array, counters: Array) -> bool:
 
 @shared
 def advance(t: Any) -> None:
-    """One sample of a tree that has begun."""
+    """Process one sample with a tree that has begun."""
     counters, sample = t.counters, t.sample
     sample[EVIDENCE] = 0.0
     for k in range(len(t.decided)):
@@ -422,7 +421,7 @@ def advance(t: Any) -> None:
 
 @shared
 def lone_density(sample: Array) -> float:
-    """Log density of a sample under the one filter that runs before the tree grows; 0 where it has none.
+    """Log density of a sample under the single filter that runs before the tree grows; 0 if it has none.
 
     It is Gaussian, or Student's where the noise variance is estimated.
     """
@@ -438,18 +437,18 @@ def lone_density(sample: Array) -> float:
 
 @shared
 def note(t: Any, window: float) -> None:
-    """Remember the probability of a change in the window, whether the sample was used and when it was, and what is
-    known at last of the event W - 1 floors back.
+    """Store the probability of a change in the window, whether the sample was used, its interval, and the final
+    probabilities of the event W - 1 levels back.
     """
     row, ring, lag_prob = (t.counters[CLOCK] - 1) % len(t.ring), t.ring, t.lag_prob
     ring[row, 0], ring[row, 1], ring[row, 2] = window, t.sample[IN_OK], t.sample[ELAPSED]
     for e in range(lag_prob.shape[1]):
-        ring[row, BESIDE + e] = lag_prob[len(lag_prob) - 1, e]
+        ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
 
 
 @machine
 def bank(address: int) -> None:
-    """One sample, by the table of a bank. One that is refused as a fault code is done again, as missing."""
+    """Process one sample, given the table of a bank. A sample refused as a fault code is processed again as missing."""
     t = table_at(address)
     counters, head = t.counters, t.report
     begun = counters[SETTLED] == 1

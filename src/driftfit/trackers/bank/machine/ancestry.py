@@ -1,11 +1,11 @@
-"""What leaves remember of their past, for tables of probabilities: marginals of events, and of no change since.
+"""The histories of leaves, from which probabilities of past events are computed: marginals of events, and of no change
+since.
 
-Row l of the table is what leaf l remembers: entry k (H + 1) + e is p(joint event e, k floors back | leaf), entry
-k (H + 1) + H is p(no change in the newest k + 1 floors | leaf). A leaf's memory is one piece, so that handing it on is
-one copy and a marginal one sum of rows; the last row of the table is for such sums. What an event adds is a row of
-`new_events`, after which come two rows of factors for what was remembered: where nothing changed, and where something
-did.
-After growth the table is still that of the parents; a sample that is not used writes it out for every leaf.
+Row l of the table is the history of leaf l: entry k (H + 1) + e is p(joint event e, k levels back | leaf), entry k (H +
+1) + H is p(no change in the newest k + 1 levels | leaf). A history is contiguous, so inheriting it is one copy, and a
+marginal is one sum of rows; the last row of the table is for such sums. A row of `new_events` is what an event adds;
+two rows of factors for the older entries follow: for no change, and for a change. After growth the table still holds
+the parents; a sample that is not used writes it out for every leaf.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from driftfit.trackers.bank.leaves.leaf_matrix import WEIGHT
 
 
 def news_of(H: int, Hm: int, width: int) -> Array:
-    """What each of H joint events adds to a memory, the first Hm of which change nothing; and the factors. The last row
-    is what a SIMD vector may reach into.
+    """What each of H joint events adds to a history (the first Hm change nothing), and the factors. The last row is
+    padding for SIMD vectors.
     """
     news = np.zeros((H + 3, width))
     news[range(H), range(H)] = 1.0
@@ -34,8 +34,8 @@ def news_of(H: int, Hm: int, width: int) -> Array:
 
 @kernel
 def hand_on(T: Array, of: int, e: int, H: int, Hm: int, news: Array, T2: Array, to: int) -> None:
-    """Row ``to`` of T2: what the child of leaf ``of`` with event e remembers, without a branch. It may write into the
-    row after it.
+    """Row ``to`` of T2: the history of the child of leaf ``of`` with event e, without a branch. It may write into the
+    next row.
     """
     block, width = H + 1, T.shape[1]
     quiet = H if e < Hm else H + 1
@@ -58,7 +58,7 @@ def write_out(t: Any, L: int) -> None:
 
 @shared
 def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
-    """One more floor of which nothing was seen: its events are as likely as before."""
+    """Add a level without an observation: its events keep their prior probabilities."""
     H = len(prior)
     block = H + 1
     for l in range(L):
@@ -76,7 +76,7 @@ def shift(T: Array, L: int, prior: Array, Hm: int) -> None:
 
 @shared
 def pick(t: Any, G: int) -> None:
-    """The histories of leaves that were kept as they were, in `order`."""
+    """Copy the histories of the leaves that were kept, in `order`."""
     H, Hm = len(t.initial), len(t.sensors)
     now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     for k in range(G):
@@ -101,7 +101,7 @@ def average(T: Array, members: Array, share: Array, T2: Array, to: int) -> None:
 
 @shared
 def summary(lags: Array, newest: Array) -> None:
-    """The newest floors, and the oldest."""
+    """The newest levels and the oldest one."""
     last = len(newest) - 1
     for k in range(len(newest)):
         row = k if k < last else len(lags) - 1
@@ -111,10 +111,10 @@ def summary(lags: Array, newest: Array) -> None:
 
 @shared
 def marginals(t: Any, L: int) -> float:
-    """lag_prob[k, e] = p(event e, k floors back), spec section 4; returns the probability of a change among the floors
+    """lag_prob[k, e] = p(event e, k levels back), spec section 4; returns the probability of a change among the levels
     of the histories.
 
-    Leaves are blocks of the children of K parents, in their order. Two spare rows are overwritten.
+    Leaves are ordered in blocks of the children of K parents. Two spare rows are overwritten.
     """
     B, X, event, lags = t.leaves, t.spare, t.event, t.lag_prob
     T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
@@ -123,7 +123,7 @@ def marginals(t: Any, L: int) -> float:
     back, quiet, last = 1, 0.0, W * block - 1
     if expanded:
         K, back = L, 0
-    for l in range(0, K, WIDTH):  # the weight of all children of a parent, and of those without a change
+    for l in range(0, K, WIDTH):  # the weight of all children of a parent, and of the children without a change
         own, still = fill(0.0), fill(0.0)
         for at in range(l, L, K):
             p = load(B, WEIGHT, at)

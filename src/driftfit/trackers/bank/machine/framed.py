@@ -1,25 +1,25 @@
-"""A bank in the coordinates of its start: for offsets that a covariance cannot hold, and directions not seen yet.
+"""A bank in the coordinates of its start: for offsets that a covariance cannot represent, and unknown directions.
 
-The compiled routine is given x and z in the place of phi and theta (`driftfit.trackers.parts.coordinates`), and needs
-to know no more: what it does to means and covariances is the same in all coordinates, as long as changes are walks and
-no leaf has output lags of its own. Change i then adds
+The compiled routine is given x and z in place of phi and theta (`driftfit.trackers.parts.coordinates`) and needs no
+other change: its updates of means and covariances hold in all coordinates, if all changes are random walks and no leaf
+has separate output lags. Change i then adds
 
     M (Q_i + diag(sizes_i r / c)) M'
 
-to a covariance. A regressor that leaves the span of those before it enters every leaf by column j, in what is left of
-its innovation; it moves no weight. What else may have happened since the last used sample, and the mixture, are the
-same linear map of what they were: C_j. = -C x and C_jj = x' C x + v.
+to a covariance. A regressor outside the span of the earlier ones determines column j of every leaf from its innovation;
+it changes no weight. The covariances of the gap and of the mixture are mapped in the same way: C_j. = -C x and C_jj =
+x' C x + v.
 
-A bank is run so where its start is not determined well enough for a covariance by the time there are residuals; the
-others are given phi and theta, at less cost. Cost per sample: O(n^3) for each change.
+A bank runs this way if its start is not determined well enough for a covariance when the first residuals are available;
+other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, shared, wholes
-from driftfit.trackers.bank.layout import LEAVES, ROW, ROWS
+from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
+from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import frame, in_units_of_theta, located_within, new_row, unseen_variance
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
@@ -27,12 +27,17 @@ from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
 WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
 """Rows of the table."""
+(
+    AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_G, AT_NOW, ADDRESSES,
+) = range(12)  # fmt: skip
+"""Addresses of fields that the routines here are given."""
 
 
 @shared
 def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float, W: Array) -> None:
-    """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are where it goes, where Q is and where sizes are, or
-    -1 where there are none."""
+    """M (Q + diag(sizes unit / c)) M' of one change; ``places`` are the offsets of the result, of Q, and of the sizes
+    (-1: none).
+    """
     n = len(S)
     to, fixed, sizes = places
     for a in range(n):
@@ -54,7 +59,7 @@ def walk(M: Array, places: tuple[int, int, int], S: Array, c: Array, unit: float
 
 @shared
 def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, noise: float, g: Array) -> None:
-    """Row j of a covariance whose lower triangle lies from ``at`` on, ``step`` apart."""
+    """Fill row j of a covariance whose lower triangle begins at ``at`` with stride ``step``."""
     n, h = len(x), noise
     for a in range(n):
         g[a] = 0.0
@@ -69,7 +74,7 @@ def enter_packed(M: Array, at: int, step: int, x: Array, j: int, sign: float, no
 
 @shared
 def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, unknown: bool, g: Array) -> float:
-    """All leaves, and what may have happened since the last used sample; returns the mean noise variance."""
+    """Add the direction to all leaves and to the covariances of the gap; returns the mean noise variance."""
     n, j, sign, noise = len(x), int(now[ENTERING]), now[OK], now[NOISE]
     B, columns, mean = table[3 * COLUMNS] // 8, table[3 * COLUMNS + 2], 0.0
     for leaf in range(many[LEAVES]):
@@ -105,39 +110,46 @@ def enter_mixture(z: Array, P: Array, x: Array, now: Array, noise: float, g: Arr
 
 
 @machine
-def machine_walks(
-    memory: int, table: int, M: int, c: int, W: int, unit: float, size: int, n: int, L: int, l: int
-) -> None:
-    """Q of every change for lane l of L, from the addresses of fields."""
-    t, m = wholes(table, 3 * ROWS, L)[:, l], floats(memory, size, L)[:, l]
+def machine_walks(fields: int, unit: float, size: int, n: int, L: int, l: int) -> None:
+    """Q of every change for lane l of L, from the addresses of fields; the memory has ``size`` numbers."""
+    at = wholes(fields, 1, ADDRESSES)
+    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
+    M, W = cubes(at[0, AT_S], n, n, L)[:, :, l], cubes(at[0, AT_W], n, n, L)[:, :, l]
+    c = floats(at[0, AT_C], n, L)[:, l]
     wide, sizes = t[3 * WALKS + 2], t[3 * RELATIVE + 2]
     for i in range(t[3 * WALKS + 1]):
         of = t[3 * RELATIVE] // 8 + i * sizes if sizes > 0 else -1
         places = t[3 * WALKS] // 8 + i * wide, t[3 * FIXED] // 8 + i * wide, of
-        walk(m, places, cubes(M, n, n, L)[:, :, l], floats(c, n, L)[:, l], unit, cubes(W, n, n, L)[:, :, l])
+        walk(m, places, M, c, unit, W)
 
 
 @machine
-def machine_enter(
-    memory: int, table: int, many: int, x: int, z: int, P: int, g: int, now: int, unknown: int, size: int,
-    counters: int, n: int, L: int, l: int,
-) -> None:  # fmt: skip
+def machine_enter(fields: int, unknown: int, size: int, counters: int, n: int, L: int, l: int) -> None:
     """`enter_leaves` and `enter_mixture` for lane l of L, from the addresses of fields."""
-    told, x_l, g_l = floats(now, NOW, L)[:, l], floats(x, n, L)[:, l], floats(g, n, L)[:, l]
-    noise = enter_leaves(
-        floats(memory, size, L)[:, l], wholes(table, 3 * ROWS, L)[:, l], wholes(many, counters, L)[:, l], x_l, told,
-        unknown > 0, g_l,
-    )  # fmt: skip
-    enter_mixture(floats(z, n, L)[:, l], cubes(P, n, n, L)[:, :, l], x_l, told, noise, g_l)
+    at = wholes(fields, 1, ADDRESSES)
+    t, m = wholes(at[0, AT_TABLE], 3 * ROWS, L)[:, l], floats(at[0, AT_MEMORY], size, L)[:, l]
+    many, now = wholes(at[0, AT_COUNTERS], counters, L)[:, l], floats(at[0, AT_NOW], NOW, L)[:, l]
+    x, g = floats(at[0, AT_X], n, L)[:, l], floats(at[0, AT_G], n, L)[:, l]
+    noise = enter_leaves(m, t, many, x, now, unknown > 0, g)
+    enter_mixture(floats(at[0, AT_D], n, L)[:, l], cubes(at[0, AT_P], n, n, L)[:, :, l], x, now, noise, g)
 
 
 FRAMED = (machine_walks, machine_enter)
-"""What the steps here call, beside those of the coordinates."""
+"""What the steps here call, apart from the routines of the coordinates."""
+
+
+@kernel
+def addresses(s: State) -> int:
+    """The address of those of the fields that these routines work on."""
+    return packed((  # type: ignore[no-any-return]
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+    ))  # fmt: skip
 
 
 @kernel
 def begin_framed(s: State, l: int) -> None:
-    """The one leaf that the bank begins with: z ~ N(d, I), in units of the noise variance if that is unknown."""
+    """The single leaf with which the bank begins: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
     s.framed[l] = 1
     frame(s, l)
@@ -149,18 +161,15 @@ def begin_framed(s: State, l: int) -> None:
 
 @kernel
 def write_walks(s: State, l: int) -> None:
-    """What the changes of the next sample add, in these coordinates."""
+    """Write the covariances that changes add at the next sample, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
-    machine_walks(
-        s.memory.ctypes.data, s.table.ctypes.data, s.S.ctypes.data, s.c.ctypes.data, s.W.ctypes.data, unit,
-        s.memory.shape[0], n, L, l,
-    )  # fmt: skip
+    machine_walks(addresses(s), unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Take a regressor in by the column by which it leaves the span; the compiled routine has let time pass."""
+    """Process a regressor that leaves the span by a column; the compiled routine has made the time update."""
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
@@ -168,11 +177,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     s.root[l] = 1
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
-    machine_enter(
-        s.memory.ctypes.data, s.table.ctypes.data, s.counters.ctypes.data, s.x.ctypes.data, s.d.ctypes.data,
-        s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data, s.unknown[l], s.memory.shape[0],
-        s.counters.shape[0], n, L, l,
-    )  # fmt: skip
+    machine_enter(addresses(s), s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
 
 
 @kernel
@@ -191,7 +196,7 @@ def read_framed(s: State, l: int) -> None:
 
 
 def in_theta(lane: dict[str, Array], means: Array, covs: Array) -> tuple[Array, Array]:
-    """means (L, n) and covs (L, n, n) of z as those of theta; they stay what they are where the bank is not framed."""
+    """Convert means (L, n) and covs (L, n, n) of z to theta; without these coordinates they are returned unchanged."""
     if not lane["framed"]:
         return means, covs
     R = lane["R"]

@@ -1,4 +1,4 @@
-"""One floor of the tree: every leaf with every change, then the sample under every sensor.
+"""One level of the tree: every leaf with every change, then the sample under every sensor.
 
     C- = C / forget + Q_i,     s = factor_j r + z'C- z,     eps = y - b_j - z'm,     K = C- z / s
     m+ = m + K eps,            C+ = C- - K (C- z)'
@@ -9,7 +9,7 @@ With unknown noise variance (nu, S; C in its units, s above with r = 1):
     log p = lgamma((nu+1)/2) - lgamma(nu/2) - 1/2 log(pi S s) - (nu+1)/2 log(1 + eps^2 / (S s)),   nu <- nu + 1,
     S <- S + eps^2 / s
 
-after nu and S were multiplied by the forgetting factor of the variance. The children of K leaves stand in the order
+after nu and S were multiplied by the forgetting factor of the variance. The children of K leaves are in the order
 sensor, change, leaf: child (j H_d + i) K + l.
 """
 
@@ -32,12 +32,12 @@ from driftfit.trackers.parts.diffuse import LEFT
 
 LOG_2PI, LOG_PI = math.log(2.0 * math.pi), math.log(math.pi)
 FLOOR = 1e-12
-"""S never falls below this share of nu times the mean square of y: the data's own rounding."""
+"""S never falls below this share of nu times the mean square of y, which is the rounding of the data."""
 
 
 @shared
 def develop_own(t: Any, K: int) -> int:
-    """The same where parent l stands for the joint event l."""
+    """The same, where parent l takes only joint event l."""
     A, C, m, Q, maps, places, n, Hm = t.parents, t.C, t.m, t.Q, t.maps, t.places, t.n, len(t.sensors)
     for l in range(K):
         c = l // Hm
@@ -53,8 +53,8 @@ def develop_own(t: Any, K: int) -> int:
 
 @part
 def develop(n: int, t: Any, K: int, own: bool) -> int:
-    """C- = C / forget + Q_i and m of every parent under every change: columns c K + l. With ``own`` parent l stands for
-    the joint event l alone. Returns the number of columns.
+    """C- = C / forget + Q_i and m of every parent under every change: columns c K + l. With ``own``, parent l takes
+    only joint event l. Returns the number of columns.
     """
     if own:
         return int(develop_own(t, K))
@@ -73,7 +73,7 @@ def develop(n: int, t: Any, K: int, own: bool) -> int:
 
 @part(sizes=(2, 3, 4))
 def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
-    """What the parents and all that may happen to them expect of the sample; returns the number of columns."""
+    """Forecasts of the sample by the parents under all events; returns the number of columns."""
     columns = develop(n, t, K, own)
     regressors(n, t, t.parents, K, columns // K, phi)
     spread(t.C, t.z, t.m, columns, n, t.output_lags, t.g, t.expected)
@@ -82,9 +82,10 @@ def ahead(n: int, t: Any, K: int, own: bool, phi: Array) -> int:
 
 @part(sizes=(2, 3, 4))
 def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> None:
-    """The data in the leaves from column ``at`` on, spec section 3; the last two rows of `scores` take eps^2 / s and s.
+    """Measurement update of the leaves from column ``at`` on (spec section 3); the last two rows of `scores` receive
+    eps^2 / s and s.
 
-    A variance keeps at least the share `LEFT` of what it was: no rounding makes it negative.
+    A variance keeps at least the share `LEFT` of its value, so that rounding cannot make it negative.
     """
     B, C, m, g, expected, scores = t.leaves, t.C, t.m, t.g, t.expected, t.scores
     for l in range(0, columns, WIDTH):
@@ -106,7 +107,7 @@ def correct(n: int, t: Any, at: int, columns: int, y: float, noise: float) -> No
 
 @shared
 def leave(t: Any, at: int, columns: int) -> None:
-    """The leaves from column ``at`` on, under a sensor that says nothing of theta."""
+    """Leave the leaves from column ``at`` on unchanged, under a sensor that carries no information about theta."""
     B, C, m, n = t.leaves, t.C, t.m, t.n
     for l in range(0, columns, WIDTH):
         for i in range(n):
@@ -125,12 +126,12 @@ def gaussian(X: Array, columns: int) -> None:
 
 @shared
 def student(t: Any, at: int, columns: int) -> None:
-    """The same in `scores` with unknown variance, spec section 8; nu and S of the leaves from column ``at`` on take the
-    sample in.
+    """The same in `scores` with unknown variance, spec section 8; nu and S of the leaves from column ``at`` on are
+    updated.
     """
     B, X, fade, least = t.leaves, t.scores, t.sample[FADE], t.sample[LEAST]
     before, ratio = np.nan, 0.0
-    for l in range(columns):  # lgamma is dear, and few values of nu differ
+    for l in range(columns):  # lgamma is expensive, and nu has few different values
         nu = fade * B[NU, at + l]
         if nu != before:
             before, ratio = nu, math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu)
@@ -165,7 +166,7 @@ def frozen(t: Any, at: int, columns: int, y: float, last: float, width: float) -
 
 @shared
 def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
-    """A row of children as their parents have it."""
+    """Copy a row from parents to children."""
     A, B = t.parents, t.leaves
     for c in range(at, at + columns, K):
         for l in range(K):
@@ -174,7 +175,7 @@ def inherit(t: Any, K: int, row: int, at: int, columns: int) -> None:
 
 @shared
 def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None:
-    """Output lags of the children: the parent's, one later, and y or what the leaf expected."""
+    """Output lags of the children: the parent's, moved by one, and y or the leaf's prediction."""
     A, B, expected, n, na, r, most = t.parents, t.leaves, t.expected, t.n, t.output_lags, t.sample[R], t.sample[MOST]
     first = FIRST + n + n * (n + 1) // 2
     for i in range(na - 1, 0, -1):
@@ -188,8 +189,8 @@ def remember(t: Any, K: int, at: int, columns: int, y: float, own: bool) -> None
 
 @shared
 def weigh(t: Any, K: int, at: int, columns: int, j: int, own: bool) -> None:
-    """log w+ = log w + log p(event | leaf) + log N of the children under sensor j, spec section 3; their ages, whose
-    children they are, and by which event.
+    """log w+ = log w + log p(event | leaf) + log N of the children under sensor j, spec section 3; their ages, parents
+    and events.
     """
     A, B, X, prior, parents, events = t.parents, t.leaves, t.scores, t.prior, t.parent, t.event
     alike, Hm, likely = t.counters[ALIKE] > 0, len(t.sensors), t.scores[0]
@@ -231,9 +232,9 @@ def encode(t: Any, K: int, at: int, columns: int, j: int) -> None:
 
 @shared
 def grow(t: Any, K: int, own: bool, phi: Array, y: float, last: float, noise: float) -> int:
-    """The leaves that K parents grow by a sample, with their weights not normalised; returns how many there are.
+    """Grow the children of K parents by one sample, with weights that are not normalised; returns their number.
 
-    With ``own`` parent l stands for the joint event l alone; ``last`` is what a frozen sensor says again.
+    With ``own``, parent l takes only joint event l; ``last`` is the value that a frozen sensor repeats.
     """
     sensors = t.sensors
     columns = int(ahead(t.n, t, K, own, phi))

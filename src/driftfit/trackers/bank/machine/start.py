@@ -1,4 +1,4 @@
-"""Before the tree of hypotheses grows: one leaf, no event, and a filter that says when the tree can begin."""
+"""Before the hypothesis tree grows: one leaf, no event, and a filter that decides when the tree can begin."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ from driftfit.trackers.bank.leaves.lags import push
 from driftfit.trackers.bank.leaves.leaf_matrix import AGE, FIRST, LOG, NU, WEIGHT, S
 
 GROWTH = 1e8
-"""Exponential forgetting lets the trace of a covariance grow to this multiple of what it is when the tree begins."""
+"""Exponential forgetting may let the trace of a covariance grow to this multiple of its value when the tree begins."""
 
 
 @shared
 def begin(t: Any, nu: float, squares: float) -> None:
-    """The one leaf that a bank starts from; P, in units of an unknown noise variance, takes those of theta."""
+    """Set the single leaf from which a bank starts; P, in units of an unknown noise variance, is converted to units of
+    theta.
+    """
     B, theta, P, history, counters = t.leaves, t.theta, t.cov, t.history, t.counters
     n, H = len(theta), len(t.initial)
     at, unit = FIRST + n, squares / (nu - 2.0) if nu > 2.0 else 1.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, exp, floats, kernel, log, nothing, wholes
-from driftfit.trackers.adaptive_kalman import RESIDUALS, learn_start
+from driftfit.trackers.adaptive_kalman import RESIDUALS
 from driftfit.trackers.bank.layout import (
     COUNT,
     COUNTERS_AT,
@@ -37,6 +37,8 @@ from driftfit.trackers.bank.layout import (
     WAITING,
     Y_HAT,
     R,
+    memory_at,
+    report_at,
 )
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import own_address
@@ -47,20 +49,23 @@ from driftfit.trackers.parts.coordinates import FRAME, whiten_within
 from driftfit.trackers.parts.diffuse import enter, measurement, prediction, spanned_variance, wander
 from driftfit.trackers.parts.excitation import learn_scales
 from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.rls import learn_scale
 
 GIVEN, GIVEN_CHAIN, DRIFT, OWN_AT = ROW["given"], ROW["given_chain"], ROW["drift"], ROW["own_likelihoods"]
 
 
 @kernel
 def keep(o: State, s: State, l: int) -> None:
-    """Store what tells of events."""
-    for k in range(s.report.shape[0]):
-        o.report[k, l] = s.report[k, l]
+    """Store the report of events."""
+    size, L = o.report.shape
+    said = floats(report_at(s), size, L)
+    for k in range(size):
+        o.report[k, l] = said[k, l]
 
 
 @kernel
 def only_drift(s: State, l: int) -> None:
-    """The first change, for the one filter before the bank starts."""
+    """The time update by the first change, for the single filter before the bank starts."""
     time = s.dt[l] * s.drift[l]
     keep = s.keep0[l] if s.dt[l] == 1.0 else exp(s.dt[l] * log(s.keep0[l]))
     at = 0
@@ -93,10 +98,10 @@ def only_drifted(s: State, l: int) -> None:
 
 @kernel
 def point(s: State) -> None:
-    """Write where the arrays are into the table."""
+    """Write the addresses of the arrays into the table."""
     framed = s.framed[0] > 0
-    s.table[MEMORY_AT, 0, 0] = s.memory.ctypes.data
-    s.table[REPORT_AT, 0, 0] = s.report.ctypes.data
+    s.table[MEMORY_AT, 0, 0] = memory_at(s)
+    s.table[REPORT_AT, 0, 0] = report_at(s)
     s.table[PHI_AT, 0, 0] = s.x.ctypes.data if framed else s.phi.ctypes.data
     s.table[POWERS_AT, 0, 0] = s.no_power.ctypes.data if framed else s.c.ctypes.data
     s.table[THETA_AT, 0, 0] = s.d.ctypes.data if framed else s.theta.ctypes.data
@@ -114,9 +119,12 @@ def report(s: State, l: int) -> None:
 
 @kernel
 def among(s: State, l: int) -> None:
-    """The same for one of several outputs: numbers of one lane lie apart, so it works on copies side by side."""
-    n, N, size, framed = s.theta.shape[0], s.memory.shape[0], s.report.shape[0], s.framed[l] > 0
-    memory, report = s.flat.ctypes.data, s.flat.ctypes.data + 8 * N
+    """The same for one of several outputs: the numbers of one lane are not contiguous, so it works on copies."""
+    n, L, framed = s.theta.shape[0], s.theta.shape[1], s.framed[l] > 0
+    N, size = s.table[MEMORY_AT, 2, 0], s.table[REPORT_AT, 2, 0]
+    own_memory, own_report = floats(memory_at(s), N, L), floats(report_at(s), size, L)
+    memory = memory_at(s) + 8 * N * L  # the field flat, behind the memory
+    report = memory + 8 * N
     vectors = report + 8 * size
     P = vectors + 24 * n
     sample = P + 8 * n * n
@@ -130,7 +138,7 @@ def among(s: State, l: int) -> None:
     table[POWERS_AT, 0], table[THETA_AT, 0], table[COV_AT, 0] = vectors + 8 * n, vectors + 16 * n, P
     table[COUNTERS_AT, 0], table[SAMPLE_AT, 0], table[OWN_AT, 0] = counters, sample, own_address(s)
     for k in range(N):
-        floats(memory, 1, N)[0, k] = s.memory[k, l]
+        floats(memory, 1, N)[0, k] = own_memory[k, l]
     for i in range(n):
         floats(vectors, 3, n)[0, i] = s.x[i, l] if framed else s.phi[i, l]
         floats(vectors, 3, n)[1, i] = 0.0 if framed else s.c[i, l]
@@ -143,9 +151,9 @@ def among(s: State, l: int) -> None:
         wholes(counters, 1, COUNT)[0, k] = s.counters[k, l]
     bank(at)
     for k in range(N):
-        s.memory[k, l] = floats(memory, 1, N)[0, k]
+        own_memory[k, l] = floats(memory, 1, N)[0, k]
     for k in range(size):
-        s.report[k, l] = floats(report, 1, size)[0, k]
+        own_report[k, l] = floats(report, 1, size)[0, k]
     for k in range(SIZE):
         s.sample[k, l] = floats(sample, 1, SIZE)[0, k]
     for k in range(COUNT):
@@ -160,7 +168,7 @@ def among(s: State, l: int) -> None:
 
 @kernel
 def run(s: State, l: int) -> None:
-    """The compiled routine; addresses are no part of the state."""
+    """Call the compiled routine; addresses are not part of the state."""
     if s.theta.shape[1] > 1:
         among(s, l)
     else:
@@ -173,7 +181,7 @@ def run(s: State, l: int) -> None:
 
 @kernel
 def hand_over(s: State, l: int) -> None:
-    """The numbers of this sample, for the compiled routine."""
+    """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
     s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
@@ -183,11 +191,11 @@ def hand_over(s: State, l: int) -> None:
 
 @kernel
 def alone(s: State, l: int, counts: bool) -> None:
-    """After a sample that the one filter took in: scales, the noise, lags; and the bank, as soon as it can begin."""
+    """After a sample of the single filter: update scales, noise and lags, and begin the bank as soon as possible."""
     learn_scales(s, l)
     s.sample[FREEDOM, l] = s.count[l] if s.unknown[l] > 0 else np.inf
     if counts:
-        learn_start(s, l)
+        learn_scale(s, l)
     s.within[l] += s.ok[l] if s.s[l] < np.inf else 0.0
     hand_over(s, l)
     s.sample[Y_HAT, l], s.sample[S2, l] = s.y_hat[l], s.s[l]
@@ -219,7 +227,7 @@ def correct(s: State, l: int) -> None:
 
 @kernel
 def in_coordinates(s: State, l: int) -> None:
-    """One sample of a bank in the coordinates of its start; one that leaves the span moves no weight."""
+    """Process one sample in the coordinates of the start; a sample outside the span changes no weight."""
     column, y_hat = whiten_within(s, l), prediction(s, l)
     write_walks(s, l)
     hand_over(s, l)
@@ -257,12 +265,13 @@ def begin(s: State, l: int) -> None:
 
 @kernel
 def take_known(s: State, known: Array, t: int, l: int) -> None:
-    """Priors of the joint events of this sample, a chain of the changes, then factors of the drift of every change."""
+    """Read the priors of the joint events of this sample, a chain of the changes, and their drift factors."""
     row, column = t if known.shape[0] > 1 else 0, 3
+    memory = floats(memory_at(s), s.table[MEMORY_AT, 2, 0], s.theta.shape[1])
     for field in (GIVEN, GIVEN_CHAIN, DRIFT):
         start = s.table[field, 0, l] // 8
         for k in range(s.table[field, 2, l]):
-            s.memory[start + k, l] = known[row, column, l]
+            memory[start + k, l] = known[row, column, l]
             column += 1
 
 

@@ -1,1 +1,1 @@
-"""How the tree of hypotheses is kept small, compiled: which leaves go on, and which become one."""
+"""How the tree of hypotheses is kept small, compiled: which leaves are kept, and which are merged."""

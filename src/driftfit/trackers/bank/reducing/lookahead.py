@@ -9,7 +9,7 @@ and nothing happens between them. One sample alone may decide nothing where ten 
 ahead then never begins to wait.
 
 The integral runs over nodes at mean +- 6 standard deviations of every component, by the trapezoidal rule on the union
-of them. The next regressors are not known; the last one before the events that are open stands for them. One that the
+of them. The next regressors are not known; the last one before the open events is used instead. One that the
 leaves have already been fitted to, as the present one, promises too little: they agree about it. Cost: components x
 nodes x s; used only while a decision is open.
 """

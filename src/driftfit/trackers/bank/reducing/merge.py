@@ -1,4 +1,4 @@
-"""Leaves into fewer leaves: those of a group become one that keeps their mean and covariance.
+"""Merge the leaves of a group into one with their mean and covariance.
 
     W = sum w,   m = sum w m_l / W,   C = sum w (C_l + d_l d_l') / W,   d_l = m_l - m
 
@@ -65,7 +65,7 @@ def freedom(t: float, start: float) -> float:
 
 @shared
 def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
-    """The covariance of parent ``to``, whose mean stands there already: sum w (C_l + g_l d_l d_l'); X is spare."""
+    """The covariance of parent ``to``, whose mean is already stored there: sum w (C_l + g_l d_l d_l'); X is spare."""
     B, A, n, unknown = t.leaves, t.parents, t.n, t.unknown > 0
     for k in range(len(members)):
         l = members[k]
@@ -80,7 +80,7 @@ def pool(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
 
 @shared
 def match(t: Any, members: Array, share: Array, to: int, X: Array) -> None:
-    """Parent ``to`` from the members, which have the given shares, summing to 1; X is spare."""
+    """Fill parent ``to`` from the members, whose shares sum to 1; X is spare."""
     B, A, n, na, unknown = t.leaves, t.parents, t.n, t.output_lags, t.unknown > 0
     lags = FIRST + n + n * (n + 1) // 2
     heaviest, g, s = 0, 0.0, 0.0
@@ -132,7 +132,7 @@ def sort(group: Array, L: int, G: int, start: Array, order: Array) -> int:
 
 @shared
 def combine(t: Any, L: int, G: int) -> float:
-    """A parent, and its history, for every group that `sort` put in order; returns the mass that is left."""
+    """Make a parent and its history for every group that `sort` ordered; returns the remaining mass."""
     A, B, start, order, X = t.parents, t.leaves, t.start, t.order, t.scratch
     now, after = (t.history_2, t.history) if t.counters[FLIPPED] > 0 else (t.history, t.history_2)
     kept, share = 0.0, X[0]
@@ -157,7 +157,7 @@ def combine(t: Any, L: int, G: int) -> float:
 
 @shared
 def take(t: Any, G: int) -> float:
-    """Leaves that are kept as they are, in `order`, of which only the rows that are in use; returns their mass."""
+    """Copy the leaves that are kept, in `order`, only the rows in use; returns their mass."""
     A, B, order, bases, unknown = t.parents, t.leaves, t.order, t.bases, t.unknown > 0
     for k in range(0, G, WIDTH):
         for row in range(LOG, CODE):
@@ -178,7 +178,7 @@ def take(t: Any, G: int) -> float:
 
 @shared
 def mix(t: Any, L: int) -> int:
-    """Interaction (IMM), spec section 5: parent e goes on from all leaves that may lead to event e, with the weights
+    """Interaction (IMM), spec section 5: parent e is mixed from all leaves that may lead to event e, with the weights
     W_le = w_l p(e | l) / sum_l w_l p(e | l). Returns the number of events.
     """
     A, B, prior, order, X = t.parents, t.leaves, t.prior, t.order, t.scratch
@@ -193,7 +193,7 @@ def mix(t: Any, L: int) -> int:
                 mass += heavy
                 count += 1
         possible = mass
-        if count == 0:  # no way leads here
+        if count == 0:  # no leaf leads here
             order[0], share[0], mass, count = 0, 1.0, 1.0, 1
         for k in range(count):
             share[k] /= mass

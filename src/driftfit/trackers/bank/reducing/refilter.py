@@ -4,7 +4,7 @@
 
 The components of the first floor share their mean, so with prior weights this is one Kalman filter with
 Q = sum p_i Q_i. With posterior weights the samples that gave them are filtered again and so count twice; merging leaves
-(GPB) uses each once and is better. It is here to show that. One sensor, independent events.
+(GPB) uses each once and is better. It is included for comparison. One sensor, independent events.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ def widen(t: Any, weight: Array, X: Array) -> None:
 
 
 @shared
-def floor(t: Any, K: int, sample: Array) -> int:
-    """One floor of the new tree, with a stored sample."""
+def grow_level(t: Any, K: int, sample: Array) -> int:
+    """One level of the new tree, with a stored sample."""
     return int(grow(t, K, False, sample[TIME + 1 :], sample[Y], sample[Y], sample[NOISE]))
 
 
 @shared
 def refilter(t: Any, L: int) -> int:
-    """Take the oldest of the stored samples into the root, and grow the tree of the others again; returns its leaves,
-    among the parents.
+    """Update the root by the oldest stored sample, and grow the tree of the others again; returns the number of its
+    leaves, which are parents.
     """
     A, B, Q, root, samples, prior, row = t.parents, t.leaves, t.Q, t.root, t.samples, t.prior, t.row
     H, D, weight = len(row), int(t.reduction[DEPTH]), t.scratch[0]
@@ -61,7 +61,7 @@ def refilter(t: Any, L: int) -> int:
         A[k, 0] = root[k, 0]
     A[LOG, 0] = 0.0
     L = min(D, 1)
-    floor(t, L, samples[0])
+    grow_level(t, L, samples[0])
     for k in range(len(root)):
         root[k, 0] = A[k, 0] = B[k, 0]
     root[LOG, 0] = A[LOG, 0] = A[CODE, 0] = 0.0
@@ -71,7 +71,7 @@ def refilter(t: Any, L: int) -> int:
                 prior[e, l] = row[e]
         increments(t, samples[at, TIME], samples[at, TIME])
         ready(t)
-        L = floor(t, L, samples[at])
+        L = grow_level(t, L, samples[at])
         normalise(B, L)
         for k in range(len(root)):
             for l in range(L):
@@ -84,7 +84,7 @@ def refilter(t: Any, L: int) -> int:
 
 @shared
 def histories(t: Any, L: int) -> None:
-    """The histories of the new tree: what happened in the D - 1 floors that it has."""
+    """Write the histories of the new tree, which has D - 1 levels."""
     A, D, H, Hm = t.parents, int(t.reduction[DEPTH]), len(t.initial), len(t.sensors)
     T = t.history_2 if t.counters[FLIPPED] > 0 else t.history
     block, width = H + 1, T.shape[1]

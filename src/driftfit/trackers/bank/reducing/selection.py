@@ -1,7 +1,7 @@
-"""Which leaves go on, and which of them become one: a group for every leaf, -1 for those that are dropped.
+"""Selection of leaves: a group for every leaf, whose members are merged; -1 for leaves that are dropped.
 
-Groups are chosen when a sample has been taken in, and carried out before the next one that can be used: a sample that
-is not used leaves the mixture as it is.
+Groups are chosen after a sample and merged before the next sample that can be used, so a sample that is not used does
+not change the mixture.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KIND, LEAVES, DEPTH, TAU, WAIT, CAP, PRIOR, AHEAD = range(8)
 
 
 FEW = 64
-"""As many entries are compared each with each; among more, and among ties, the bound is searched."""
+"""Up to so many entries are compared pairwise; for more, and for ties, the bound is searched."""
 
 
 @kernel
@@ -58,7 +58,7 @@ def bound(V: Array, row: int, count: int, M: int) -> float:
 @shared
 def heaviest(V: Array, row: int, count: int, M: int, group: Array, order: Array, ranks: Array) -> int:
     """Number the M largest positive values of a row in their order, ties by their order; -1 for the rest. Returns how
-    many. What follows in the row, up to the end of a SIMD vector, must be zero; ``ranks`` (1, count) is overwritten.
+    many. The rest of the row, up to the end of a SIMD vector, must be zero; ``ranks`` (1, count) is overwritten.
     """
     value, over, G = V[row], 0, 0
     if count <= FEW:
@@ -102,7 +102,7 @@ def beam(t: Any, L: int) -> int:
 
 @shared
 def merge(t: Any, L: int) -> int:
-    """Leaves of one code become one; codes are numbered as they come."""
+    """Merge leaves with the same code; codes are numbered in the order of their appearance."""
     B, group, slots, G = t.leaves, t.group, t.slots, 0
     for l in range(L):
         slots[int(B[CODE, l])] = -1
@@ -119,7 +119,7 @@ def merge(t: Any, L: int) -> int:
 
 @shared
 def hybrid(t: Any, L: int) -> int:
-    """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of what comes of it."""
+    """Merge leaves equal in recent changes, newest sensor events and age; keep the heaviest of the results."""
     B, group, slots, X, bases = t.leaves, t.group, t.slots, t.scratch, t.bases
     cap, M, size, G = t.reduction[CAP], int(t.reduction[LEAVES]), len(t.slots), 0
     mass, key, renumber = X[0], X[1], X[3]
@@ -130,7 +130,7 @@ def hybrid(t: Any, L: int) -> int:
         if B[WEIGHT, l] <= 0.0:
             continue
         mine = (B[CHANGES, l] * bases[1] + B[SENSORS, l]) * (cap + 1.0) + min(B[AGE, l], cap)
-        place = int(mine) * 2654435761 % size  # a table of hashes with open addresses
+        place = int(mine) * 2654435761 % size  # a hash table with open addressing
         while slots[place] >= 0 and key[slots[place]] != mine:
             place = (place + 1) % size
         if slots[place] < 0:
@@ -206,7 +206,7 @@ def decide(t: Any, L: int, phi: Array) -> None:
     """Resolve the oldest events while the rule says so, spec section 5.
 
     A leaf that loses a decision leaves its group. ``decided[k]`` is the event, how many samples ago it was first
-    visible, and its probability. ``phi`` stands for the next regressor.
+    visible, and its probability. ``phi`` is used as the next regressor.
     """
     B, group, stamps, decided, held = t.leaves, t.group, t.stamps, t.decided, t.counters[HELD]
     p, risk, H, count = t.scratch[0], t.scratch[1], len(t.loss), 0

@@ -55,12 +55,12 @@ class EventSmoothed:
 
     @cached_property
     def covs(self) -> Array:
-        """(T, n, n), with what is not known of a drift that was fitted."""
+        """(T, n, n), including the uncertainty of a fitted drift."""
         return self._given if self._fitted is None else self._given + self._fitted.spread()
 
     @property
     def std(self) -> Array:
-        """inf for what the record never told apart."""
+        """inf for parameters that the record never distinguished."""
         return np.where(np.isinf(self.run.std[-1]), np.inf, np.sqrt(np.einsum("tii->ti", self.covs)))
 
     def band(self, level: float = 0.95) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from driftfit.engine.kernel import Array
 
 
 class Shifts(Protocol):
-    """What says how far parameters moved: a smoothed path."""
+    """Anything that states how far parameters moved: a smoothed path."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -120,17 +120,17 @@ class Event:
 
     def row(self, names: tuple[str, ...]) -> dict[str, Any]:
         """A row of a table, with change and standard error of every parameter, None if there is none."""
-        told = {
+        row = {
             "kind": self.kind, "date": self.date, "first": self.first, "last": self.last, "known": self.known,
             "prob": self.prob, "name": self.name,
             "moved": ", ".join(name for name, z in self.z.items() if abs(z) > 2.0),
         }  # fmt: skip
         for name in names:
-            told |= {name: self.shift.get(name), f"std_{name}": self.std.get(name)}
-        return told
+            row |= {name: self.shift.get(name), f"std_{name}": self.std.get(name)}
+        return row
 
 
-class Told(NamedTuple):
+class Probabilities(NamedTuple):
     """The probabilities from which events are made."""
 
     latest: Array
@@ -144,18 +144,18 @@ class Told(NamedTuple):
     sensor_names: tuple[str, ...]
 
 
-def changes_of(told: Told, threshold: float) -> list[Event]:
+def changes_of(given: Probabilities, threshold: float) -> list[Event]:
     """Clusters of samples at which theta may have jumped."""
-    Hm, latest = len(told.sensor_names), np.nan_to_num(told.latest)
+    Hm, latest = len(given.sensor_names), np.nan_to_num(given.latest)
     by_change = latest.reshape(len(latest), -1, Hm).sum(axis=2)
-    p, names = by_change[:, 1:].sum(axis=1), told.change_names[1:]
+    p, names = by_change[:, 1:].sum(axis=1), given.change_names[1:]
     events: list[Event] = []
-    for a, b in runs(told.window > threshold):
-        reach = slice(max(0, a - told.W + 1, events[-1].span.last + 1 if events else 0), b)
+    for a, b in runs(given.window > threshold):
+        reach = slice(max(0, a - given.W + 1, events[-1].span.last + 1 if events else 0), b)
         for first, end in clusters(p, reach, threshold):
             mass, share = p[first:end], by_change[first:end, 1:].sum(axis=0)
             low, high = densest(mass)
-            low = back_to(first + low, reach.start, told.used)
+            low = back_to(first + low, reach.start, given.used)
             shares = dict(zip(names, (share / share.sum()).tolist(), strict=True))
             likely, date = names[int(share.argmax())], first + int(mass.argmax())
             prob = float(min(mass.sum(), 1.0))
@@ -175,7 +175,7 @@ def clusters(p: Array, reach: slice, threshold: float) -> list[tuple[int, int]]:
 
 
 def back_to(first: int, start: int, used: Array) -> int:
-    """The first of the unused samples before this one: what happened at them is visible here."""
+    """The first of the unused samples before this one: changes at them become visible here."""
     while first > start and not used[first - 1]:
         first -= 1
     return first
@@ -185,27 +185,25 @@ def densest(mass: Array) -> tuple[int, int]:
     """First and last of the smallest set of neighbours with `LEVEL` of the total."""
     total = np.r_[0.0, np.cumsum(mass)]
     wanted = LEVEL * total[-1] * (1.0 - 1e-12)
-    ends = np.searchsorted(
-        total, total[:-1] + wanted
-    )  # of the interval that begins at each sample sample sample sample sample sample
+    ends = np.searchsorted(total, total[:-1] + wanted)
     first = int(np.argmin(np.where(ends <= len(mass), ends - np.arange(len(mass)), len(mass) + 1)))
     return first, int(ends[first]) - 1
 
 
-def faults_of(told: Told, threshold: float) -> list[Event]:
+def faults_of(given: Probabilities, threshold: float) -> list[Event]:
     """Intervals in which the sensor was probably not nominal."""
-    Hm, T, events = len(told.sensor_names), len(told.latest), []
-    by_sensor = np.nan_to_num(told.latest).reshape(T, -1, Hm).sum(axis=1)
+    Hm, T, events = len(given.sensor_names), len(given.latest), []
+    by_sensor = np.nan_to_num(given.latest).reshape(T, -1, Hm).sum(axis=1)
     for j in range(1, Hm):
         for a, b in runs(by_sensor[:, j] > threshold):
-            p, known = float(by_sensor[a:b, j].max()), min(a + told.W - 1, T - 1)
-            events.append(Event("sensor", Span(a, a, b - 1, known), p, told.sensor_names[j]))
+            p, known = float(by_sensor[a:b, j].max()), min(a + given.W - 1, T - 1)
+            events.append(Event("sensor", Span(a, a, b - 1, known), p, given.sensor_names[j]))
     return events
 
 
-def all_of(told: Told, threshold: float) -> list[Event]:
+def all_of(given: Probabilities, threshold: float) -> list[Event]:
     """Changes and faults, sorted by time."""
-    return sorted(changes_of(told, threshold) + faults_of(told, threshold), key=lambda event: event.span.date)
+    return sorted(changes_of(given, threshold) + faults_of(given, threshold), key=lambda event: event.span.date)
 
 
 def runs(on: Array) -> list[tuple[int, int]]:

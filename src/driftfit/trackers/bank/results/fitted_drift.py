@@ -1,16 +1,16 @@
-"""The drift between events, of a bank that was given none: for each parameter the factor of greatest likelihood.
+"""The drift between events of a bank without a given drift: for each parameter the factor of greatest likelihood.
 
     max_f sum_t log N(y_t; phi_t' m_t, c s_t),   Q_t = D Q_0 D,   D = diag(f_i)^(1/2)   between events,   f_i >= 1
 
 The drift of `Bank()` is a guess, too small where parameters walk all the time: between events a path would be taken for
-certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: what the bank estimated has the drift in
-it that its own hypotheses do not explain. All covariances are multiplied by c.
+certain. c = 1, or where the noise variance is unknown the mean of e_t^2 / s_t: the bank's estimate contains drift that
+its own hypotheses do not explain. All covariances are multiplied by c.
 
-A bank whose drift is too small finds changes in a walk, and these take from it what it needs to be recognised. So a
+A bank whose drift is too small explains a random walk by changes, and the fit then underestimates the drift. So a
 change of prior probability p is kept if, with the drift fitted to those that are left, it multiplies the likelihood by
 more than (1 - p) / p; the weaker half of the others goes, until all that are left are kept.
 
-Bands also contain what is not known of the factors: for each of them in turn, the paths at other values, weighted by
+Bands also contain the uncertainty of the factors: for each of them in turn, the paths at other values, weighted by
 their likelihood and a prior that is flat in the standard deviation of the drift, f^(1/2),
 
     C_s + sum_i sum_g w_ig (C_ig - C_s + (m_ig - m_s)(m_ig - m_s)'),    w_ig proportional to L(f_ig) f_ig^(1/2) d log f
@@ -18,8 +18,8 @@ their likelihood and a prior that is flat in the standard deviation of the drift
 The likelihood of a short record is flat towards small drifts, all of which a prior flat in log f would count as
 evidence that nothing moves.
 
-Source: the likelihood is Schweppe's (1965), the prior Gelman's (2006), section 7.1; the rest is ours. Cost: O(T n^2) for each of some hundred likelihoods, and
-O(T n^3) for each value of a factor that is likely enough.
+Source: the likelihood is by Schweppe (1965), the prior by Gelman (2006), section 7.1; the rest is ours. Cost: O(T n^2)
+for each of some hundred likelihoods, and O(T n^3) for each value of a factor that is likely enough.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WIDER = 1e7
 STARTS = (1.0, 1e2, 1e4)
 """Factors at which the search begins: the likelihood may be flat where a drift is too small to be seen."""
 AWAY = np.arange(-7.0, 8.0)
-"""Where the likelihood of a factor is looked at, in its natural logarithm."""
+"""Values at which the likelihood of a factor is computed, as natural logarithms."""
 LIKELY = 0.01
 """Values of a factor that are less likely than this share of the best are left out."""
 
@@ -79,13 +79,13 @@ class FittedDrift:
         return self._scaled(self._logs)
 
     def _at(self, logs: Array, without: int | None = None) -> Problem:
-        """The regression with these factors, and one change less."""
+        """The regression with these factors, and without one change."""
         root, dates = np.exp(0.5 * logs), [date for date in self.dates if date != without]
         Q = self._base * (root[:, None] * root)
         Q[dates] = self._given.Q[dates]
         return self._given._replace(Q=Q)
 
-    def _told(self, tried: Problem) -> tuple[float, float]:
+    def _deviance(self, tried: Problem) -> tuple[float, float]:
         """-2 log L, but for a constant, and c."""
         phi, y, r, Q, m0, C0 = tried
         logs, squares = forward(phi, y, r, Q, m0, C0.copy(), self._m, self._C)
@@ -93,11 +93,11 @@ class FittedDrift:
         return float(logs + self._count * np.log(scale) + squares / scale), scale
 
     def _cost(self, logs: Array, without: int | None = None) -> float:
-        return self._told(self._at(logs, without))[0]
+        return self._deviance(self._at(logs, without))[0]
 
     def _scaled(self, logs: Array) -> Problem:
         tried = self._at(logs)
-        scale = self._told(tried)[1]
+        scale = self._deviance(tried)[1]
         return tried._replace(r=tried.r * scale, Q=tried.Q * scale, C0=tried.C0 * scale)
 
     def _fit(self, starts: list[Array]) -> None:
@@ -109,7 +109,7 @@ class FittedDrift:
         self._logs = found.x if found.fun < self._cost(start) else start
 
     def spread(self) -> Array:
-        """What the uncertainty of the factors adds to the covariances of the path, (T, n, n)."""
+        """Covariances that the uncertainty of the factors adds to the path, (T, n, n)."""
         m, C, _ = solve(self.problem)
         more = np.zeros_like(C)
         for i in range(len(self._logs)):

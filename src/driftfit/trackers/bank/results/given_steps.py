@@ -1,4 +1,4 @@
-"""A regression whose coefficients make a step of given covariance before every sample: filter and smoother.
+"""A regression whose coefficients move by a step of given covariance before every sample: filter and smoother.
 
     G = C(t|t) C(t+1|t)^-1,   m_s = m + G (m_s(t+1) - m(t+1|t)),   C_s = C + G (C_s(t+1) - C(t+1|t)) G'
 

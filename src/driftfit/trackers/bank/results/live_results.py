@@ -10,9 +10,9 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.run.live.live import Live
 from driftfit.trackers.bank.bank import Bank
-from driftfit.trackers.bank.layout import BESIDE, CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO
+from driftfit.trackers.bank.layout import CLOCK, ELAPSED, IMPOSSIBLE, REPORTED_TO, SAMPLE_HEAD
 from driftfit.trackers.bank.memory import SINGLE
-from driftfit.trackers.bank.results.events import Event, Told, all_of
+from driftfit.trackers.bank.results.events import Event, Probabilities, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of
 
 
@@ -30,9 +30,9 @@ class LiveHypotheses:
         self.tracker: Bank = live.tracker  # type: ignore[assignment]
         self._lane = live.lane()
         self.names = self.tracker.event_names
-        told = {name: self.tracker.told(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
-        self.lag_prob: Array = told["lag_prob"].copy()
-        self.evidence, self.window, self.kept, self.leaves = (float(told[name]) for name in SINGLE)
+        reported = {name: self.tracker.reported(self._lane["report"], name) for name in ("lag_prob", *SINGLE)}
+        self.lag_prob: Array = reported["lag_prob"].copy()
+        self.evidence, self.window, self.kept, self.leaves = (float(reported[name]) for name in SINGLE)
         self.impossible = int(self._lane["counters"][IMPOSSIBLE])
 
     def mixture(self) -> Mixture:
@@ -46,14 +46,14 @@ class LiveHypotheses:
         """
         many, bank = self._lane["counters"], self.tracker
         ring = bank.array(self._live.model, self._lane, "ring")
-        now, W = int(many[CLOCK]), bank.floors_told[-1] + 1
+        now, W = int(many[CLOCK]), bank.reported_levels[-1] + 1
         at = np.arange(max(0, now - len(ring)), now)
         rows = ring[at % len(ring)]
         first = int(at[0]) - W + 1 if len(at) else 0
         window, used = np.r_[np.zeros(W - 1), rows[:, 0]], np.r_[np.ones(W - 1, bool), rows[:, 1] > 0.0]
-        latest = np.vstack([rows[:, BESIDE:], np.zeros((W - 1, len(self.names)))])
-        told = Told(latest, window, used, W, bank.change_names, bank.sensor_names)
-        found = [replace(event, span=event.span.moved(first)) for event in all_of(told, threshold)]
+        latest = np.vstack([rows[:, SAMPLE_HEAD:], np.zeros((W - 1, len(self.names)))])
+        given = Probabilities(latest, window, used, W, bank.change_names, bank.sensor_names)
+        found = [replace(event, span=event.span.moved(first)) for event in all_of(given, threshold)]
         busy, reported = window[-1] > threshold, int(many[REPORTED_TO])
         done = [event for event in found if reported <= event.span.date and event.span.last < now - W + 1 and not busy]
         if not busy:

@@ -55,7 +55,7 @@ def stack(axis: Any, time: Array, p: Array, names: tuple[str, ...]) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.28), ncols=min(len(names), 4), fontsize=8, frameon=False)
 
 
-def plot_tree(live: Live, floors: int = 3, ax: Any = None) -> Figure:
+def plot_tree(live: Live, levels: int = 3, ax: Any = None) -> Figure:
     """The tree of hypotheses of a stream that decides (`Decide`, `GPB`): events as branches, weights as widths.
 
     The newest levels are drawn, with the oldest on the left; each leaf is labelled with its weight and its mean.
@@ -68,7 +68,7 @@ def plot_tree(live: Live, floors: int = 3, ax: Any = None) -> Figure:
     H = len(bank.event_names)
     B = bank.array(live.model, lane, "leaves")[:, : lane["counters"][LEAVES]]
     means = mixture_of(bank, live, lane).means
-    depth = min(floors, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
+    depth = min(levels, max(1, round(float(np.log(max(B[CODE].max(), 1.0) + 1.0) / np.log(max(H, 2))) + 0.499)))
     figure, (axis,) = panels(ax, (2.2 * depth + 2.4, max(2.5, 0.24 * H**depth + 0.8)))
     axis.set_axis_off()
     codes, weights = B[CODE].astype(int) % H**depth, B[WEIGHT]

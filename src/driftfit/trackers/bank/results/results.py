@@ -1,6 +1,6 @@
 """Results of a bank of hypotheses besides parameters: probabilities, evidence, alarms, events, the mixture.
 
-Everything is causal unless stated otherwise: row t contains what was known after sample t. Once events were decided,
+Everything is causal unless stated otherwise: row t contains the probabilities after sample t. Once events were decided,
 probabilities are conditional on the decisions.
 """
 
@@ -20,7 +20,7 @@ from driftfit.trackers.bank.layout import IMPOSSIBLE
 from driftfit.trackers.bank.reduction import Decide
 from driftfit.trackers.bank.results import dates
 from driftfit.trackers.bank.results.decided_path import EventSmoothed, measurements, steps_of
-from driftfit.trackers.bank.results.events import Event, Told, all_of
+from driftfit.trackers.bank.results.events import Event, Probabilities, all_of
 from driftfit.trackers.bank.results.mixture import Mixture, mixture_of, undecided
 from driftfit.trackers.bank.results.pictures import plot_hypotheses
 
@@ -80,7 +80,7 @@ class Hypotheses:
         self.tracker: Bank = run.tracker  # type: ignore[assignment]
         self._report = run.written("report")
         self.names = self.tracker.event_names
-        self.lags = self.tracker.floors_told
+        self.lags = self.tracker.reported_levels
         self.sensors = len(self.tracker.all_sensors)
         if self.impossible:
             warnings.warn(
@@ -92,12 +92,12 @@ class Hypotheses:
     def __repr__(self) -> str:
         return f"Hypotheses of {len(self.run)} samples: {', '.join(self.names)}; {self.tracker!r}"
 
-    def _told(self, name: str) -> Array:
-        return self.tracker.told(self._report, name)
+    def _reported(self, name: str) -> Array:
+        return self.tracker.reported(self._report, name)
 
     @cached_property
     def lag_prob(self) -> Array:
-        p = self._told("lag_prob").copy()
+        p = self._reported("lag_prob").copy()
         p[p.sum(axis=2) < 0.5] = np.nan
         return np.asarray(p)
 
@@ -134,11 +134,11 @@ class Hypotheses:
 
     @property
     def window(self) -> Array:
-        return self._told("window")
+        return self._reported("window")
 
     @property
     def evidence(self) -> Array:
-        return self._told("evidence")
+        return self._reported("evidence")
 
     @property
     def log_evidence(self) -> float:
@@ -147,11 +147,11 @@ class Hypotheses:
 
     @property
     def leaves(self) -> Array:
-        return self._told("leaves")
+        return self._reported("leaves")
 
     @property
     def kept(self) -> Array:
-        return self._told("kept")
+        return self._reported("kept")
 
     @property
     def impossible(self) -> int:
@@ -161,14 +161,14 @@ class Hypotheses:
     @cached_property
     def decisions(self) -> list[Decision]:
         """Decided events, in order; empty for reductions that do not decide."""
-        found = self._told("decided")
+        found = self._reported("decided")
         return [
             Decision(int(t - found[t, k, 1]), int(t), int(found[t, k, 0]), float(found[t, k, 2]))
             for t, k in zip(*np.nonzero(found[:, :, 0] >= 0.0), strict=True)
         ]
 
     def finish(self) -> list[Decision]:
-        """What `Decide` would decide about the open events, the oldest first, each given those before it.
+        """The decisions that `Decide` would make about the open events, the oldest first, each given the earlier ones.
 
         It also works if the record is shorter than the depth; empty for reductions that do not decide.
         """
@@ -206,12 +206,12 @@ class Hypotheses:
         return self._timed(dates.dated(found, measured, jumps))
 
     def found(self, threshold: float = 0.5) -> list[Event]:
-        """`events` as they were known when they were found: with the dates of the leaves, and without shifts."""
+        """`events` at the time of their detection: with the dates of the leaves, and without shifts."""
         bank = self.tracker
-        told = Told(
+        given = Probabilities(
             self.latest, self.window, self.run.ok, self.lags[-1] + 1, bank.change_names, bank.sensor_names
         )  # fmt: skip
-        found = [self._early(event, threshold) for event in all_of(told, threshold)]
+        found = [self._early(event, threshold) for event in all_of(given, threshold)]
         return self._timed(found)
 
     def _early(self, event: Event, threshold: float) -> Event:

@@ -1,1 +1,1 @@
-"""Several filters side by side, each with a drift or a noise of its own, for trackers that find both as they go."""
+"""Parallel filters with different drift or noise, for trackers that estimate both on-line."""

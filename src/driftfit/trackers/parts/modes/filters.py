@@ -5,7 +5,7 @@
     a_k    = sum_j p_(j|k) / s_kj,     d_k = sum_j p_(j|k) (1 / s_kj - a_k)^2
     m_k   <- m_k + g_k a_k e_k,        C_k <- C_k - g_k g_k' (a_k - d_k e_k^2)
 
-with v_j the noise of level j (`driftfit.trackers.parts.noise_levels`), c and nu the probabilities of filters and
+with v_j the noise of level j (`driftfit.trackers.parts.modes.noise_levels`), c and nu the probabilities of filters and
 levels. An outlier's level is as wide as the innovation if that is larger than the level itself: its influence does not
 grow with its distance. The filters use the coordinates z = M theta of their start, in which the regressor is x
 (`driftfit.trackers.parts.coordinates`): any units, any offset, and directions without information. A regressor
@@ -27,7 +27,7 @@ from driftfit.engine.kernel import State, exp, kernel, log
 from driftfit.trackers.parts.coordinates import OUTGROWN, in_units_of_theta, new_row
 from driftfit.trackers.parts.diffuse import LEFT
 from driftfit.trackers.parts.modes.ladder import TOP, leap
-from driftfit.trackers.parts.noise_levels import OUTLIER
+from driftfit.trackers.parts.modes.noise_levels import OUTLIER
 from driftfit.trackers.parts.resolution import lasting
 
 LEAST = 1e-100
@@ -87,12 +87,23 @@ def innovate(s: State, l: int) -> None:
 
 
 @kernel
+def sum_of_row(s: State, l: int) -> float:
+    """Sum of the scratch row over the filters."""
+    total = 0.0
+    for k in range(s.mu.shape[0]):
+        total += s.row[k, l]
+    return total
+
+
+@kernel
 def likelihoods(s: State, l: int) -> float:
     """joint[j, k] = c_k nu_j N(e_k; 0, s_kj) exp(nearest / 2) (2 pi)^(1/2); returns nearest."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest, factor = np.inf, s.noise[l] * s.leverage[l]
     more = lasting(s, l)
     leap(s, l, factor * max(s.r[l], s.coarse[l]))
+    for k in range(K):
+        s.row[k, l] = np.inf
     for j in range(J):
         noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l]) + more
         widest = np.inf if j == J - 1 else 0.0
@@ -100,7 +111,9 @@ def likelihoods(s: State, l: int) -> float:
             square = s.e_k[k, l] * s.e_k[k, l]
             v = s.h[k, l] + max(noise, min(square, widest))
             s.inverse[j, k, l] = 1.0 / v
-            nearest = min(nearest, square / v)
+            s.row[k, l] = min(s.row[k, l], square / v)
+    for k in range(K):
+        nearest = min(nearest, s.row[k, l])
     for j in range(J):
         for k in range(K):
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
@@ -110,26 +123,38 @@ def likelihoods(s: State, l: int) -> float:
 
 
 @kernel
-def predictive_density(s: State, nearest: float, l: int) -> None:
-    """The log density of the sample as it was predicted: without a leap, with the noise of a reading that does not
-    repeat, and with a tail that integrates to 1."""
+def as_predicted(s: State, nearest: float, l: int) -> None:
+    """Add, filter by filter, the density without an outlier to the scratch row, where it is not that of ``joint``."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
-    leapt, again = s.rare[l] < 1.0, lasting(s, l) > 0.0
-    ordinary, outlier = 0.0, 0.0
     for j in range(J - 1):
         noise = factor * max(s.level[j, l] * s.r[l], s.coarse[l])
         for k in range(K):
-            if again or (leapt and k == TOP):
-                v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
-                far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
-                ordinary += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
-            else:
-                ordinary += s.joint[j, k, l]
+            v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
+            far = s.e_k[k, l] * s.e_k[k, l] / v - nearest
+            s.row[k, l] += s.prior[k, l] * s.nu_prior[j, l] / np.sqrt(v) * exp(-0.5 * far)
+
+
+@kernel
+def predictive_density(s: State, nearest: float, l: int) -> None:
+    """The log density of the sample under its prediction: without a leap, with the noise of a reading that does not
+    repeat, and with a tail that integrates to 1."""
+    K, J = s.mu.shape[0], s.nu.shape[0]
+    factor = s.noise[l] * s.leverage[l]
     noise = factor * max(s.level[J - 1, l] * s.r[l], s.coarse[l])
     for k in range(K):
         v = s.h[k, l] - (s.gained[l] if k == TOP else 0.0) + noise
-        outlier += s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+        s.row[k, l] = s.prior[k, l] * s.nu_prior[J - 1, l] * np.sqrt(v) / (v + s.e_k[k, l] * s.e_k[k, l])
+    outlier = sum_of_row(s, l)
+    for k in range(K):
+        s.row[k, l] = 0.0
+    if s.rare[l] < 1.0 or lasting(s, l) > 0.0:
+        as_predicted(s, nearest, l)
+    else:
+        for j in range(J - 1):
+            for k in range(K):
+                s.row[k, l] += s.joint[j, k, l]
+    ordinary = sum_of_row(s, l)
     tail = log(outlier / np.pi)
     body = log(ordinary / np.sqrt(2.0 * np.pi)) - 0.5 * nearest if ordinary > 0.0 else -np.inf
     s.density[l] = tail + log(1.0 + exp(body - tail)) if body < tail else body + log(1.0 + exp(tail - body))
@@ -141,22 +166,23 @@ def weigh(s: State, l: int) -> None:
     K, J = s.mu.shape[0], s.nu.shape[0]
     nearest = likelihoods(s, l)
     predictive_density(s, nearest, l)
-    total = 0.0
+    for k in range(K):
+        s.row[k, l] = 0.0
     for j in range(J):
         for k in range(K):
-            total += s.joint[j, k, l]
+            s.row[k, l] += s.joint[j, k, l]
+    share = 1.0 / sum_of_row(s, l)
     for k in range(K):
-        s.mu[k, l] = 0.0
+        # at 0 a mode that only such modes lead to would have no mixture at all
+        s.mu[k, l] = max(s.row[k, l] * share, LEAST)
     for j in range(J):
         s.nu[j, l] = 0.0
         for k in range(K):
-            s.joint[j, k, l] /= total
+            s.joint[j, k, l] *= share
+        for k in range(K):
             s.nu[j, l] += s.joint[j, k, l]
-            s.mu[k, l] += s.joint[j, k, l]
-    for k in range(K):
-        s.mu[k, l] = max(s.mu[k, l], LEAST)  # at 0 a mode that only such modes lead to would have no mixture at all
     s.odd[l] = s.nu[J - 1, l] + (s.mu[TOP, l] - s.joint[J - 1, TOP, l] if s.rare[l] < 1.0 else 0.0)
-    # an outlier says nothing about the level: the chain keeps what it was
+    # an outlier says nothing about the level: the chain keeps its state
     for j in range(J - 1):
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
 
@@ -191,7 +217,7 @@ def update_filters(s: State, l: int) -> None:
 
 @kernel
 def outgrown(s: State, l: int) -> int:
-    """The first coordinate of which this sample tells `OUTGROWN` times as much as all before it, or -1."""
+    """The first coordinate about which this sample has `OUTGROWN` times the information of all earlier ones, or -1."""
     others = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
     for j in range(s.theta.shape[0]):
         own = s.x[j, l] * s.x[j, l] * s.C[j, j, 0, l]
@@ -203,7 +229,7 @@ def outgrown(s: State, l: int) -> int:
 
 @kernel
 def enter_filters(s: State, j: int, l: int) -> None:
-    """Row j of M becomes what is left of phi; all filters take in z_j from what is left of the innovation."""
+    """Row j of M becomes the rest of phi; all filters are updated in z_j by the rest of the innovation."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     y_hat, e, v = s.y_hat[l], s.e[l], s.s[l]
     for i in range(j, n):

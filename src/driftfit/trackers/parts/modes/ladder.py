@@ -5,8 +5,8 @@
     C_j = sum_i (mu_i T_ij / c_j) (C_i + (m_i - m_j)(m_i - m_j)')
 
 T moves one rung up or down, and from every rung directly to the top, which is how a jump is detected. The top is the
-rung of ratio 1: those above it are for noise that is little beside the drift. A second ladder has learned weights of
-the parameters (`driftfit.trackers.parts.modes.weights`), and the first, without them, makes it safe while they are
+rung of ratio 1: those above it are for noise that is small compared with the drift. A second ladder has learned weights
+of the parameters (`driftfit.trackers.parts.modes.weights`), and the first, without them, makes it safe while they are
 unknown or wrong: T leads across to it, and back through the bottom and by a jump. T never leads from the top directly
 to the bottom: mixing the wide covariance of the top filter into the filter without drift costs more than anything else
 when nothing changes (measured: 1.8 times the error of least squares instead of 1.15).
@@ -27,16 +27,16 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel, log
 
-LADDER = (0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 10.0, 100.0)
-"""Ratios that all parameters climb."""
-LEARNED = LADDER[2:8]
+LADDER = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.04, 0.2, 1.0, 30.0)
+"""Drift ratios of the modes in which all parameters drift."""
+LEARNED = LADDER[3:9]
 """Ratios of the ladder whose parameters have learned weights, and of groups."""
-UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.002, 0.0015, 0.1, 0.0001
+UP, DOWN, JUMP, BACK, ACROSS = 0.0005, 0.001, 0.0015, 0.1, 0.0005
 """Probabilities: to the rung above, to the one below, to the top, from a rung of its ratio to the one below, and from a
 rung that all parameters climb to the same one with learned weights."""
 
 TOP = LADDER.index(1.0)
-"""The mode that detects jumps, and may leap; the rungs above it are for noise that is little beside the drift."""
+"""The mode that detects jumps, and may leap; the rungs above it are for noise that is small compared with the drift."""
 START = 0.25
 """Probability of no drift before the first sample."""
 LEAP, RARE = 3.0, 0.02
@@ -135,7 +135,7 @@ def mix(s: State, l: int) -> None:
 
 @kernel
 def leap(s: State, l: int, noise: float) -> None:
-    """Let the top filter explain the innovation by a move of any necessary size, if that is more likely."""
+    """Let the top filter explain the innovation by a jump of any size, if that is more likely."""
     most = LEAP * s.patience[l]
     square, v, unit = s.e_k[TOP, l] * s.e_k[TOP, l], s.h[TOP, l] + noise, 0.0
     for i in range(s.theta.shape[0]):

@@ -5,7 +5,8 @@
 
 with f_t the probabilities after sample t and T their transitions, for drift modes and likewise for noise levels v_tj,
 and o_t the probability that sample t was an outlier. A smoother of that random walk (`driftfit.smooth.exact`) estimates
-theta from all samples, with the averaged drift and noise. Before the filters start nothing drifts.
+theta from all samples, with the averaged drift and noise, on the regressors and outputs from which coloured noise was
+taken (`driftfit.trackers.parts.coloured`). Before the filters start nothing drifts.
 
 Source: the backward pass is Kim's (1994), eq. 2.20; smoothing one random walk given its result, instead of one for each
 mode, is ours.
@@ -20,15 +21,18 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.modes.ladder import TOP
-from driftfit.trackers.parts.noise_levels import level_chain
+from driftfit.trackers.parts.modes.noise_levels import level_chain
 
-NOTED = ("joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight")
-"""Fields that a run notes at every sample."""
+SMOOTHER_FIELDS = (
+    "joint", "prior", "nu", "r", "c", "leverage", "coarse", "alike", "leapt", "weighed", "settled", "weight", "white",
+    "explained",
+)  # fmt: skip
+"""Fields that are stored at every sample."""
 
 
 @kernel
-def note(o: State, s: State, l: int) -> None:
-    """Store them."""
+def store_for_smoother(o: State, s: State, l: int) -> None:
+    """Store the fields of the smoother."""
     for k in range(s.prior.shape[0]):
         o.prior[k, l] = s.prior[k, l]
         for j in range(s.joint.shape[0]):
@@ -38,12 +42,13 @@ def note(o: State, s: State, l: int) -> None:
     for i in range(s.c.shape[0]):
         o.c[i, l] = s.c[i, l]
         o.weight[i, l] = s.weight[i, l]
+        o.white[i, l] = s.white[i, l]
     o.r[l], o.leverage[l], o.coarse[l], o.alike[l] = s.r[l], s.leverage[l], s.coarse[l], s.alike[l]
-    o.leapt[l], o.weighed[l], o.settled[l] = s.leapt[l], s.weighed[l], s.settled[l]
+    o.leapt[l], o.weighed[l], o.settled[l], o.explained[l] = s.leapt[l], s.weighed[l], s.settled[l], s.explained[l]
 
 
 def given_all(after: Array, transition: Array, moves: Array) -> Array:
-    """Probabilities (T, K) of the states of a chain given all samples, from those after each; it moves where told."""
+    """Probabilities (T, K) of the states of a chain, which ``moves`` at some samples, given all samples."""
     found, ahead = after.copy(), after @ transition
     for t in range(len(found) - 2, -1, -1):
         if moves[t]:
@@ -54,21 +59,23 @@ def given_all(after: Array, transition: Array, moves: Array) -> Array:
     return found
 
 
-def varying(noted: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]) -> tuple[Array, Array]:
-    """q (T, n) and r (T,) of every sample, from what a run noted (T, ..), its innovations and intervals of drift."""
-    running, weighed = noted["settled"] > 0, noted["weighed"] > 0
-    r = np.where(running, noted["r"], noted["r"][np.argmax(running)])
-    after = np.where(weighed[:, None], noted["joint"].sum(axis=1), noted["prior"])
+def estimated_variances(
+    fields: Mapping[str, Array], e: Array, time: Array, state: Mapping[str, Any]
+) -> tuple[Array, Array]:
+    """q (T, n) and r (T,) of every sample, from the stored fields (T, ..), the innovations and intervals of drift."""
+    running, weighed = fields["settled"] > 0, fields["weighed"] > 0
+    r = np.where(running, fields["r"], fields["r"][np.argmax(running)])
+    after = np.where(weighed[:, None], fields["joint"].sum(axis=1), fields["prior"])
     w, span, learned = given_all(after, state["transition"], weighed), r * time, state["learned"]
     ratio = np.where(learned > 0.0, 0.0, state["ratio"])
     with np.errstate(divide="ignore", invalid="ignore"):
-        leapt = np.where(weighed, noted["leapt"] / span, 0.0)
-        drift = w @ ratio.T + (w @ learned)[:, None] * noted["weight"]
-        q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / noted["c"]
-    q = np.where(running[:, None] & (span[:, None] > 0.0) & (noted["c"] > 0.0), q, 0.0)
-    levels = given_all(noted["nu"][:, :-1], level_chain(), weighed)
-    v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], noted["coarse"][:, None]), axis=1)
-    v = np.where(running, v + noted["coarse"] * noted["alike"] * (noted["alike"] + 2.0), r) * noted["leverage"]
-    outlier = np.where(weighed, noted["joint"][:, -1].sum(axis=1), 0.0)
+        leapt = np.where(weighed, fields["leapt"] / span, 0.0)
+        drift = w @ ratio.T + (w @ learned)[:, None] * fields["weight"]
+        q = (drift + (w[:, TOP] * leapt)[:, None] * ratio[:, TOP]) * span[:, None] / fields["c"]
+    q = np.where(running[:, None] & (span[:, None] > 0.0) & (fields["c"] > 0.0), q, 0.0)
+    levels = given_all(fields["nu"][:, :-1], level_chain(), weighed)
+    v = np.sum(levels * np.maximum(state["level"][:-1] * r[:, None], fields["coarse"][:, None]), axis=1)
+    v = np.where(running, v + fields["coarse"] * fields["alike"] * (fields["alike"] + 2.0), r) * fields["leverage"]
+    outlier = np.where(weighed, fields["joint"][:, -1].sum(axis=1), 0.0)
     far = np.maximum(state["level"][-1] * v, np.where(weighed, e * e, 0.0))
     return q, 1.0 / ((1.0 - outlier) / v + outlier / far)

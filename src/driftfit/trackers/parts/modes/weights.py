@@ -10,9 +10,9 @@ as the non-negative solution of
 
     sum_j A_ij rho_j = b_i,    A_ij = sum N_ij^2,    b_i = sum (r_i^2 - N_ii + sum_j N_ij^2 p_j)
 
-whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, of which
-later samples tell what moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j rho_j
-(`driftfit.trackers.parts.modes.ladder`).
+whose sums fade. The pass is made every `BLOCK` samples over the last `WINDOW`, and counts the oldest block, for which
+later samples show which parameter moved. The second ladder of drift ratios climbs in these proportions, rho_i / max_j
+rho_j (`driftfit.trackers.parts.modes.ladder`).
 
 Source: the smoother and its scores are Koopman and Shephard (1992); solving for all variances together, as data
 arrive, is ours. Cost per sample: O(n^2).
@@ -33,11 +33,11 @@ FADE = 0.97
 SWEEPS = 20
 """Sweeps over the parameters for the solution."""
 FLOOR = 0.01
-"""Least weight."""
+"""Smallest weight."""
 TINY = 1e-300
 
 E, PRECISION, SPAN, MORE = 0, 1, 2, 3
-"""What is remembered of a sample after its regressor and gain: the innovation over its variance, the inverse variance
+"""Entries of a stored sample after its regressor and gain: the innovation over its variance, the inverse variance
 (both in units of r), and the intervals of drift."""
 ASSUMED, SLOPE, WEIGHT, ADJOINT, SHIFT, CURVATURE = 0, 1, 2, 3, 4, 5
 """Rows (n,) of the estimation: p, b, the weights, r, N k; then A, and N."""
@@ -55,7 +55,7 @@ def no_weights(n: int) -> dict[str, Any]:
 
 @shared
 def step_back(past: Array, at: int, t: Array) -> None:
-    """One step back of r and N."""
+    """One backward step of r and N."""
     n = t.shape[1]
     N = CURVATURE + n
     move, more = past[at, 2 * n + E], past[at, 2 * n + PRECISION]
@@ -100,7 +100,7 @@ def look_back(past: Array, newest: int, t: Array) -> None:
 
 @shared
 def solve(t: Array) -> None:
-    """Weights, from the sums."""
+    """Compute the weights from the sums."""
     n, A = t.shape[1], CURVATURE
     for i in range(n):
         t[WEIGHT, i] = max(t[SLOPE, i], 0.0) / (t[A + i, i] + TINY)
@@ -127,7 +127,7 @@ def machine_weights(past: int, newest: int, scores: int, n: int, L: int, l: int)
 
 @kernel
 def remember(s: State, at: int, l: int) -> None:
-    """A sample that the filters took, in units of r and c; s.d is scratch here."""
+    """Store a sample that the filters used, in units of r and c; s.d is scratch here."""
     n, K = s.theta.shape[0], s.mu.shape[0]
     e, precision = 0.0, 0.0
     for k in range(K):
@@ -153,7 +153,7 @@ def remember(s: State, at: int, l: int) -> None:
 
 @kernel
 def learn_weights(s: State, l: int) -> None:
-    """Remember a sample, and look back at the end of a block."""
+    """Store a sample, and update the weights at the end of a block."""
     n, L = s.d.shape
     at = s.remembered[l] % WINDOW
     remember(s, at, l)

@@ -1,1 +1,1 @@
-"""Samples without an output: what a bank does with events whose times nothing tells apart."""
+"""Samples without an output: events in a gap, whose times the data cannot distinguish."""

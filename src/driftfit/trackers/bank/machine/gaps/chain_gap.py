@@ -1,6 +1,7 @@
-"""Gaps under a Markov chain of changes: each leaf goes on twice, with the mode that likely lasted and with all else.
+"""Gaps under a Markov chain of changes: each leaf is continued twice, with the mode that probably lasted and with all
+others.
 
-While nothing is seen the chain goes on. For a leaf whose last event is s,
+During a gap the chain continues. For a leaf whose last event is s,
 
     reach[s, e]    p(last event of the gap is e)
     stay[s, e]     the part of it in which the change was that of e at every sample of the gap
@@ -11,20 +12,20 @@ A sample that can be used after k others that could not finds each leaf, weight 
     one mode c       w kappa,         C + held[c],                                    stay[s, .] / kappa
     all else         w (1 - kappa),   C + (mean[s] - kappa held[c]) / (1 - kappa),   the rest of reach
 
-(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a floor as always, with the chain
-from the events that they end in. So a jump in the gap, after which all is as before, is a leaf of its own, and so is a
+(c the mode of largest kappa, the sum of stay[s, e] over its events e) and both grow a level as always, with the chain
+from the events that they end in. So a jump in the gap after which all is as before has a separate leaf, and so has a
 mode that lasted. That is exact in the probabilities of both courses and of what they end in, and in the first two
-moments of the parameters given either; what is lost is what the sample would tell of courses within the second. An
-interval of dt nominal samples is a gap of dt - 1 and a floor.
+moments of the parameters given either; the information of the sample about courses within the second is lost. An
+interval of dt nominal samples is a gap of dt - 1 and a level.
 
 Reductions that number leaves by their last events, `Decide` and `GPB`, have room for as many leaves as there are
 numbers, and twice that here. So at most two leaves have one number: of a leaf that was parted by an earlier gap, and
-whose twin is still there, one leaf goes on with the moments of both courses. Without that rule a `Decide` whose leaves
-came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
+whose twin is still there, one leaf continues with the moments of both courses. Without that rule a `Decide` whose
+leaves came to be in one branch, parted again at every gap, and no decision removed any: they outgrew their table.
 
-Only random walks, and not under `IMM`, which has one leaf for every event and mixes it anew from all of them, nor
-under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H n^2) for each
-sample that is not used, and twice the leaves for the one that ends the gap.
+Only random walks, and not under `IMM`, which has one leaf for every event and mixes it from all of them at every
+sample, nor under `FirstFloor`, which grows the tree again from samples alone; both widen by the mean. Cost: O(H^3 + H
+n^2) for each sample that is not used, and twice the leaves for the one that ends the gap.
 """
 
 from __future__ import annotations
@@ -37,20 +38,20 @@ from driftfit.trackers.bank.layout import ALIKE, FLIPPED, IN_DT, OPEN, TAKEN
 from driftfit.trackers.bank.leaves.leaf_matrix import CODE, FIRST, LOG, WEIGHT, variance_factor
 
 SURE = 1e-12
-"""A course less likely than this is left out."""
+"""Courses of events less likely than this are left out."""
 MOST_STEPS = 1000
-"""Steps of a chain of events that an interval may have."""
+"""Largest number of steps of a chain of events in one interval."""
 
 
 @kernel
 def further(dt: float) -> int:
-    """Steps of the chain in an interval before its last."""
+    """Number of steps of the chain before the last one of an interval."""
     return int(min(dt, MOST_STEPS) - 0.5) if dt > 1.0 else 0
 
 
 @shared
 def open_gap(path: Array, H: int) -> None:
-    """No sample passed: the rows are reach (H), stay (H), held (H_d), mean (H), and one that is spare."""
+    """Begin a gap: the rows are reach (H), stay (H), held (H_d), mean (H), and a spare one."""
     for row in range(len(path) - 1):
         for k in range(path.shape[1]):
             path[row, k] = 1.0 if row < 2 * H and k == row % H else 0.0
@@ -58,13 +59,13 @@ def open_gap(path: Array, H: int) -> None:
 
 @shared
 def step(t: Any, e: int, to: int) -> float:
-    """p(next event is ``to`` | e): one row for all where they are alike."""
+    """p(next event is ``to`` | e); one row serves all events where the rows are equal."""
     return t.row[to] if t.counters[ALIKE] > 0 else t.chain[e, to]  # type: ignore[no-any-return]
 
 
 @shared
 def lengthen(t: Any, share: float) -> None:
-    """One more sample of which nothing is known, in which change c adds ``share`` of Q[c]."""
+    """Add a sample without an observation, in which change c adds ``share`` of Q[c]."""
     path, Q, X, H, Hd, Hm = t.path, t.Q, t.scratch, len(t.row), len(t.walks), len(t.sensors)
     for s in range(H):
         for e in range(H):
@@ -85,14 +86,14 @@ def lengthen(t: Any, share: float) -> None:
     for c in range(Hd):
         for k in range(Q.shape[1]):
             path[2 * H + c, k] += share * Q[c, k]
-    path[2 * H, path.shape[1] - 1] = 1.0  # the first sample may lead from any event into a mode
+    path[2 * H, path.shape[1] - 1] = 1.0  # at the first sample any event may lead into a mode
 
 
 @shared
 def go_on(t: Any, dt: float, used: bool) -> None:
-    """The interval up to this sample, or to the floor that ends the gap; Q becomes that of this floor, if there is one.
+    """The interval up to this sample, or to the level that ends the gap; Q becomes that of this level, if there is one.
 
-    A sample that is refused after all comes here twice.
+    A sample that is refused later is processed here twice.
     """
     counters, Q = t.counters, t.Q
     if counters[OPEN] == 0 and counters[TAKEN] == 0:
@@ -121,7 +122,7 @@ def add_variance(t: Any, L: int) -> None:
 
 @shared
 def add_covariance(t: Any, L: int) -> None:
-    """The covariance of the mixture with what the gap adds on average."""
+    """Add to the covariance of the mixture what the gap adds on average."""
     P, B, X, path, H, Hd = t.cov, t.leaves, t.scratch, t.path, len(t.row), len(t.walks)
     variance_factor(t, X, 0, L)
     for s in range(H):
@@ -137,7 +138,7 @@ def add_covariance(t: Any, L: int) -> None:
 
 @shared
 def widen_leaf(t: Any, k: int, q: Array) -> None:
-    """C + q of one parent, q being a lower triangle, which may be overwritten."""
+    """C + q of one parent; q is a lower triangle and may be overwritten."""
     for i in range(t.n * (t.n + 1) // 2):
         t.parents[FIRST + t.n + i, k] += q[i]
 
@@ -162,7 +163,7 @@ def origins(t: Any, L: int, K: int) -> None:
 
 @shared
 def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
-    """The prior of the floor to come of a leaf whose last event has the probabilities p. Where no time passes
+    """The prior of the level to come of a leaf whose last event has the probabilities p. Where no time passes
     (``standing``) nothing changes.
     """
     prior, H, Hm = t.prior, len(t.row), len(t.sensors)
@@ -178,10 +179,10 @@ def next_event(t: Any, standing: bool, p: Array, k: int) -> None:
 
 
 @shared
-def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> None:
-    """What the leaf of one mode remembers: that mode at every floor of the gap, and sensors as they were likely."""
+def remember_one(T: Array, k: int, levels: int, H: int, Hm: int, best: int) -> None:
+    """The history of the leaf of one mode: that mode at every level of the gap, and the probabilities of sensors."""
     block = H + 1
-    known = min(floors, T.shape[1] // block)
+    known = min(levels, T.shape[1] // block)
     quiet = T[k, (known - 1) * block + H] if known > 0 else 1.0
     for at in range(0, T.shape[1] - block + 1, block):
         if at < known * block:
@@ -199,11 +200,11 @@ def remember_one(T: Array, k: int, floors: int, H: int, Hm: int, best: int) -> N
 
 
 @shared
-def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, kappa: float) -> None:
-    """What the leaf of all other courses remembers: the mean without the course of one mode."""
+def remember_other(T: Array, k: int, levels: int, H: int, Hm: int, best: int, kappa: float) -> None:
+    """The history of the leaf of all other courses: the mean without the course of one mode."""
     block = H + 1
     for at in range(0, T.shape[1] - block + 1, block):
-        if at < floors * block:
+        if at < levels * block:
             for j in range(Hm):
                 share = 0.0
                 for e in range(j, H, Hm):
@@ -215,13 +216,13 @@ def remember_other(T: Array, k: int, floors: int, H: int, Hm: int, best: int, ka
                 total += T[k, at + e]
             for e in range(H):
                 T[k, at + e] /= total
-        if best == 0 and at >= (floors - 1) * block:
+        if best == 0 and at >= (levels - 1) * block:
             T[k, at + H] = 0.0  # something changed
 
 
 @shared
 def count_codes(t: Any, K: int) -> None:
-    """How many parents have each code, in `slots`, for a reduction that takes leaves of one code for one history."""
+    """Count the parents of each code, in `slots`, for reductions that treat leaves of one code as one history."""
     for k in range(K if t.bases[0] > 1.0 else 0):
         t.slots[int(t.parents[CODE, k])] = 0
     for k in range(K if t.bases[0] > 1.0 else 0):
@@ -230,7 +231,7 @@ def count_codes(t: Any, K: int) -> None:
 
 @shared
 def may_part(t: Any, k: int) -> bool:
-    """Whether a leaf may go on as two: there is room for two of each code."""
+    """Whether a leaf may be continued as two: there is room for two of each code."""
     return t.bases[0] == 1.0 or t.slots[int(t.parents[CODE, k])] == 1  # type: ignore[no-any-return]
 
 
@@ -254,7 +255,7 @@ def courses(t: Any, k: int) -> tuple[int, float]:
 
 @shared
 def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
-    """Parent k in the course of one mode."""
+    """Continue parent k in the course of one mode."""
     path, stay, H, Hm, q = t.path, t.scratch[1], len(t.row), len(t.sensors), t.path[len(t.path) - 1]
     for e in range(H):
         stay[e] = stay[e] / kappa if e // Hm == best else 0.0
@@ -266,7 +267,7 @@ def follow_mode(t: Any, k: int, best: int, kappa: float) -> None:
 
 @shared
 def follow_others(t: Any, k: int, to: int, best: int, kappa: float) -> None:
-    """Parent ``to``, a copy of k, in all courses but that of one mode, whose probability is kappa; of 0, in all."""
+    """Continue parent ``to``, a copy of k, in all courses except that of one mode of probability kappa (0: in all)."""
     path, reach, stay, H, Hm = t.path, t.scratch[0], t.scratch[1], len(t.row), len(t.sensors)
     held, means, q = 2 * H + best, 2 * H + len(t.walks), path[len(path) - 1]
     for i in range(t.n * (t.n + 1) // 2):
@@ -283,7 +284,7 @@ def follow_others(t: Any, k: int, to: int, best: int, kappa: float) -> None:
 
 @shared
 def duplicate(t: Any, T: Array, k: int, to: int) -> None:
-    """Parent k once more, with what it remembers."""
+    """Copy parent k with its history."""
     for i in range(len(t.parents)):
         t.parents[i, to] = t.parents[i, k]
     for i in range(T.shape[1]):
@@ -292,12 +293,12 @@ def duplicate(t: Any, T: Array, k: int, to: int) -> None:
 
 @shared
 def split(t: Any, K: int) -> int:
-    """The parents twice; returns how many there are now.
+    """Split the parents in two; returns their new number.
 
-    `prior` has for every leaf the shares of the events before the gap, and takes those of the floor to come.
+    `prior` has for every leaf the shares of the events before the gap, and takes those of the level to come.
     """
     A, T = t.parents, t.history_2 if t.counters[FLIPPED] > 0 else t.history
-    H, Hm, floors, count = len(t.row), len(t.sensors), t.counters[OPEN], K
+    H, Hm, levels, count = len(t.row), len(t.sensors), t.counters[OPEN], K
     count_codes(t, K)
     for k in range(K):
         best, kappa = courses(t, k)
@@ -306,8 +307,8 @@ def split(t: Any, K: int) -> int:
             duplicate(t, T, k, count)
             A[LOG, count] += math.log(1.0 - kappa)
             A[LOG, k] += math.log(kappa)
-            remember_other(T, count, floors, H, Hm, best, kappa)
-            remember_one(T, k, floors, H, Hm, best)
+            remember_other(T, count, levels, H, Hm, best, kappa)
+            remember_one(T, k, levels, H, Hm, best)
             follow_others(t, k, count, best, kappa)
             count += 1
         if parts or kappa >= 1.0 - SURE:

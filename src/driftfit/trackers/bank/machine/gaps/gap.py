@@ -1,22 +1,22 @@
-"""Gaps: what may have happened since the last sample that was used, as one floor of the tree.
+"""Gaps: the events that may have happened since the last used sample, as one level of the tree.
 
-A tree that grew by a floor at every missing sample would fill up with histories that no data tell apart: for events
-that are independent of each other it does not matter when in the gap a jump was. So leaves take in the ordinary course
-only, sample by sample, and beside them stands what else there may have been: the probability a_0 that nothing but the
-ordinary course was, and for every other change i the probability a_i that it was the first, with the mean A_i of what
-it and all further changes add to the covariance. An interval in which change i is the first with probability r_i, none
-with r_0, and adds Q_i, makes of them
+A tree that grew by a level at every missing sample would fill up with histories that the data cannot distinguish: for
+independent events it does not matter when in the gap a jump happened. Leaves therefore make only the nominal time
+update, sample by sample. The alternatives are kept in a table: the probability a_0 that only nominal changes happened,
+and for every other change i the probability a_i that it was the first, with the mean A_i of the covariance that it and
+all further changes add. After an interval in which change i is the first with probability r_i (none: r_0) and adds Q_i,
+they are
 
     a_i A_i <- a_i (A_i + D) + a_0 r_i (Q_i + M),    a_i <- a_i + a_0 r_i,    a_0 <- a_0 r_0
 
 where D is the mean of all changes of the interval and M that of those after its first. An interval of dt nominal
-samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one floor with the
+samples has r_0 = p_0^dt, and dt (1 - p_0) changes on average. The next used sample grows one level with the
 probabilities a and the covariances A. Its event stands for the whole gap.
 
 That is exact in the probability of any change, in the first two moments of the parameters after the gap given the
 first change, and wholly where at most one change falls into a gap; the ordinary course, a drift, is not taken back for
-the samples at which another change was in its place. Priors that follow a Markov chain of changes are about what lasts:
-there the chain goes on and leaves take in the mean of all changes.
+the samples at which another change was in its place. Priors that follow a Markov chain describe changes that last:
+there the chain continues and leaves receive the mean of all changes.
 
 Cost: O(H n^2) for each sample that is not used.
 """
@@ -34,7 +34,7 @@ and in the first row how many changes follow the first of an interval on average
 
 @shared
 def odds(gap: Array, row: Array, Hm: int, dt: float, given: bool) -> None:
-    """The chances of this interval; those that the user has ``given`` are of the interval, whatever its length."""
+    """The probabilities of this interval; those ``given`` by the user apply to the interval, whatever its length."""
     at = gap.shape[1] - WIDTH
     none, rest = 0.0, 0.0
     for e in range(len(row)):
@@ -57,7 +57,7 @@ def odds(gap: Array, row: Array, Hm: int, dt: float, given: bool) -> None:
 
 @shared
 def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
-    """Q, of one change each, becomes that of the floor. A sample that is not ``used`` leaves it to the next one."""
+    """Turn Q of single changes into Q of the level. A sample that is not ``used`` leaves this to the next one."""
     at = gap.shape[1] - WIDTH
     before, more, chance = gap[0, at + SINCE], gap[0, at + MORE], 0.0
     for i in range(1, len(gap)):
@@ -75,7 +75,7 @@ def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
                 if earlier + more + apart > 0.0:
                     Q[i, k] = (kept + (earlier + now * apart) * Q[0, k]) / both
                     kept = kept / both
-                else:  # one nominal sample: to the last bit what it would be if it were used
+                else:  # one nominal sample: the same bits as if it were used
                     kept = Q[i, k]
                 if not used:
                     gap[i, k] = kept
@@ -83,7 +83,7 @@ def covariances(gap: Array, dt: float, used: bool, Q: Array) -> None:
 
 @shared
 def chances(prior: Array, L: int, Hm: int, gap: Array, whole: bool) -> None:
-    """The prior of one nominal sample becomes that of the interval, or of the ``whole`` gap."""
+    """Turn the prior of one nominal sample into that of the interval, or of the ``whole`` gap."""
     at = gap.shape[1] - WIDTH
     for j in range(Hm):
         for l in range(L):
@@ -98,7 +98,7 @@ def chances(prior: Array, L: int, Hm: int, gap: Array, whole: bool) -> None:
 
 @shared
 def extend(gap: Array) -> None:
-    """A sample that is not used makes the gap longer."""
+    """Extend the gap by a sample that is not used."""
     at = gap.shape[1] - WIDTH
     for i in range(1, len(gap)):
         gap[i, at + SINCE] += gap[0, at + SINCE] * gap[i, at + NOW]
@@ -107,14 +107,14 @@ def extend(gap: Array) -> None:
 
 @shared
 def close(gap: Array) -> None:
-    """A sample was used."""
+    """Close the gap after a used sample."""
     for i in range(len(gap)):
         gap[i, gap.shape[1] - WIDTH + SINCE] = 1.0 if i == 0 else 0.0
 
 
 @shared
 def widen(gap: Array, unit: float, P: Array) -> None:
-    """The covariance of the mixture with what may have happened in the gap; ``unit`` is what that is in units of."""
+    """Widen the covariance of the mixture by the changes that may have happened in the gap, in units of ``unit``."""
     at = gap.shape[1] - WIDTH
     for c in range(1, len(gap)):
         share, k = unit * gap[c, at + SINCE], 0
@@ -125,13 +125,13 @@ def widen(gap: Array, unit: float, P: Array) -> None:
 
 
 @shared
-def take_back(T: Array, L: int, floors: int, gap: Array, H: int, Hm: int) -> None:
-    """The floors of a gap, whose changes the floor that ends it stands for: they changed nothing themselves."""
+def take_back(T: Array, L: int, levels: int, gap: Array, H: int, Hm: int) -> None:
+    """Clear the changes of the levels of a gap, because the level that ends the gap contains them."""
     block, width = H + 1, T.shape[1]
     quiet = gap[0, gap.shape[1] - WIDTH + SINCE]
     for l in range(L):
         for k in range(0, width - block + 1, block):
-            if k < floors * block:
+            if k < levels * block:
                 for e in range(Hm, H):
                     T[l, k + e % Hm] += T[l, k + e]
                     T[l, k + e] = 0.0

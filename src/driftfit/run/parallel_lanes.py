@@ -29,7 +29,6 @@ from driftfit.engine.kernel import Array, Driver
 from driftfit.run.program import Program, State, progress, tile_of
 from driftfit.run.result import Lane
 from driftfit.run.states.layout import words_of
-from driftfit.trackers.base import Tracker
 
 BLOCK = 256
 """Number of samples that are copied into lane order at a time: a block of a tile fits into the second-level cache."""
@@ -48,15 +47,15 @@ _thread = threading.local()
 
 
 def run_lanes(
-    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State]
+    programs: Sequence[Program], records: Records, keep: str, starts: Mapping[int, State], dtype: Any = np.float64
 ) -> list[Lane | None]:
     """Run every series by its programs, one for each of its outputs; all have one bound model.
 
     ``programs`` and the result have an entry for each output of each series, in that order; ``starts`` are the fields
-    that some of them begin with. An interrupt (Ctrl-C) stops the run: what is not finished is None.
+    that some of them begin with. An interrupt (Ctrl-C) stops the run: lanes that are not finished are None.
     """
     lanes: list[Lane | None] = [None] * len(programs)
-    jobs = prepare(programs, records, keep)
+    jobs = prepare(programs, records, keep, dtype)
     for job in jobs:
         for lane, k in enumerate(job.lanes.tolist()):
             for name, value in starts.get(k, {}).items():
@@ -69,9 +68,9 @@ def run_lanes(
     return lanes
 
 
-def prepare(programs: Sequence[Program], records: Records, keep: str) -> list[Job]:
+def prepare(programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64) -> list[Job]:
     """Tiles at their start for all series, the longest first."""
-    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep)]
+    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep, dtype)]
     return sorted(jobs, key=lambda job: -len(job.out))
 
 
@@ -90,11 +89,12 @@ class Job:
 def _groups(programs: Sequence[Program]) -> list[list[int]]:
     """Series whose trackers have the same steps and fields, so that they can share tiles."""
     groups: dict[Any, list[int]] = defaultdict(list)
-    kinds: dict[Tracker, Any] = {}
+    kinds: dict[int, list[int]] = {}  # most series share one program, and its steps take 100 us to compare
     for k, program in enumerate(programs):
-        if program.tracker not in kinds:
-            kinds[program.tracker] = (program.steps, program.tracker.outputs, program.shapes)
-        groups[kinds[program.tracker]].append(k)
+        group = kinds.get(id(program))
+        if group is None:
+            group = kinds[id(program)] = groups[program.steps, program.tracker.outputs, program.shapes]
+        group.append(k)
     return list(groups.values())
 
 
@@ -104,7 +104,7 @@ def width_of(program: Program, count: int, ny: int = 1) -> int:
     return ny if wide < 2 * ny else wide
 
 
-def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str) -> Iterator[Job]:
+def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str, dtype: Any) -> Iterator[Job]:
     """Tiles for the series of one group, longest first."""
     ny, program = records.ny, programs[group[0] * records.ny]
     L = width_of(program, len(group), ny)
@@ -117,11 +117,10 @@ def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], k
     longest = records.length[padded[:, 0]]
     ends = np.cumsum(longest)
     # one allocation for all tiles, so that it is large enough for huge pages
-    out = program.written(tiles[:1], int(ends[-1]), keep)
-    run = program.drivers(keep).run
+    out = program.written(tiles[:1], int(ends[-1]), keep, dtype)
     for k, some in enumerate(lanes):
         live = (np.arange(L) < ny * G) & (place < len(order) - k * G)
-        yield Job(run, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
+        yield Job(program.fill, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
 
 
 def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
@@ -217,7 +216,8 @@ def _gather_signals(y: Array, u: Array, start: Array, column: Array, to_y: Array
 
 @Driver
 def _gather_factors(known: Array, start: Array, column: Array, to_known: Array) -> None:
-    """The same for what is known of the samples (one row if it is the same for all); dt = 0 for a lane that has ended.
+    """The same for the known numbers of the samples (one row if they are equal for all); dt = 0 for a lane that has
+    ended.
 
     ``known`` is (T, k, ny).
     """

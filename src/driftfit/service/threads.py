@@ -18,7 +18,7 @@ READ = 0.5
 """Seconds for which a source may block."""
 
 
-class Runner(threading.Thread):
+class WorkerThread(threading.Thread):
     """A thread that works until it is stopped, and begins again after a pause when something fails."""
 
     what = ""
@@ -57,7 +57,7 @@ class Runner(threading.Thread):
         self.stopping.set()
 
 
-class SourceRunner(Runner):
+class SourceThread(WorkerThread):
     """Reads one source into the intake."""
 
     what = "source"
@@ -68,7 +68,7 @@ class SourceRunner(Runner):
         self.position = engine.positions.get(f"source:{source.name}")
 
     def work(self) -> None:
-        """Read until the source ends; after a failure go on from what was handed over."""
+        """Read until the source ends; after a failure continue after the last batch that was passed on."""
         reader: Reader = self.source.open(self.position)
         self.state = "running"
         try:
@@ -86,7 +86,7 @@ class SourceRunner(Runner):
             reader.close()
 
 
-class SinkRunner(Runner):
+class SinkThread(WorkerThread):
     """Hands stored results to one sink."""
 
     what = "sink"
@@ -117,7 +117,7 @@ class SinkRunner(Runner):
             journal.close()
 
     def _next(self, journal: Journal, names: Names) -> tuple[Outcome, int] | None:
-        """What the sink is to write next, and the last group in it; None when the thread is to end."""
+        """The next batch for the sink, and the last group in it; None when the thread is to end."""
         begun = time.monotonic()
         results: list[Any] = []
         events: list[Any] = []

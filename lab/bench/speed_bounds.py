@@ -1,7 +1,7 @@
 """Two floors for the record filter: a loop in C with fixed n, and streaming the same bytes.
 
 Both come from ``benchmarks/`` (`kernel.py`, `filter.c`).
-What is timed is the driver alone, without what `track` does once per call.
+Only the driver is timed, without the work that `track` does once per call.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def streaming(module: Any, tile: Any, steps: int) -> Job:
     return Job("streaming the bytes", lambda: module.stream(tile.y, tile.u, copy), steps)
 
 
-def floor(n: int, lanes: int, T: int) -> Contest:
+def bound(n: int, lanes: int, T: int) -> Contest:
     """The driver on ``lanes`` series of an ARX(n/2, n/2) against both floors."""
     module: Any = import_module("benchmarks.kernel")
     tile = module.Tile(n, lanes, T // lanes)

@@ -6,8 +6,9 @@
 
 p is the share of DRAWS bootstrapped paths with a larger supremum. A covariance that is estimated from a few rows at the
 end of a record is useless there, so the tests of `driftfit.judge.statistics.supremum` leave the ends out. F takes the
-variance of the noise from the whole record, and signs keep what variance every row has. Near the ends the residuals
-themselves would count the change that is looked for as noise. Every row there is a date, and about MIDDLE between.
+variance of the noise from the whole record, and random signs keep the variance of every row. Near the ends the
+residuals themselves would count the change as noise. Every row there is a date, and about MIDDLE
+between.
 
 For scores without correlation and records of at least LEAST rows: with fewer the signs know too little of tails.
 

@@ -1,4 +1,4 @@
-"""What a benchmark ran on, and medians of jobs that take turns."""
+"""The computer that a benchmark ran on, and medians of jobs that take turns."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def installed(package: str) -> str | None:
         return None
 
 
-def machine() -> str:
+def computer() -> str:
     """Processor, cores and Python."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
@@ -36,7 +36,7 @@ def machine() -> str:
 
 
 def versions() -> str:
-    """Versions of ours and of every peer, absent ones said so."""
+    """Versions of ours and of every peer; absent ones are marked."""
     return ", ".join(f"{name} {installed(name) or 'absent'}" for name in (*LIBRARIES, *PACKAGES))
 
 

@@ -1,6 +1,6 @@
-"""Many: results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
+"""Results by key. Series of a fleet, settings of a grid and outputs of a record are lanes with keys.
 
-What is common to `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
+The common part of `driftfit.run.fleet.Fleet` and `driftfit.run.outputs.Outputs`: a mapping from key to `Track`, their
 copies, and their files.
 """
 
@@ -20,13 +20,13 @@ from driftfit.data.record import Labels, Records
 from driftfit.engine.drivers import repeat_tile
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.program import Program, State, programs_of, state_of
+from driftfit.run.program import Program, State, kept, programs_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import Lane, Track, names_of
 from driftfit.trackers.base import Tracker
 
 
-class Many(Plain):
+class KeyedResults(Plain):
     """Results of many lanes, from key to `Track` like a dict; ``by`` names the parts of a key.
 
     ``programs``, ``lanes`` and ``starts`` have an entry for each output of each series of ``records``, in that order;
@@ -70,7 +70,7 @@ class Many(Plain):
 
     @property
     def by(self) -> tuple[str, ...]:
-        """Names of what identifies the results, one for each part of a key."""
+        """Names of the parts of a key."""
         raise NotImplementedError
 
     @property
@@ -95,7 +95,7 @@ class Many(Plain):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of what was written for all series."""
+        """Bytes of the results of all series."""
         return sum(lane.out.nbytes // lane.tile["theta"].shape[-1] for lane in self._lanes if lane)
 
     def __len__(self) -> int:
@@ -122,6 +122,17 @@ class Many(Plain):
             lane = self._lanes[j]
             assert lane is not None
             yield self._programs[j], state_of(lane.tile, lane.lane)
+
+    def undetermined(self) -> Iterator[tuple[Program, dict[str, Array]]]:
+        """Of `ends` those whose record does not determine every parameter."""
+        found: dict[int, Array] = {}  # by tile, because looking at each lane alone takes as long as running it
+        for j in self._index.values():
+            lane = self._lanes[j]
+            assert lane is not None
+            if id(lane.tile) not in found:
+                found[id(lane.tile)] = np.isinf(lane.tile["var"][0]).any(axis=0)
+            if found[id(lane.tile)][lane.lane]:
+                yield self._programs[j], state_of(lane.tile, lane.lane)
 
     def stack(self, name: str) -> Array:
         """One result of every lane in natural order, (lanes, T, ...), NaN after the end of a series.
@@ -219,7 +230,9 @@ def _restored(
     tiles = repeat_tile(program.tile(), len(some))
     into = {name: tiles[name][..., 0] for name in storage.fields(tiles)}
     storage.restore(path, program.tracker, arrays, f"state{g}_", into)
-    out = program.written(tiles[:1], sum(length), "cov" if f"out{g}_P" in arrays else "std")
+    stored = [name.removeprefix(f"out{g}_") for name in arrays if name.startswith(f"out{g}_")]
+    keep, _ = kept(np.dtype([(name, float) for name in stored]))
+    out = program.written(tiles[:1], sum(length), keep, arrays[f"out{g}_theta"].dtype)
     storage.restore(path, program.tracker, arrays, f"out{g}_", {name: out[name][..., 0] for name in names_of(out)})
     ends = np.cumsum(length).tolist()
     for k, j in enumerate(some):

@@ -1,0 +1,207 @@
+"""What a user waits for: records, streams and batches through public calls, against loops in C and against peers.
+
+    python -m benchmarks.end_to_end                  records, live
+    python -m benchmarks.end_to_end live --quick
+
+The model is ARX(2, 2), n = 4, tracked by Kalman(q=1e-4, r=0.01); one thread. The loop in C (benchmarks/filter.c) writes
+the same results into memory that it allocates at every call, as `track` does. What is compared takes turns; figures are
+the least processor time of many turns, so that other programs on the machine disturb them as little as possible.
+"""
+
+import os
+
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ[f"{_library}_NUM_THREADS"] = "1"
+
+import ctypes
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from time import process_time_ns
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from driftfit import ARX, AdaptiveKalman, Kalman, Live, track
+
+HERE = Path(__file__).parent
+MODEL, TRACKER = ARX(2, 2), Kalman(q=1e-4, r=0.01)
+N = 4
+BUDGET = 1_000_000
+"""Samples over which the turns of one comparison are spread, at least five turns."""
+
+
+def least(jobs: Sequence[Callable[[], object]], turns: int) -> list[float]:
+    """The least nanoseconds of processor time of each job, all taking turns."""
+    best = [np.inf] * len(jobs)
+    for job in jobs:
+        job()
+    for _ in range(turns):
+        for k, job in enumerate(jobs):
+            begun = process_time_ns()
+            result = job()
+            best[k] = min(best[k], process_time_ns() - begun)
+            del result
+    return best
+
+
+def signals(T: int) -> tuple[np.ndarray, np.ndarray]:
+    """A stable ARX(1, 1) driven by noise, every hundredth output missing."""
+    rng = np.random.default_rng(1)
+    u, v = rng.standard_normal(T), 0.1 * rng.standard_normal(T)
+    y = np.zeros(T)
+    for t in range(1, T):
+        y[t] = 0.7 * y[t - 1] + u[t - 1] + v[t]
+    y[rng.random(T) < 0.01] = np.nan
+    return y, u
+
+
+class Loop:
+    """The loop of filter.c from a diffuse start, in memory of its own."""
+
+    def __init__(self, folder: str, name: str, fields: int, real: type, *flags: str) -> None:
+        target = Path(folder) / f"{name}.so"
+        options = ["-O3", "-march=native", "-shared", "-fPIC", "-DNA=2", "-DNB=2", *flags]
+        subprocess.run(["gcc", *options, str(HERE / "filter.c"), "-o", str(target), "-lm"], check=True)
+        self._run = ctypes.CDLL(str(target)).run
+        self._fields, self._real = fields, real
+        start = np.concatenate([np.zeros(N), 1e6 * np.eye(N).ravel(), np.full(N, 1e-4), [0.01], np.full(4, np.nan)])
+        self._start = np.append(start, 0.0)
+
+    def __call__(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        out, state = np.empty((len(y), self._fields), self._real), self._start.copy()
+        at = (ctypes.c_void_p(array.ctypes.data) for array in (state, y, u, out))
+        state_at, *others = at
+        self._run(state_at, ctypes.c_long(len(y)), *others)
+        return out
+
+
+def records(quick: bool) -> Iterator[tuple[str, ...]]:
+    """Records: one call of `track`, everything included, and the loop in C with the same results."""
+    yield "T", "kept", "us", "ns a sample", "bytes a sample", "C, ns a sample", "times C"
+    kinds = {
+        "std": ({}, 12, np.float64, ()),
+        "std, float32": ({"dtype": "float32"}, 12, np.float32, ("-DREAL=float",)),
+        "theta": ({"keep": "theta"}, 4, np.float64, ("-DTHETA_ALONE",)),
+        "theta, float32": ({"keep": "theta", "dtype": "float32"}, 4, np.float32, ("-DTHETA_ALONE", "-DREAL=float")),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        loops = {name: Loop(folder, f"loop{k}", *kind[1:3], *kind[3]) for k, (name, kind) in enumerate(kinds.items())}
+        for T in (500, 1000) if quick else (500, 1000, 10_000, 100_000, 1_000_000, 10_000_000):
+            y, u = signals(T)
+            for name, (options, fields, real, _) in kinds.items():
+                if T < 100_000 and name != "std":
+                    continue
+                found, loop = track(MODEL, TRACKER, y, u, **options), loops[name]
+                # the loop begins with a variance of 1e6, which half of its digits do not survive
+                np.testing.assert_allclose(found.theta[-1], loop(y, u)[-1, :N], rtol=1e-2, atol=1e-3)
+                ours, c = least(
+                    (lambda: track(MODEL, TRACKER, y, u, **options), lambda: loop(y, u)),  # noqa: B023
+                    10 if quick else max(5, min(2000, 3 * BUDGET // T)),
+                )
+                size = fields * np.dtype(real).itemsize
+                yield (f"{T:,}", name, f"{ours / 1e3:,.1f}", f"{ours / T:.1f}", f"{size}", f"{c / T:.1f}",
+                       f"{ours / c:.2f}")  # fmt: skip
+
+
+def peers(y: list[float], phi: np.ndarray) -> dict[str, Callable[[], None]]:
+    """A pass over the samples by padasip and filterpy, which are handed the regressors."""
+    from filterpy.kalman import KalmanFilter
+    from padasip.filters import FilterRLS
+
+    rls, kalman = FilterRLS(N, mu=0.99), KalmanFilter(N, 1)
+    kalman.F, kalman.Q, kalman.R = np.eye(N), 1e-4 * np.eye(N), np.array([[0.01]])
+
+    def by_padasip() -> None:
+        for value, row in zip(y, phi, strict=True):
+            rls.predict(row)
+            rls.adapt(value, row)
+
+    def by_filterpy() -> None:
+        for value, row in zip(y, phi[:, None, :], strict=True):
+            kalman.predict()
+            kalman.update(value, H=row)
+
+    return {"padasip FilterRLS": by_padasip, "filterpy KalmanFilter": by_filterpy}
+
+
+def live(quick: bool) -> Iterator[tuple[str, ...]]:
+    """Streams: one call of `update` for each sample, and batches."""
+    yield "a sample by", "ns", "padasip, times", "filterpy, times"
+    T, turns = (100, 3) if quick else (1000, 150)
+    y, u = signals(T)
+    y = np.nan_to_num(y)
+    phi = np.column_stack([np.roll(y, 1), np.roll(y, 2), np.roll(u, 1), np.roll(u, 2)])
+    outputs, floats, arrays, clock = y.tolist(), u.tolist(), list(u[:, None]), [0.0]
+    stream = {name: Live(MODEL, TRACKER) for name in ("float", "array", "time", "batch", "timed")}
+    adaptive = Live(MODEL, AdaptiveKalman())
+
+    def each(one: Live, inputs: list[object]) -> Callable[[], None]:
+        def job() -> None:
+            update = one.update
+            for value, present in zip(outputs, inputs, strict=True):
+                update(value, present)
+
+        return job
+
+    def timed() -> None:
+        update, at = stream["time"].update, clock[0]
+        for value, present in zip(outputs, floats, strict=True):
+            at += 1.0
+            update(value, present, at)
+        clock[0] = at
+
+    def std() -> None:
+        for _ in outputs:
+            stream["float"].std  # noqa: B018
+
+    def batches(size: int) -> Callable[[], None]:
+        def job() -> None:
+            for k in range(0, T, size):
+                stream["batch"].update_many(y[k : k + size], u[k : k + size])
+
+        return job
+
+    jobs = {
+        "update, u a float": each(stream["float"], floats),
+        "update, u an array": each(stream["array"], arrays),
+        "update, u a float, with its time": timed,
+        "update of AdaptiveKalman, u a float": each(adaptive, floats),
+        "reading live.std": std,
+        "update_many, batches of 10": batches(10),
+        "update_many, batches of 100": batches(100),
+        "update_many, batches of 1000": batches(1000),
+    }
+    others = peers(outputs, phi)
+    *ours, padasip, filterpy = (ns / T for ns in least((*jobs.values(), *others.values()), turns))
+    for name, ns in zip(jobs, ours, strict=True):
+        yield name, f"{ns:.0f}", f"{padasip / ns:.1f}", f"{filterpy / ns:.1f}"
+    for name, ns in zip(others, (padasip, filterpy), strict=True):
+        yield name, f"{ns:.0f}", f"{padasip / ns:.1f}", f"{filterpy / ns:.1f}"
+
+
+PARTS = {"records": records, "live": live}
+
+
+def main(
+    part: Annotated[list[str] | None, typer.Argument(help=f"Of {', '.join(PARTS)}; all by default.")] = None,
+    quick: Annotated[bool, typer.Option(help="Small sizes, to see that it works.")] = False,
+) -> None:
+    """Print one table per part."""
+    console = Console(width=110)
+    for name in part or PARTS:
+        heads, *rows = PARTS[name](quick)
+        table = Table(title=(PARTS[name].__doc__ or "").strip(), title_justify="left")
+        for k, head in enumerate(heads):
+            table.add_column(head, justify="right" if k else "left")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

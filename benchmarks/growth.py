@@ -1,0 +1,135 @@
+"""How cost grows: processor time against samples, parameters, series, leaves, outputs and candidates, with slopes.
+
+    python -m benchmarks.growth           about ten minutes, most of it compiling new sizes
+    python -m benchmarks.growth --quick
+
+Slopes are least squares on log axes over the larger half of the sizes. Costs in proportion have slope 1; in n the
+filter costs n^2 per sample. Figures are the least processor time of several turns, all threads together.
+"""
+
+import os
+
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ[f"{_library}_NUM_THREADS"] = "1"
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from time import process_time_ns
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.end_to_end import signals
+from driftfit import ARX, Bank, Beam, Change, Kalman, Regression, Sensor, select, track
+
+TRACKER = Kalman(q=1e-4, r=0.01)
+
+Case = tuple[str, str, float, list[int], Callable[[int], Callable[[], Any]]]
+"""(against, of, slope that the mathematics says, sizes, the job of a size)."""
+
+
+def spent(job: Callable[[], Any], turns: int) -> float:
+    """The least nanoseconds of processor time of some turns."""
+    best = np.inf
+    for _ in range(turns):
+        begun = process_time_ns()
+        result = job()
+        best = min(best, process_time_ns() - begun)
+        del result
+    return best
+
+
+def by_samples(T: int) -> Callable[[], Any]:
+    y, u = signals(T)
+    return lambda: track(ARX(2, 2), TRACKER, y, u)
+
+
+def by_parameters(n: int) -> Callable[[], Any]:
+    T = max(2000, 200_000 // n)
+    y, u = np.random.default_rng(0).standard_normal((2, T))
+    return lambda: track(ARX(n // 2, n - n // 2), TRACKER, y, u)
+
+
+def by_series(count: int) -> Callable[[], Any]:
+    y, u = np.random.default_rng(0).standard_normal((2, count, 100))
+    return lambda: track(ARX(2, 2), TRACKER, y, u, by="row", keep="theta", dtype="float32")
+
+
+def to_parquet(count: int) -> Callable[[], Any]:
+    y, u = np.random.default_rng(0).standard_normal((2, count, 100))
+
+    def job() -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            return track(ARX(2, 2), TRACKER, y, u, by="row", to=Path(folder) / "fleet")
+
+    return job
+
+
+def by_leaves(leaves: int) -> Callable[[], Any]:
+    y, u = signals(1000)
+    changes = [Change(0.0, prob=0.98), Change(1e-2, prob=0.01), Change(1.0, prob=0.01)]
+    bank = Bank(changes, [Sensor.nominal(0.01)], reduce=Beam(leaves), p0=10.0)
+    return lambda: track(ARX(2, 2), bank, np.nan_to_num(y), u)
+
+
+def by_outputs(ny: int) -> Callable[[], Any]:
+    rng = np.random.default_rng(0)
+    y, u = rng.standard_normal((20_000, ny)), rng.standard_normal(20_000)
+    return lambda: track(Regression(1, ny=ny), TRACKER, y, u)
+
+
+def by_candidates(count: int) -> Callable[[], Any]:
+    y, u = signals(1000)
+    models = [ARX(na, nb, nk) for nk in (1, 2, 3) for nb in (1, 2, 3) for na in (1, 2, 3)][:count]
+    return lambda: select(models, np.nan_to_num(y), u, tracker=TRACKER)
+
+
+def cases(quick: bool) -> Iterator[Case]:
+    few = slice(0, 3) if quick else slice(None)
+    yield "T", "track, n = 4", 1.0, [1000, 10_000, 100_000, 1_000_000, 4_000_000][few], by_samples
+    yield "n", "one sample", 2.0, [2, 4, 12, 24, 48, 100][few], by_parameters
+    yield (
+        "series",
+        "fleet of 100 rows each, theta in float32",
+        1.0,
+        [100, 1000, 10_000, 100_000, 1_000_000][few],
+        by_series,
+    )
+    yield "series", "the same to Parquet", 1.0, [100, 1000, 10_000][few], to_parquet
+    yield "leaves", "Bank with Beam, n = 4, T = 1000", 1.0, [8, 16, 32, 64, 128][few], by_leaves
+    yield "outputs", "Regression(1), T = 20,000", 1.0, [2, 4, 8, 16, 32][few], by_outputs
+    yield "candidates", "select among ARX models, T = 1000", 1.0, [3, 9, 18, 27][few], by_candidates
+
+
+def main(
+    against: Annotated[list[str] | None, typer.Argument(help="Some of the quantities; all by default.")] = None,
+    quick: Annotated[bool, typer.Option(help="Small sizes, to see that it works.")] = False,
+) -> None:
+    """Print the table."""
+    console = Console(width=120)
+    table = Table(title="How cost grows", title_justify="left")
+    for k, head in enumerate(("against", "of", "sizes", "ms, processor time", "slope", "expected", "peak, GB")):
+        table.add_column(head, justify="right" if k > 2 else "left")
+    for name, what, expected, sizes, make in cases(quick):
+        if against and name not in against:
+            continue
+        ns = [spent(make(size), 1 if size >= 300_000 else 4) for size in sizes]
+        if name == "n":  # per sample
+            ns = [total / max(2000, 200_000 // n) for total, n in zip(ns, sizes, strict=True)]
+        half = slice(len(sizes) // 2 - (len(sizes) < 4), None)
+        slope = np.polyfit(np.log(sizes[half]), np.log(ns[half]), 1)[0]
+        peak = getrusage(RUSAGE_SELF).ru_maxrss / 1e6
+        shown = ", ".join(f"{one / 1e6:.3g}" for one in ns)
+        table.add_row(
+            name, what, f"{sizes[0]:,} to {sizes[-1]:,}", shown, f"{slope:.2f}", f"{expected:g}", f"{peak:.1f}"
+        )
+    console.print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

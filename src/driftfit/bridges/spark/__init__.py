@@ -1,0 +1,13 @@
+"""Fleets on Spark: `track` for tables, `follow` for streams, with PySpark 4 (``pip install driftfit[spark]``) and Java.
+
+Spark partitions, shuffles, retries and keeps checkpoints; this package adds the step. Every unit gives the bits that
+`driftfit.track` gives for it on one machine.
+"""
+
+from driftfit.bridges.spark.batch import track
+from driftfit.bridges.spark.follow import follow
+from driftfit.bridges.spark.keyed import follow_keyed
+from driftfit.bridges.spark.session import session
+from driftfit.bridges.spark.store import Store
+
+__all__ = ["Store", "follow", "follow_keyed", "session", "track"]

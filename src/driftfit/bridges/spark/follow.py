@@ -1,0 +1,208 @@
+"""Streams: every unit of a stream of Spark, exactly once, with the states in a table of our own.
+
+For every micro-batch (`foreachBatch`) the new rows meet the states after the batch before: both are brought together by
+unit, run in the lanes of tiles, and written with the new states as one folder (`driftfit.bridges.spark.store`). A batch
+that Spark runs again after a crash finds the same rows and the same states, and writes the same folder, or finds it
+complete and leaves it as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.bridges.spark.batch import results_schema
+from driftfit.bridges.spark.flow import NEW, OLD, WAITED, Flow
+from driftfit.bridges.spark.frames import rows_of, task_of
+from driftfit.bridges.spark.pieces import COUNTS
+from driftfit.bridges.spark.store import NEXT, Store
+from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.data.clock import Clock
+from driftfit.data.storage import describe, rebuild
+from driftfit.models.base import Model
+from driftfit.run.live.alarm import check_rule
+from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.trackers.base import Tracker
+
+STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
+"""What states have beside their unit and their times."""
+
+
+def follow(
+    stream: Any, model: Model, tracker: Tracker, *, path: str, y: str, by: str | Sequence[str], time: str,
+    u: str | Sequence[str] | None = None, dt: Any = None, settings: Any = None, arrays: bool = False, hold: Any = 0,
+    rule: AlarmRule | None = None, expire: Any = None, initial: Any = None, migrate: bool = False, sink: Any = None,
+    trigger: Mapping[str, Any] | None = None,
+) -> Any:  # fmt: skip
+    """Follow every unit of a stream of Spark.
+
+    Parameters
+    ----------
+    stream : pyspark.sql.DataFrame
+        A streaming data frame; one row per sample.
+    model, tracker, y, u, by, time, dt, settings, arrays
+        As for `driftfit.bridges.spark.track`.
+    path : str
+        The folder of the results, the states and the checkpoint (`Store`).
+    hold : number or duration
+        How far behind the newest time of its unit a row may come: samples wait for so long, and go on in the order of
+        their times. Rows that are later, at a repeated time, or without a time are counted and kept (`Store.late`).
+    rule : AlarmRule or None
+        The rule of a reference run, ``run.detect(...).rule``: gives the columns ``alarm`` and ``cause``.
+    expire : number, duration or None
+        Units whose newest time is so far behind the newest of all end; their states are kept with the kind "expired".
+    initial : pyspark.sql.DataFrame or None
+        States to begin with: ``track(..., outputs="states")``, or those of another stream, ``Store.states()``.
+    migrate : bool
+        Go on from states that another tracker's settings made: what depends on settings takes its new value, all else
+        is carried over.
+    sink : callable or None
+        ``sink(results, batch)`` is called after a batch is written, and may be called again for the same batch after a
+        crash: it must be idempotent, as a MERGE by unit and time, or a write that replaces the batch.
+    trigger : mapping or None
+        As for ``DataStreamWriter.trigger``: ``{"availableNow": True}``, ``{"processingTime": "1 minute"}``.
+
+    Returns
+    -------
+    pyspark.sql.streaming.StreamingQuery
+
+    Raises
+    ------
+    ValueError
+        For what cannot run, and for a path whose states were made by another model or other settings.
+    ImportError
+        If PySpark or Java is missing.
+    """
+    task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
+    kinds = dict(rows_of(stream, task, None).dtypes)
+    dated = kinds[time].startswith("timestamp")
+    if rule is not None and check_rule(rule).kind in FROZEN:
+        raise ValueError(f"spark.follow: a rule of kind {rule.kind!r} is not for Spark; use 'innovation' or 'band'.")
+    schema = _schema(task, kinds, rule is not None)
+    store = Store(stream.sparkSession, path)
+    flow = Flow(task, schema, duration("hold", hold, dated), rule, _before(store, task, schema, migrate))
+    run = _Batches(store, flow, settings, initial, None if expire is None else duration("expire", expire, dated), sink)
+    writer = stream.writeStream.foreachBatch(run).option("checkpointLocation", f"{store.path}/checkpoint")
+    return writer.trigger(**(trigger or {"processingTime": "0 seconds"})).start()
+
+
+def duration(name: str, value: Any, dated: bool) -> Any:
+    """A span of time in the type of times."""
+    span = value if isinstance(value, int | float) and not dated else Clock.of(value).duration if value else 0
+    if dated and not value:
+        return np.timedelta64(0, "us")
+    if span is None or not span >= (np.timedelta64(0) if dated else 0) or (dated and isinstance(span, int | float)):
+        raise ValueError(
+            f"spark.follow: {name} must be {'a duration, such as 10min' if dated else 'a number'}, not negative; "
+            f"got {value!r}."
+        )
+    return span
+
+
+def _schema(task: Task, kinds: Mapping[str, str], watched: bool) -> dict[str, str]:
+    """Columns and types of the table."""
+    own = {name: kinds[name] for name in task.columns}
+    alarms = {"alarm": "boolean", "cause": "string"} if watched else {}
+    times = {"last": kinds[task.time], "newest": kinds[task.time]}
+    return {"kind": "string", **own, **results_schema(task), **alarms, "failed": "string", **STATE, **times}
+
+
+def _before(store: Store, task: Task, schema: Mapping[str, str], migrate: bool) -> Tracker | None:
+    """The tracker that made the states, if it is another one; notes what is followed from now on."""
+    program = task.program_for(None)
+    text = "" if isinstance(program, str) else program.layout.text
+    results = [name for name in schema if name not in ("kind", *STATE, "last", "newest", "failed")]
+    about = {"model": describe(task.model), "tracker": describe(task.tracker), "fields": text, "results": results}
+    about |= {"schema": ", ".join(f"`{name}` {kind}" for name, kind in {"batch": "int", **schema}.items())}
+    about |= {"rows": list(task.columns), "states": [*task.by, *STATE, "last", "newest"]}
+    found = store.abouts()
+    if not found:
+        store.begin(about)
+        return None
+    last = found[-1]
+    if last["model"] != about["model"]:
+        raise ValueError(
+            f"spark.follow: the states in {store.path} were made with {rebuild(last['model'], Model)!r}, not with "
+            f"{task.model!r}; begin in another folder."
+        )
+    old: Tracker = rebuild(last["tracker"], Tracker)
+    if old != task.tracker and not migrate:
+        raise ValueError(
+            f"spark.follow: the states in {store.path} were made with {old!r}, not with {task.tracker!r}: give "
+            "migrate=True to carry them over, or begin in another folder."
+        )
+    if last != about:
+        store.begin(about)
+    return old if old != task.tracker else None
+
+
+class _Batches:
+    """What Spark calls with every micro-batch."""
+
+    def __init__(self, store: Store, flow: Flow, settings: Any, initial: Any, expire: Any, sink: Any) -> None:
+        self.store, self.flow, self.settings, self.initial = store, flow, settings, initial
+        self.expire, self.sink = expire, sink
+
+    def __call__(self, rows: Any, batch: int) -> None:
+        store = self.store
+        if not store.has(batch):
+            done = [one for one in store.batches() if one < batch]
+            store.write(self._table(rows, done[-1] if done else None), batch)
+            # two states stay: that of the batch before is needed if this one is lost
+            if done:
+                store.forget(done[-1])
+        if self.sink is not None:
+            self.sink(store.read("result", batches=[batch]).select("batch", *store.schema_of("results")), batch)
+
+    def _table(self, rows: Any, before: int | None) -> Any:
+        """The table of a batch, which begins with the states after another one."""
+        from pyspark.sql import functions as F  # noqa: N812
+
+        flow, task = self.flow, self.flow.task
+        new = rows_of(rows, task, self.settings).withColumn("_kind", F.lit(NEW))
+        parts = [new]
+        if before is not None:
+            kept = self.store.read(*NEXT, batches=[before])
+            which = F.when(F.col("kind") == "state", F.lit(OLD)).otherwise(F.lit(WAITED))
+            names = [*task.columns, *STATE, "last", "newest"]
+            parts.append(kept.withColumn("_kind", which).select(*names, "_kind"))
+            if self.expire is not None:
+                flow = replace(flow, expired=self._oldest(kept))
+        else:
+            flow = replace(flow, before=None)
+            if self.initial is not None:
+                parts.append(_begun(self.initial, task).withColumn("_kind", F.lit(OLD)))
+        every = parts[0]
+        for part in parts[1:]:
+            every = every.unionByName(part, allowMissingColumns=True)
+        times = {"last": flow.schema["last"], "newest": flow.schema["newest"]}
+        for name, kind in {**STATE, **times}.items():
+            if name not in every.columns:
+                every = every.withColumn(name, F.lit(None).cast(kind))
+        own = [SETTING + name for name in task.settings]
+        every = every.select(*task.columns, *STATE, "last", "newest", *own, "_kind")
+        order = [*task.by, "_kind", task.time, task.y, *task.u]
+        made = ", ".join(f"`{name}` {kind}" for name, kind in flow.schema.items())
+        return every.repartition(*task.by).sortWithinPartitions(*order).mapInArrow(flow.work, made)
+
+    def _oldest(self, kept: Any) -> Any:
+        """The time before which a unit has been silent for too long."""
+        newest = kept.agg({"newest": "max"}).first()[0]
+        if newest is None:
+            return None
+        return newest - self.expire if isinstance(newest, float) else np.datetime64(newest, "us") - self.expire
+
+
+def _begun(initial: Any, task: Task) -> Any:
+    """States to begin with, from a batch run or from another stream."""
+    from pyspark.sql import functions as F  # noqa: N812
+
+    if "failed" in initial.columns:
+        initial = initial.where("failed is null")
+    if "newest" not in initial.columns:
+        initial = initial.withColumn("last", F.col(task.time)).withColumn("newest", F.col(task.time))
+    names = [name for name in STATE if name in initial.columns]
+    return initial.select(*task.by, *names, "last", "newest")

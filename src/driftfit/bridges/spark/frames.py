@@ -1,0 +1,109 @@
+"""Data frames of Spark: which columns a task reads, checked before any job runs, and the settings of units joined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from driftfit.bridges.spark.session import missing
+from driftfit.bridges.spark.task import SETTING, Task
+from driftfit.data.arguments import check_roles
+from driftfit.engine.settings import near
+from driftfit.models.base import Model
+from driftfit.run.program import programs_of
+from driftfit.trackers.base import Tracker
+
+KEYS = ("string", "tinyint", "smallint", "int", "bigint", "date", "timestamp", "boolean")
+"""Types of columns that identify units."""
+NUMBERS = ("tinyint", "smallint", "int", "bigint", "float", "double", "decimal", "boolean")
+TIMES = ("timestamp", "timestamp_ntz", "date", "tinyint", "smallint", "int", "bigint", "float", "double")
+
+
+def task_of(
+    df: Any, model: Model, tracker: Tracker, columns: Mapping[str, Any], dt: Any, settings: Any, arrays: bool
+) -> Task:
+    """The task for a data frame; ``columns`` are y, u, by and time. ValueError for what cannot run."""
+    if problem := missing():
+        raise ImportError(problem)
+    check_roles("track", model, tracker, several=False)
+    if len(model.outputs) > 1:
+        raise ValueError("spark: a model with several outputs is not followed on Spark; give one output at a time.")
+    names = {name: _names(name, columns[name]) for name in ("y", "u", "by", "time")}
+    for name in ("y", "time"):
+        if len(names[name]) != 1:
+            raise ValueError(
+                f"spark: {name}= is the name of one column; got {columns[name]!r}."
+                + (" Data frames of Spark have no order, so samples need a time." if name == "time" else "")
+            )
+    if not names["by"]:
+        raise ValueError("spark: by= names the columns that identify units; a single series runs on one machine.")
+    _check_types(df, names)
+    kind = dict(df.dtypes)[names["time"][0]]
+    dated = kind in ("timestamp", "timestamp_ntz", "date")
+    zone = df.sparkSession.conf.get("spark.sql.session.timeZone") if kind == "timestamp" else None
+    own = () if settings is None else _settings(settings, tracker, names["by"])
+    task = Task(model, tracker, names["y"][0], names["u"], names["by"], names["time"][0], dt, zone, own, arrays)
+    task.clock.steps(np.array([0, 1], "M8[us]") if dated else np.array([0.0, 1.0]))
+    if not own:
+        programs_of(model, tracker, task.order)
+    used = [*names["by"], *names["time"], *names["y"], *names["u"]]
+    results = [*used, *schema_names(task)]
+    if twice := [name for name in dict.fromkeys(results) if results.count(name) > 1]:
+        raise ValueError(f"spark: the table of results would have {twice[0]!r} twice; rename that column first.")
+    return task
+
+
+def schema_names(task: Task) -> list[str]:
+    """The columns that results add."""
+    own = ["prediction", "innovation", "innovation_std", "ok", "failed"]
+    return own + (["theta", "std"] if task.arrays else [f"{w}_{p}" for p in task.names for w in ("theta", "std")])
+
+
+def _names(argument: str, value: Any) -> tuple[str, ...]:
+    given = () if value is None else (value,) if isinstance(value, str) else tuple(value)
+    if not all(isinstance(name, str) for name in given):
+        raise ValueError(f"spark: {argument}= takes names of columns; got {value!r}.")
+    return given
+
+
+def _check_types(df: Any, names: Mapping[str, Sequence[str]]) -> None:
+    """ValueError for a column that does not exist or has a type that cannot be used."""
+    kinds = dict(df.dtypes)
+    for argument, allowed in (("by", KEYS), ("time", TIMES), ("y", NUMBERS), ("u", NUMBERS)):
+        for name in names[argument]:
+            if name not in kinds:
+                raise ValueError(f"spark: {argument}: there is no column {name!r}: {near(name, list(kinds))}")
+            if kinds[name].partition("(")[0] not in allowed:
+                raise ValueError(
+                    f"spark: {argument}: column {name!r} is of type {kinds[name]}; it must be one of "
+                    f"{', '.join(allowed)}. Cast it first: df.withColumn({name!r}, F.col({name!r}).cast('double'))."
+                )
+
+
+def _settings(settings: Any, tracker: Tracker, by: Sequence[str]) -> tuple[str, ...]:
+    """The settings that a table gives for every unit."""
+    known = [field.name for field in fields(tracker) if field.init]  # type: ignore[arg-type]
+    own = [name for name in settings.columns if name not in by]
+    if wrong := [name for name in by if name not in settings.columns]:
+        raise ValueError(f"spark: the table of settings has no column {wrong[0]!r}, by which units are found.")
+    if wrong := [name for name in own if name not in known]:
+        raise ValueError(f"spark: {type(tracker).__name__} has no setting {wrong[0]!r}: {near(wrong[0], known)}")
+    return tuple(own)
+
+
+def rows_of(df: Any, task: Task, settings: Any) -> Any:
+    """The columns that the task reads, with the settings of every unit."""
+    from pyspark.sql import functions as F  # noqa: N812  (as everybody calls it)
+
+    kind = dict(df.dtypes)[task.time]
+    to = "timestamp_ntz" if kind == "date" else kind if kind.startswith("timestamp") else "double"
+    columns = [*(F.col(name) for name in task.by), F.col(task.time).cast(to).alias(task.time)]
+    columns += [F.col(name).cast("double").alias(name) for name in (task.y, *task.u)]
+    rows = df.select(*columns)
+    if settings is None:
+        return rows
+    own = [F.col(name).alias(SETTING + name) for name in task.settings]
+    return rows.join(settings.select(*task.by, *own), on=list(task.by), how="left")

@@ -1,0 +1,34 @@
+"""Judge many runs on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from time import monotonic
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import Progress
+
+from driftfit.run.parallel_lanes import cores
+
+Said = TypeVar("Said")
+PATIENCE = 2.0
+"""Seconds after which a progress bar appears."""
+
+
+def on_all_cores(keys: Iterable[Hashable], judge: Callable[[Hashable], Said], what: str) -> dict[Hashable, Said]:
+    """``judge(key)`` for each key, in their order; the first alone, so that only one thread compiles."""
+    keys = list(keys)
+    said = [judge(key) for key in keys[:1]]
+    progress = Progress(console=Console(stderr=True), transient=True)
+    task, begun, shown = progress.add_task(what, total=len(keys), completed=len(said)), monotonic(), False
+    with ThreadPoolExecutor(cores()) as pool, ExitStack() as stack:
+        for one in pool.map(judge, keys[1:]):
+            said.append(one)
+            progress.advance(task)
+            if not shown and monotonic() - begun > PATIENCE:
+                stack.enter_context(progress)
+                shown = True
+    return dict(zip(keys, said, strict=True))

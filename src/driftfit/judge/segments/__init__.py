@@ -1,0 +1,1 @@
+"""Parts of `driftfit.judge.segment`: the breaks that correlated noise leaves, and their thresholds."""

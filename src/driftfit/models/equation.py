@@ -1,0 +1,224 @@
+"""An equation of your own: y_t = f(inputs, lags; theta_t) + v_t, written as text, with exact derivatives.
+
+    Equation("flow = theta.k * sqrt(p1 - p2) - theta.c")
+    Equation("y = theta.a * y[-1] + theta.b * u[-1] / (1 + theta.s * u[-1] ** 2)", start={"s": 0.5})
+
+The name on the left is the output. ``theta.NAME`` is a parameter, ``NAME[-2]`` a signal two samples ago, every other
+name an input. Allowed are + - * / **, numbers, pi, comparisons, ``A if CONDITION else B``, and the functions abs, cos,
+exp, log, max, min, sin, sqrt, tanh. Nothing else of the text is evaluated.
+
+Every tracker of linear regressions follows theta by the linearisation of f at a point theta',
+
+    phi_t = d f / d theta (theta'),     y_t - f(theta') + phi_t' theta' = phi_t' theta_t + v_t
+
+so that `Kalman` is the extended Kalman filter for drifting parameters, and `RLS` recursive Gauss-Newton. An equation
+that is linear in theta is exactly the `Regression` on its terms. Derivatives are computed by forward differentiation
+of the text (dual numbers), together with f and in the same compiled code.
+
+theta' begins at ``start``, and goes to the estimate in the course of the first 10 n usable samples: a parameter that
+enters nonlinearly needs a start from which linear steps lead to it. Where f or a derivative is not finite at theta'
+(the root of a negative number), the sample is linearised at ``start`` instead; where it is not finite there either, it
+is not used.
+
+A missing output is replaced by its prediction among the lags, for at most as many samples as the longest lag; samples
+that need a missing input are not used. A gap in time breaks the lags as in `ARX`.
+
+Source: Ljung and Soderstrom, Theory and Practice of Recursive Identification (1983), section 3.6; Griewank and Walther,
+Evaluating Derivatives (2008), chapter 3. Cost per sample: that of f and its derivatives, O(n) for each operation at
+most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import input_names, numbers
+from driftfit.models.arx import GAP
+from driftfit.models.base import Model
+from driftfit.models.formulas import Formula, compiled, parse
+
+SETTLING = 10.0
+"""Usable samples for each parameter in which the point of linearisation goes from the start to the estimate."""
+
+
+@dataclass(frozen=True)
+class Equation(Model):
+    """y = f(inputs, lags; theta), given as text; see `driftfit.models.equation`.
+
+    Parameters
+    ----------
+    equation : str
+        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``.
+    start : mapping from parameter to number, or a number for all
+        Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
+        ``theta0`` and ``p0``.
+    inputs : names or None
+        Columns of u, in order; None: the inputs of the equation, in the order in which they appear.
+
+    Raises
+    ------
+    ValueError
+        If the text is not such an equation, ``start`` names what is no parameter, or inputs are missing.
+    """
+
+    equation: str
+    start: Any = 1.0
+    inputs: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        formula = parse(self.equation)
+        if self.inputs is None:
+            self._set("inputs", formula.inputs)
+        else:
+            self._set("inputs", input_names("Equation", "inputs", self.inputs))
+        if absent := [name for name in formula.inputs if name not in self.inputs]:
+            raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
+        given = self.start
+        if isinstance(given, Sequence) and not isinstance(given, str) and all(len(one) == 2 for one in given):
+            given = dict(given)
+        if isinstance(given, Mapping):
+            if unknown := sorted(set(given) - set(formula.parameters)):
+                raise ValueError(
+                    f"Equation: start names {', '.join(unknown)}; the parameters are {', '.join(formula.parameters)}."
+                )
+            named = tuple((name, numbers("Equation", "start", value, ndim=0)) for name, value in given.items())
+            self._set("start", named)
+        else:
+            self._set("start", numbers("Equation", "start", given, ndim=0))
+
+    def bind(self, inputs: int | Sequence[str]) -> Equation:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if count != self.m:
+            raise ValueError(f"Equation: {self.m} inputs ({', '.join(self.input_names)}), but u has {count} columns.")
+        return self
+
+    @property
+    def formula(self) -> Formula:
+        return parse(self.equation)
+
+    @property
+    def m(self) -> int:
+        return len(self.input_names)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.inputs or ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.formula.parameters
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (self.formula.output,)
+
+    @property
+    def begins(self) -> Array:
+        """The point (n,) at which the linearisation begins."""
+        if isinstance(self.start, tuple):
+            given = dict(self.start)
+            return np.array([given.get(name, 1.0) for name in self.names])
+        return np.full(self.n, float(self.start))
+
+    @property
+    def reach(self) -> int:
+        return self.formula.reach
+
+    @property
+    def output_lags(self) -> int | None:
+        return None if self.formula.lags_of(self.formula.output) else 0
+
+    def memory(self) -> Mapping[str, Any]:
+        depth = self.reach + 1
+        return {
+            "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan), "point": self.begins,
+            "first_point": self.begins, "value": 0.0, "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0,
+            "started": 0.0,
+        }  # fmt: skip
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self.equation, self.input_names)
+
+    def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:
+        p, h = y.shape[1], noise.shape[1]
+        out = np.concatenate([y, np.zeros((len(theta), h))], axis=1)
+        for k in range(h):
+            t = p + k
+            signals = {name: u[:, : t + 1, j] for j, name in enumerate(self.input_names)}
+            signals[self.formula.output] = out[:, : t + 1]
+            out[:, t] = self.formula.value(theta.T, signals) + noise[:, k]
+        return out[:, p:]
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """1, then 0 without output lags; with them it depends on the operating point and is NaN: use `simulate`."""
+        response: Array = np.eye(1, h)[0]
+        if self.formula.lags_of(self.formula.output):
+            response[1:] = np.nan
+        return response
+
+
+@lru_cache
+def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
+    formula = parse(equation)
+    m, n, reach = len(inputs), len(formula.parameters), formula.reach
+    evaluate = compiled(equation, inputs)
+
+    @kernel
+    def age(s: State, l: int) -> None:
+        broken = s.dt[l] > GAP
+        for i in range(reach, 0, -1):
+            s.y_lag[i, l] = np.nan if broken else s.y_lag[i - 1, l]
+            for j in range(m):
+                s.u_lag[j, i, l] = np.nan if broken else s.u_lag[j, i - 1, l]
+        for j in range(m):
+            s.u_lag[j, 0, l] = s.u[j, l]
+
+    @kernel
+    def finite(s: State, l: int) -> bool:
+        good = abs(s.value[l]) < LARGEST
+        for i in range(n):
+            good = good & (abs(s.phi[i, l]) < LARGEST)
+        return good
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        age(s, l)
+        evaluate(s, l)
+        if not finite(s, l):
+            for i in range(n):
+                s.point[i, l] = s.first_point[i, l]
+            evaluate(s, l)
+        good, along = finite(s, l), 0.0
+        for i in range(n):
+            along += s.phi[i, l] * s.point[i, l]
+        s.shift[l] = s.value[l] - along if good else 0.0
+        if not good:
+            s.phi[0, l] = np.nan
+        s.measured[l] = s.y[l]
+        s.y[l] -= s.shift[l]
+        s.started[l] = 1.0 if good else s.started[l]
+        s.dt[l] = s.dt[l] if s.started[l] > 0.0 else 0.0
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        seen = s.seen[l] > 0.0
+        informed = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))
+        s.y_hat[l] += s.shift[l]
+        known = informed & (s.without[l] < reach)
+        s.without[l] = 0.0 if seen else s.without[l] + 1.0
+        s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
+        s.usable[l] += s.ok[l]
+        share = min(1.0, s.usable[l] / (SETTLING * n)) if informed & (s.ok[l] > 0.0) else 0.0
+        for i in range(n):
+            moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
+            s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]
+
+    return ModelSteps(regress, push)

@@ -1,0 +1,289 @@
+"""Formulas as text: their parts, their value in numpy, and compiled code for the value and its derivatives.
+
+The text is read as a syntax tree, of which only arithmetic, comparisons, a conditional expression, names, lags and the
+functions of `FUNCTIONS` are accepted. From the tree code is written that does one operation a line and, beside it, the
+same line for the derivative with respect to every parameter on which it depends (forward differentiation).
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array, exp, kernel, log
+
+LONGEST = 2000
+"""Characters of a formula."""
+FUNCTIONS = {
+    "abs": 1, "cos": 1, "exp": 1, "log": 1, "max": 2, "min": 2, "sin": 1, "sqrt": 1, "tanh": 1,
+}  # fmt: skip
+"""Functions by name, with the number of their arguments."""
+OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**"}
+COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+
+
+@dataclass(frozen=True)
+class Formula:
+    """The parts of ``output = expression``."""
+
+    text: str
+    output: str
+    tree: ast.expr = field(compare=False)
+    parameters: tuple[str, ...]
+    inputs: tuple[str, ...]
+    lags: tuple[tuple[str, int], ...]
+    """Signals with their lags, in samples."""
+
+    @property
+    def reach(self) -> int:
+        """The longest lag."""
+        return max((lag for _, lag in self.lags), default=0)
+
+    def lags_of(self, signal: str) -> tuple[int, ...]:
+        """The lags of a signal that the expression uses."""
+        return tuple(lag for name, lag in self.lags if name == signal)
+
+    def value(self, theta: Array, signals: Mapping[str, Array]) -> Array:
+        """The expression for parameters (n, D) and signals (D or 1, t + 1) up to the present sample; (D,)."""
+        with np.errstate(all="ignore"):
+            return np.broadcast_to(self._value(self.tree, theta, signals), theta.shape[1:])
+
+    def _value(self, node: ast.expr, theta: Array, signals: Mapping[str, Array]) -> Any:
+        def at(one: ast.expr) -> Any:
+            return self._value(one, theta, signals)
+
+        match node:
+            case ast.Constant():
+                return node.value
+            case ast.Name():
+                return np.pi if node.id == "pi" else signals[node.id][:, -1]
+            case ast.Attribute():
+                return theta[self.parameters.index(node.attr)]
+            case ast.Subscript():
+                return signals[node.value.id][:, -1 - _lag(node)]  # type: ignore[attr-defined]
+            case ast.UnaryOp():
+                return -at(node.operand) if isinstance(node.op, ast.USub) else at(node.operand)
+            case ast.BinOp():
+                return _BINARY[type(node.op)](at(node.left), at(node.right))
+            case ast.IfExp():
+                return np.where(at(node.test), at(node.body), at(node.orelse))
+            case ast.Compare():
+                return _COMPARE[type(node.ops[0])](at(node.left), at(node.comparators[0]))
+            case ast.Call():
+                return _CALLS[node.func.id](*(at(one) for one in node.args))  # type: ignore[attr-defined]
+        raise AssertionError(node)
+
+
+_BINARY: dict[Any, Any] = {
+    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
+    ast.Pow: lambda x, p: np.power(np.asarray(x, dtype=float), p),
+}  # fmt: skip
+_COMPARE: dict[Any, Any] = {
+    ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal, ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
+}  # fmt: skip
+_CALLS: dict[str, Any] = {
+    "abs": np.abs, "cos": np.cos, "exp": np.exp, "log": np.log, "max": np.maximum, "min": np.minimum, "sin": np.sin,
+    "sqrt": np.sqrt, "tanh": np.tanh,
+}  # fmt: skip
+
+
+def _lag(node: ast.Subscript) -> int:
+    return node.slice.operand.value  # type: ignore[attr-defined,no-any-return]
+
+
+@lru_cache(maxsize=256)
+def parse(text: str) -> Formula:
+    """The parts of a formula; ValueError says what in it is not understood."""
+    if not isinstance(text, str) or len(text) > LONGEST:
+        raise ValueError(
+            f"Equation: give a text of at most {LONGEST} characters, as 'y = theta.k * sqrt(u) - theta.c'."
+        )
+    left, equals, right = text.partition("=")
+    output = left.strip()
+    try:
+        tree = ast.parse(right.strip(), mode="eval").body if equals else None
+    except (SyntaxError, RecursionError, MemoryError):
+        tree = None
+    if tree is None or not output.isidentifier() or output in (*FUNCTIONS, "theta", "pi"):
+        raise ValueError(f"Equation: {text!r} is not an equation such as 'y = theta.k * sqrt(p1 - p2) - theta.c'.")
+    parameters: dict[str, None] = {}
+    lags: dict[tuple[str, int], None] = {}
+    _check(tree, parameters, lags)
+    if (output, 0) in lags:
+        raise ValueError(f"Equation: {output} on the right must have a lag, as {output}[-1].")
+    if not parameters:
+        raise ValueError(f"Equation: {text!r} has no parameter; write the unknown numbers as theta.NAME.")
+    inputs = dict.fromkeys(name for name, _ in lags if name != output)
+    return Formula(text, output, tree, tuple(parameters), tuple(inputs), tuple(lags))
+
+
+def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, int], None]) -> None:
+    """Collect parameters and lags; ValueError for whatever is not allowed."""
+    match node:
+        case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
+            return
+        case ast.Attribute(value=ast.Name(id="theta")):
+            parameters[node.attr] = None
+            return
+        case ast.Name() if node.id not in (*FUNCTIONS, "theta"):
+            if node.id != "pi":
+                lags[node.id, 0] = None
+            return
+        case ast.Subscript(
+            value=ast.Name(id=name), slice=ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(lag)))
+        ):
+            lags[name, lag] = None
+            return
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
+            within = [node.operand]
+        case ast.BinOp() if type(node.op) in OPERATORS:
+            within = [node.left, node.right]
+        case ast.IfExp():
+            within = [node.test, node.body, node.orelse]
+        case ast.Compare() if len(node.ops) == 1 and type(node.ops[0]) in COMPARISONS:
+            within = [node.left, *node.comparators]
+        case ast.Call(func=ast.Name(id=name), keywords=[]) if FUNCTIONS.get(name) == len(node.args):
+            within = list(node.args)
+        case _:
+            raise ValueError(
+                f"Equation: {ast.unparse(node)!r} is not understood. Use theta.NAME for parameters, NAME and NAME[-1] "
+                f"for signals, + - * / **, comparisons, 'A if B else C', pi and {', '.join(FUNCTIONS)}."
+            )
+    for one in within:
+        _check(one, parameters, lags)
+
+
+class _Writer:
+    """Lines of code for a tree, and the names of their results: value, and derivatives by parameter."""
+
+    def __init__(self, formula: Formula, inputs: tuple[str, ...]) -> None:
+        self.formula, self.inputs = formula, inputs
+        self.lines: list[str] = []
+
+    def let(self, code: str) -> str:
+        name = f"x{len(self.lines)}"
+        self.lines.append(f"{name} = {code}")
+        return name
+
+    def write(self, node: ast.expr) -> tuple[str, dict[int, str]]:
+        match node:
+            case ast.Constant():
+                return repr(float(node.value)), {}  # type: ignore[arg-type]
+            case ast.Attribute():
+                i = self.formula.parameters.index(node.attr)
+                return self.let(f"s.point[{i}, l]"), {i: "1.0"}
+            case ast.Name():
+                return (repr(float(np.pi)) if node.id == "pi" else self._signal(node.id, 0)), {}
+            case ast.Subscript():
+                return self._signal(node.value.id, _lag(node)), {}  # type: ignore[attr-defined]
+            case ast.UnaryOp():
+                x, dx = self.write(node.operand)
+                return (self._scaled("-1.0", x, dx)) if isinstance(node.op, ast.USub) else (x, dx)
+            case ast.BinOp():
+                return self._binary(node)
+            case ast.IfExp():
+                test, _ = self.write(node.test)
+                return self._chosen(test, self.write(node.body), self.write(node.orelse))
+            case ast.Compare():
+                (a, _), (b, _) = self.write(node.left), self.write(node.comparators[0])
+                return self.let(f"{a} {COMPARISONS[type(node.ops[0])]} {b}"), {}
+            case ast.Call():
+                return self._call(node.func.id, [self.write(one) for one in node.args])  # type: ignore[attr-defined]
+        raise AssertionError(node)
+
+    def _signal(self, name: str, lag: int) -> str:
+        if name == self.formula.output:
+            return self.let(f"s.y_lag[{lag}, l]")
+        return self.let(f"s.u_lag[{self.inputs.index(name)}, {lag}, l]")
+
+    def _scaled(self, factor: str, x: str, dx: dict[int, str]) -> tuple[str, dict[int, str]]:
+        return self.let(f"{factor} * {x}"), {i: self.let(f"{factor} * {d}") for i, d in dx.items()}
+
+    def _chosen(self, test: str, one: Any, other: Any) -> tuple[str, dict[int, str]]:
+        """``one`` where the test holds."""
+        (a, da), (b, db) = one, other
+        both = sorted({*da, *db})
+        value = self.let(f"{a} if {test} else {b}")
+        return value, {i: self.let(f"{da.get(i, '0.0')} if {test} else {db.get(i, '0.0')}") for i in both}
+
+    def _sum(self, *terms: tuple[str, dict[int, str]]) -> dict[int, str]:
+        """The derivatives sum_k factor_k d_k of a function with these partial derivatives."""
+        found: dict[int, list[str]] = {}
+        for factor, dx in terms:
+            for i, d in dx.items():
+                found.setdefault(i, []).append(f"{factor} * {d}")
+        return {i: self.let(" + ".join(parts)) for i, parts in sorted(found.items())}
+
+    def _binary(self, node: ast.BinOp) -> tuple[str, dict[int, str]]:
+        (a, da), (b, db) = self.write(node.left), self.write(node.right)
+        match node.op:
+            case ast.Add():
+                return self.let(f"{a} + {b}"), self._sum(("1.0", da), ("1.0", db))
+            case ast.Sub():
+                return self.let(f"{a} - {b}"), self._sum(("1.0", da), ("-1.0", db))
+            case ast.Mult():
+                return self.let(f"{a} * {b}"), self._sum((b, da), (a, db))
+            case ast.Div():
+                value = self.let(f"{a} / {b}")
+                return value, self._sum((f"(1.0 / {b})", da), (f"(-{value} / {b})", db))
+        return self._power(node, (a, da), (b, db))
+
+    def _power(self, node: ast.BinOp, base: Any, power: Any) -> tuple[str, dict[int, str]]:
+        (a, da), (b, db) = base, power
+        try:
+            p = ast.literal_eval(node.right)
+        except ValueError:
+            p = None
+        if isinstance(p, int) and abs(p) <= 32:  # exact, also for negative bases
+            value = self.let(_product(a, abs(p)) if p >= 0 else f"1.0 / ({_product(a, -p)})")
+            less = _product(a, p - 1) if p >= 1 else f"(1.0 / ({_product(a, 1 - p)}))"
+            return value, self._sum((f"{float(p)!r} * ({less})", da))
+        logarithm = self.let(f"log({a}) if {a} > 0.0 else np.nan")
+        value = self.let(f"exp({b} * {logarithm})")
+        return value, self._sum((f"({b} * {value} / {a})", da), (f"({value} * {logarithm})", db))
+
+    def _call(self, name: str, given: list[Any]) -> tuple[str, dict[int, str]]:
+        (a, da) = given[0]
+        match name:
+            case "max" | "min":
+                return self._chosen(self.let(f"{a} {'>' if name == 'max' else '<'} {given[1][0]}"), *given)
+            case "abs":
+                return self.let(f"abs({a})"), self._sum((f"(1.0 if {a} >= 0.0 else -1.0)", da))
+            case "sqrt":
+                value = self.let(f"np.sqrt({a})")
+                return value, self._sum((f"(0.5 / {value})", da))
+            case "exp":
+                value = self.let(f"exp({a})")
+                return value, self._sum((value, da))
+            case "log":
+                return self.let(f"log({a}) if {a} > 0.0 else np.nan"), self._sum((f"(1.0 / {a})", da))
+            case "tanh":
+                value = self.let(f"1.0 - 2.0 / (exp(2.0 * {a}) + 1.0)")
+                return value, self._sum((f"(1.0 - {value} * {value})", da))
+        value = self.let(f"np.{name}({a})")
+        return value, self._sum((f"np.cos({a})" if name == "sin" else f"(-np.sin({a}))", da))
+
+
+def _product(x: str, times: int) -> str:
+    return " * ".join([x] * times) if times else "1.0"
+
+
+@lru_cache(maxsize=256)
+def compiled(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
+    """The kernel that writes s.value and s.phi at s.point, from s.y_lag and s.u_lag (a row for each input)."""
+    formula = parse(text)
+    writer = _Writer(formula, inputs)
+    value, derivatives = writer.write(formula.tree)
+    lines = [*writer.lines, f"s.value[l] = {value}"]
+    lines += [f"s.phi[{i}, l] = {derivatives.get(i, '0.0')}" for i in range(len(formula.parameters))]
+    code = "def evaluate(s, l):\n" + "\n".join(f"    {line}" for line in lines)
+    known: dict[str, Any] = {"np": np, "exp": exp, "log": log, "__name__": __name__}
+    exec(code, known)  # written above, from a tree in which nothing but arithmetic is left
+    made: Callable[..., Any] = kernel(known["evaluate"])
+    return made

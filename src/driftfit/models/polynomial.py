@@ -1,0 +1,264 @@
+"""Transfer functions in coloured noise: ARMAX, output error, Box-Jenkins and all between, by prediction errors.
+
+    A(z) y_t = sum_j B_j(z) / F_j(z) u_j,t + (c) + C(z) / D(z) e_t
+
+    A = 1 - a_1 z^-1 ..,  B_j = b_1 z^-nk + ..,  F_j = 1 - f_1 z^-1 ..,  C = 1 + c_1 z^-1 ..,  D = 1 - d_1 z^-1 ..
+
+The prediction is linear in past outputs and inputs, and in three signals that depend on theta themselves:
+
+    w_j,t = sum_i f_i w_j,t-i + sum_i b_i u_j,t-nk-i+1               the response to an input, without noise
+    v_t   = y_t - sum_i a_i y_t-i - sum_j w_j,t - c                  the noise
+    e_t   = v_t - sum_i d_i v_t-i - sum_i c_i e_t-i                  the innovation
+
+    y_hat = sum_i a_i y_t-i + sum_j w_j,t + c + sum_i d_i v_t-i + sum_i c_i e_t-i
+
+Every tracker of linear regressions follows theta by the linearisation of y_hat at its own last estimate theta',
+
+    psi_t = d y_hat / d theta,     y_t - y_hat(theta') + psi_t' theta' = psi_t' theta_t + e_t
+
+    d y_hat / d a_i = D/C y_t-i       d y_hat / d b_i = D/(C F_j) u_j,t-nk-i+1    d y_hat / d f_i = D/(C F_j) w_j,t-i
+    d y_hat / d c_i = 1/C e_t-i       d y_hat / d d_i = 1/C v_t-i                 d y_hat / d c   = D/C 1
+
+`RLS` is then the recursive maximum likelihood (or prediction error) method, and `Kalman` the extended Kalman filter for
+parameters that drift. In contrast to least squares in an `ARX` model they are not biased by coloured noise, and their
+covariance is that of the prediction error estimate.
+
+theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. The start needs care, because
+the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
+samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
+autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at
+1 - 4 n / N of their distance from 0. The bias of the start fades with the memory of the tracker: with `RLS(1.0)` the
+bands of C cover less than stated for a few hundred samples.
+
+A missing output is replaced by its prediction, for at most na outputs in a row if there are lags of it, and its e is
+0. A missing input makes the samples unusable that have it in psi directly; in w its last value is held. A gap in time
+breaks the lags as in `ARX`, and e and v are 0 after it.
+
+Source: Ljung and Soderstrom, Theory and Practice of Recursive Identification (1983), section 3.7, and Ljung, System
+Identification (1999), eq. 11.51; the general structure is eq. 4.33 there. Departures: signs of a, d, f are those of the
+regression, as in `ARX`; the start; filters that stay stable, where the source projects theta itself; w and e of a
+sample are computed from the theta that has learned from it. Cost per sample: O(n + K (m + 1)) with K the largest order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.kernel import Array, Step
+from driftfit.engine.settings import input_names, whole
+from driftfit.models.base import Model
+from driftfit.models.polynomial_steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
+
+
+@dataclass(frozen=True)
+class PolynomialModel(Model):
+    """A(z) y = sum_j B_j(z) / F_j(z) u_j + C(z) / D(z) e, the general transfer function with one output.
+
+    `ARMAX`, `OE` and `BoxJenkins` are its best-known cases.
+
+    Parameters
+    ----------
+    na, nc, nd : int
+        Orders of A, C and D.
+    nb, nf, nk : int, or one per input
+        Lags of each input, order of its F, and its delay in samples (0 uses the present input).
+    inputs : int, names, or None
+        How many inputs, or their names. None: as many as ``nb``, ``nf`` or ``nk`` have entries, else as many as u has
+        columns.
+    offset : bool
+        Add the constant c as the last parameter.
+
+    Raises
+    ------
+    ValueError
+        If an order is negative, the numbers of inputs disagree, or there is nothing to estimate.
+    """
+
+    na: int = 0
+    nb: int | tuple[int, ...] = 1
+    nc: int = 0
+    nd: int = 0
+    nf: int | tuple[int, ...] = 0
+    nk: int | tuple[int, ...] = 1
+    inputs: int | tuple[str, ...] | None = None
+    offset: bool = False
+
+    def __post_init__(self) -> None:
+        kind, counts = type(self).__name__, set()
+        for name in ("na", "nc", "nd"):
+            self._set(name, whole(kind, name, getattr(self, name), 0))
+        for name in ("nb", "nf", "nk"):
+            value = getattr(self, name)
+            if isinstance(value, Sequence | np.ndarray):
+                self._set(name, tuple(whole(kind, name, one, 0) for one in value))
+                counts.add(len(value))
+            else:
+                self._set(name, whole(kind, name, value, 0))
+        if isinstance(self.inputs, str):
+            self._set("inputs", (self.inputs,))
+        elif isinstance(self.inputs, int | np.integer):
+            self._set("inputs", whole(kind, "inputs", self.inputs, 0))
+        elif self.inputs is not None:
+            self._set("inputs", input_names(kind, "inputs", self.inputs))
+        elif len(counts) == 1:
+            self._set("inputs", next(iter(counts)))
+        elif self.nb == 0 and not counts:
+            self._set("inputs", 0)
+        given = self.inputs if isinstance(self.inputs, int) or self.inputs is None else len(self.inputs)
+        if len(counts | ({given} if given is not None else set())) > 1:
+            raise ValueError(
+                f"{kind}: nb={self.nb!r}, nf={self.nf!r}, nk={self.nk!r} and inputs={self.inputs!r} imply different "
+                "numbers of inputs."
+            )
+        if self.inputs is not None and self.n == 0:
+            raise ValueError(f"{kind}: there is nothing to estimate; give an order of at least 1.")
+
+    def bind(self, inputs: int | Sequence[str]) -> PolynomialModel:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if self.inputs is None:
+            if count == 0:
+                raise ValueError(f"{type(self).__name__}: nb={self.nb!r} needs an input, but there is no u; give nb=0.")
+        elif count != self.m:
+            raise ValueError(
+                f"{type(self).__name__}: the model has {self.m} inputs (nb={self.nb!r}, inputs={self.inputs!r}), "
+                f"but u has {count} columns."
+            )
+        elif isinstance(inputs, int) or not isinstance(self.inputs, int):
+            return self
+        return replace(self, inputs=inputs if isinstance(inputs, int) else tuple(inputs))
+
+    @property
+    def m(self) -> int:
+        return 1 if self.inputs is None else self.inputs if isinstance(self.inputs, int) else len(self.inputs)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.inputs if isinstance(self.inputs, tuple) else ()
+
+    @property
+    def orders(self) -> tuple[tuple[int, int, int], ...]:
+        """(nb, nf, nk) of every input."""
+        each = (one if isinstance(one, tuple) else (one,) * self.m for one in (self.nb, self.nf, self.nk))
+        return tuple(zip(*each, strict=True))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        inputs = self.input_names or tuple(f"u{j + 1}" if self.m > 1 else "" for j in range(self.m))
+        names = [f"a{i + 1}" for i in range(self.na)]
+        names += [_named("b", i, u) for u, (nb, _, _) in zip(inputs, self.orders, strict=True) for i in range(nb)]
+        names += [f"c{i + 1}" for i in range(self.nc)] + [f"d{i + 1}" for i in range(self.nd)]
+        names += [_named("f", i, u) for u, (_, nf, _) in zip(inputs, self.orders, strict=True) for i in range(nf)]
+        return (*names, "offset") if self.offset else tuple(names)
+
+    @property
+    def dimensions(self) -> tuple[tuple[int, int | None], ...]:
+        gains = [(1, j) for j, (nb, _, _) in enumerate(self.orders) for _ in range(nb)]
+        rest = self.nc + self.nd + sum(nf for _, nf, _ in self.orders)
+        return (*((0, None),) * self.na, *gains, *((0, None),) * rest, *([(1, None)] if self.offset else []))
+
+    @property
+    def recursive(self) -> bool:
+        return True
+
+    @property
+    def reach(self) -> int:
+        return self._depth - 1
+
+    @property
+    def _places(self) -> Places:
+        return places(self.na, self.nc, self.nd, self.orders, self.offset)
+
+    @property
+    def _depth(self) -> int:
+        """Samples of the past that are kept, the present one included."""
+        inputs = (max(nb + nk - 1, nf) for nb, nf, nk in self.orders)
+        return 1 + max(self.na, self.nc, self.nd, *inputs, 1)
+
+    def memory(self) -> Mapping[str, Any]:
+        past = np.zeros((OWN + EACH * self.m, self._depth))
+        past[[Y, *(OWN + EACH * j + U for j in range(self.m))]] = np.nan
+        return {
+            "signals": past,
+            "point": np.zeros(self.n),
+            "damped": np.zeros(self.n),
+            "recursion": np.zeros((2, self._depth)),
+            "last_input": np.zeros(max(self.m, 1)),
+            "shift": 0.0,
+            "measured": np.nan,
+            "without": 0.0,
+            "started": 0.0,
+            "usable": 0.0,
+        }
+
+    @property
+    def steps(self) -> ModelSteps:
+        return steps(self._places)
+
+    @property
+    def apply(self) -> Step | None:
+        late = all(nk > 0 for _, _, nk in self.orders)
+        return taking_inputs(self._places) if late else None
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """Response of C / (A D) to an impulse, (h,)."""
+        from scipy import signal  # this import takes a third of a second, and only forecasts need it
+
+        parts = self.parts(theta)
+        response: Array = signal.lfilter(parts["C"], np.convolve(parts["A"], parts["D"]), np.eye(1, h)[0])
+        return response
+
+    def parts(self, theta: Array) -> dict[str, Any]:
+        """The polynomials of one theta (n,) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
+
+        They have the signs of the equation, so that A = [1, -a_1, ..]; B begins with nk zeros.
+        """
+        theta = np.asarray(theta, dtype=float)
+        sizes = [self.na, *(nb for nb, _, _ in self.orders), self.nc, self.nd, *(nf for _, nf, _ in self.orders)]
+        cut = np.split(theta[: sum(sizes)], np.cumsum(sizes)[:-1])
+        b, (c, d), f = cut[1 : 1 + self.m], cut[1 + self.m : 3 + self.m], cut[3 + self.m :]
+        return {
+            "A": np.append(1.0, -cut[0]),
+            "B": [np.append(np.zeros(nk), one) for one, (_, _, nk) in zip(b, self.orders, strict=True)],
+            "C": np.append(1.0, c),
+            "D": np.append(1.0, -d),
+            "F": [np.append(1.0, -one) for one in f],
+        }
+
+
+def _named(letter: str, i: int, u: str) -> str:
+    return f"{letter}{i + 1}[{u}]" if u else f"{letter}{i + 1}"
+
+
+@dataclass(frozen=True, repr=False)
+class ARMAX(PolynomialModel):
+    """A(z) y = B(z) u + C(z) e: as `ARX`, in noise that is a moving average after A. See `PolynomialModel`."""
+
+    nd: int = field(default=0, init=False)
+    nf: int = field(default=0, init=False)
+    na: int = 1
+    nc: int = 1
+
+
+@dataclass(frozen=True, repr=False)
+class OE(PolynomialModel):
+    """y = B(z) / F(z) u + e, output error: a plant, and white noise of measurement. See `PolynomialModel`."""
+
+    na: int = field(default=0, init=False)
+    nc: int = field(default=0, init=False)
+    nd: int = field(default=0, init=False)
+    nf: int | tuple[int, ...] = 1
+
+
+@dataclass(frozen=True, repr=False)
+class BoxJenkins(PolynomialModel):
+    """y = B(z) / F(z) u + C(z) / D(z) e: plant and noise have models of their own. See `PolynomialModel`."""
+
+    na: int = field(default=0, init=False)
+    nc: int = 1
+    nd: int = 1
+    nf: int | tuple[int, ...] = 1

@@ -1,0 +1,360 @@
+"""The compiled steps of `driftfit.models.polynomial`: the signals behind a prediction, and its gradient.
+
+Each function makes the kernels for one set of orders, which are constants, so that every loop is unrolled.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import State, Step, kernel
+from driftfit.models.arx import GAP
+
+SETTLING = 4.0
+"""Samples for each parameter, at the start, that are a pseudolinear regression."""
+
+STABLE = 0.9999
+"""Largest reflection coefficient of a filter that is used."""
+
+CONTRACTION, CONTRACTIONS = 0.9, 20
+"""Factor of the zeros of C or F while it is unstable, and how often it is applied."""
+
+ROUNDING = 1e-10
+"""A residual below this share of its output is 0."""
+
+Y, YF, V, VF, E, EF, ONE, OWN = range(8)
+"""Rows of the past: the output and D/C of it, v and 1/C v, e and 1/C e, D/C 1; then EACH rows for every input."""
+U, HELD, G, UF, W, WF, EACH = range(7)
+"""Rows of an input: itself, itself or its last value, D/C and D/(C F) of that, its response w, D/(C F) of w."""
+
+
+class Places(NamedTuple):
+    """The orders, and where the coefficients of each polynomial begin in theta; tuples have an entry per input."""
+
+    na: int
+    nc: int
+    nd: int
+    m: int
+    nb: tuple[int, ...]
+    nf: tuple[int, ...]
+    nk: tuple[int, ...]
+    at_b: tuple[int, ...]
+    at_c: int
+    at_d: int
+    at_f: tuple[int, ...]
+    at_offset: int
+    """-1 if there is none."""
+    n: int
+
+
+def places(na: int, nc: int, nd: int, orders: tuple[tuple[int, int, int], ...], offset: bool) -> Places:
+    """The places for these orders; ``orders`` are (nb, nf, nk) of every input."""
+    # without inputs the loops over them never run, but Numba cannot type an empty tuple
+    nb, nf, nk = (tuple(one[i] for one in orders) or (0,) for i in range(3))
+    at_c = na + sum(nb)
+    at_f = at_c + nc + nd
+    last = at_f + sum(nf)
+    return Places(
+        na, nc, nd, len(orders), nb, nf, nk, tuple(na + sum(nb[:j]) for j in range(len(nb))), at_c, at_c + nc,
+        tuple(at_f + sum(nf[:j]) for j in range(len(nf))), last if offset else -1, last + offset,
+    )  # fmt: skip
+
+
+@kernel
+def stable(s: State, first: int, order: int, sign: float, l: int) -> bool:
+    """Whether 1 + sum_i sign x_i z^-i is, x from s.point[first]: all reflection coefficients are inside (-1, 1)."""
+    inside = True
+    for i in range(order):
+        s.recursion[0, i, l] = sign * s.point[first + i, l]
+    for k in range(order - 1, -1, -1):
+        r = s.recursion[0, k, l]
+        inside = inside & (abs(r) < STABLE)
+        scale = 1.0 / (1.0 - r * r) if inside else 0.0
+        for i in range(k):
+            s.recursion[1, i, l] = (s.recursion[0, i, l] - r * s.recursion[0, k - 1 - i, l]) * scale
+        for i in range(k):
+            s.recursion[0, i, l] = s.recursion[1, i, l]
+    return inside
+
+
+@kernel
+def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
+    """s.point is theta in the coefficients of a polynomial, its zeros drawn towards 0 until it is stable."""
+    for i in range(order):
+        s.point[first + i, l] = s.theta[first + i, l]
+    for _ in range(CONTRACTIONS):
+        if not stable(s, first, order, sign, l):
+            scale = CONTRACTION
+            for i in range(order):
+                s.point[first + i, l] *= scale
+                scale *= CONTRACTION
+    if not stable(s, first, order, sign, l):
+        for i in range(order):
+            s.point[first + i, l] = 0.0
+
+
+@lru_cache
+def _filters(p: Places) -> tuple[Any, Any]:
+    """D/C and 1/C of the present sample of a row: ``colour(s, raw, filtered, l)`` returns it, ``whiten`` stores it."""
+    nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
+
+    @kernel
+    def colour(s: State, raw: int, filtered: int, l: int) -> float:
+        x = s.signals[raw, 0, l]
+        for i in range(nd):
+            x -= s.point[at_d + i, l] * s.signals[raw, i + 1, l]
+        for i in range(nc):
+            x -= s.damped[at_c + i, l] * s.signals[filtered, i + 1, l]
+        return x  # type: ignore[no-any-return]
+
+    @kernel
+    def whiten(s: State, raw: int, filtered: int, l: int) -> None:
+        x = s.signals[raw, 0, l]
+        for i in range(nc):
+            x -= s.damped[at_c + i, l] * s.signals[filtered, i + 1, l]
+        s.signals[filtered, 0, l] = x
+
+    return colour, whiten
+
+
+@lru_cache
+def _point(p: Places) -> Any:
+    """The point of the linearisation: theta, where C and F are stable."""
+    n, at_c, at_d, at_f, nc, nf, m = p.n, p.at_c, p.at_d, p.at_f, p.nc, p.nf, p.m
+    past_f = at_f[0] + sum(nf)
+
+    @kernel
+    def linearise(s: State, l: int) -> None:
+        for i in range(n):
+            if (i < at_c) | ((i >= at_d) & (i < at_f[0])) | (i >= past_f):
+                s.point[i, l] = s.theta[i, l]
+        if nc > 0:
+            contract(s, at_c, nc, 1.0, l)
+        for j in range(m):
+            if nf[j] > 0:
+                contract(s, at_f[j], nf[j], -1.0, l)
+        # the filters of the gradient reach their full length in the course of time
+        inner = 1.0 - 1.0 / max(s.usable[l] / (SETTLING * n), 1.0)
+        scale = inner
+        for i in range(nc):
+            s.damped[at_c + i, l] = scale * s.point[at_c + i, l]
+            scale *= inner
+        for j in range(m):
+            scale = inner
+            for i in range(nf[j]):
+                s.damped[at_f[j] + i, l] = scale * s.point[at_f[j] + i, l]
+                scale *= inner
+
+    step: Step = linearise
+    return step
+
+
+@lru_cache
+def taking_inputs(p: Places) -> Step:
+    """The step that takes the inputs of the present sample, and filters them."""
+    m, nf, at_f = p.m, p.nf, p.at_f
+    colour, _ = _filters(p)
+
+    @kernel
+    def take_inputs(s: State, l: int) -> None:
+        for j in range(m):
+            own, u = OWN + EACH * j, s.u[j, l]
+            known = abs(u) < LARGEST
+            s.signals[own + U, 0, l] = u if known else np.nan
+            s.last_input[j, l] = u if known else s.last_input[j, l]
+            s.signals[own + HELD, 0, l] = s.last_input[j, l]
+            s.signals[own + G, 0, l] = colour(s, own + HELD, own + G, l)
+            x = s.signals[own + G, 0, l]
+            for i in range(nf[j]):
+                x += s.damped[at_f[j] + i, l] * s.signals[own + UF, i + 1, l]
+            s.signals[own + UF, 0, l] = x
+
+    step: Step = take_inputs
+    return step
+
+
+@lru_cache
+def _responses(p: Places) -> Any:
+    """``respond(s, filtered, l)`` stores the present w of every input, with ``filtered`` D/(C F) of it too."""
+    m, nb, nf, nk, at_b, at_f = p.m, p.nb, p.nf, p.nk, p.at_b, p.at_f
+
+    @kernel
+    def respond(s: State, filtered: bool, l: int) -> float:
+        total = 0.0
+        for j in range(m):
+            w, wf, own = 0.0, 0.0, OWN + EACH * j
+            for i in range(nb[j]):
+                b = s.point[at_b[j] + i, l]
+                w += b * s.signals[own + HELD, nk[j] + i, l]
+                wf += b * s.signals[own + UF, nk[j] + i, l]
+            for i in range(nf[j]):
+                w += s.point[at_f[j] + i, l] * s.signals[own + W, i + 1, l]
+                wf += s.damped[at_f[j] + i, l] * s.signals[own + WF, i + 1, l]
+            s.signals[own + W, 0, l] = w
+            s.signals[own + WF, 0, l] = wf if filtered else s.signals[own + WF, 0, l]
+            total += w
+        return total
+
+    step: Step = respond
+    return step
+
+
+@lru_cache
+def _predictions(p: Places) -> tuple[Any, Any]:
+    """``predict(s, filtered, l)``: y_hat at s.point; ``noise(s, l)``: the part of it that earlier noise explains."""
+    na, nc, nd, at_c, at_d, at_offset = p.na, p.nc, p.nd, p.at_c, p.at_d, p.at_offset
+    respond = _responses(p)
+
+    @kernel
+    def noise(s: State, l: int) -> float:
+        total = 0.0
+        for i in range(nc):
+            total += s.point[at_c + i, l] * s.signals[E, i + 1, l]
+        for i in range(nd):
+            total += s.point[at_d + i, l] * s.signals[V, i + 1, l]
+        return total
+
+    @kernel
+    def predict(s: State, filtered: bool, l: int) -> float:
+        y_hat = respond(s, filtered, l) + noise(s, l)
+        for i in range(na):
+            lag = s.signals[Y, i + 1, l]
+            y_hat += s.point[i, l] * (lag if abs(lag) < LARGEST else 0.0)
+        if at_offset >= 0:
+            y_hat += s.point[at_offset, l]
+        return y_hat  # type: ignore[no-any-return]
+
+    return predict, noise
+
+
+@lru_cache
+def _gradient(p: Places) -> Any:
+    """s.phi: the gradient of y_hat, or at the start the regression vector."""
+    na, nc, nd, m, nb, nf, nk = p.na, p.nc, p.nd, p.m, p.nb, p.nf, p.nk
+    at_b, at_c, at_d, at_f, at_offset, n = p.at_b, p.at_c, p.at_d, p.at_f, p.at_offset, p.n
+
+    @kernel
+    def gradient(s: State, l: int) -> None:
+        settled = s.usable[l] >= SETTLING * n
+        for i in range(na):
+            lag = s.signals[YF, i + 1, l] if settled else s.signals[Y, i + 1, l]
+            s.phi[i, l] = lag if abs(s.signals[Y, i + 1, l]) < LARGEST else np.nan
+        for j in range(m):
+            own = OWN + EACH * j
+            for i in range(nb[j]):
+                at = nk[j] + i
+                lag = s.signals[own + UF, at, l] if settled else s.signals[own + U, at, l]
+                s.phi[at_b[j] + i, l] = lag if abs(s.signals[own + U, at, l]) < LARGEST else np.nan
+            for i in range(nf[j]):
+                s.phi[at_f[j] + i, l] = s.signals[own + WF, i + 1, l] if settled else s.signals[own + W, i + 1, l]
+        for i in range(nc):
+            s.phi[at_c + i, l] = s.signals[EF, i + 1, l] if settled else s.signals[E, i + 1, l]
+        for i in range(nd):
+            s.phi[at_d + i, l] = s.signals[VF, i + 1, l] if settled else s.signals[V, i + 1, l]
+        if at_offset >= 0:
+            one = 1.0
+            for i in range(nd):
+                one -= s.point[at_d + i, l]
+            for i in range(nc):
+                one -= s.damped[at_c + i, l] * s.signals[ONE, i + 1, l]
+            s.signals[ONE, 0, l] = one
+            s.phi[at_offset, l] = one if settled else 1.0
+
+    step: Step = gradient
+    return step
+
+
+@lru_cache
+def _regress(p: Places) -> Any:
+    n, m = p.n, p.m
+    linearise, take_inputs, gradient, (predict, _) = _point(p), taking_inputs(p), _gradient(p), _predictions(p)
+
+    @kernel
+    def age(s: State, l: int) -> None:
+        """Every signal moves by one sample; a gap in time breaks the lags."""
+        broken = s.dt[l] > GAP
+        for r in range(s.signals.shape[0]):
+            for i in range(s.signals.shape[1] - 1, 0, -1):
+                s.signals[r, i, l] = s.signals[r, i - 1, l]
+        for i in range(1, s.signals.shape[1]):
+            s.signals[Y, i, l] = np.nan if broken else s.signals[Y, i, l]
+            for j in range(m):
+                s.signals[OWN + EACH * j + U, i, l] = np.nan if broken else s.signals[OWN + EACH * j + U, i, l]
+            for r in (V, VF, E, EF):
+                s.signals[r, i, l] = 0.0 if broken else s.signals[r, i, l]
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        age(s, l)
+        linearise(s, l)
+        take_inputs(s, l)
+        y_hat = predict(s, True, l)
+        gradient(s, l)
+        along, complete = 0.0, 1.0
+        for i in range(n):
+            complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
+            along += s.phi[i, l] * s.point[i, l]
+        known = (s.usable[l] >= SETTLING * n) & (abs(y_hat - along) < LARGEST)
+        s.shift[l] = y_hat - along if known else 0.0
+        s.measured[l] = s.y[l]
+        s.y[l] -= s.shift[l]
+        s.started[l] = 1.0 if complete > 0.0 else s.started[l]
+        s.dt[l] = s.dt[l] if s.started[l] > 0.0 else 0.0
+
+    step: Step = regress
+    return step
+
+
+@lru_cache
+def _push(p: Places) -> Any:
+    na, n = p.na, p.n
+    at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
+    linearise, (predict, noise), (colour, whiten) = _point(p), _predictions(p), _filters(p)
+
+    @kernel
+    def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
+        s.signals[Y, 0, l], s.signals[V, 0, l], s.signals[E, 0, l] = y, v, e
+        whiten(s, E, EF, l)
+        whiten(s, V, VF, l)
+        filtered = colour(s, Y, YF, l)
+        s.signals[YF, 0, l] = filtered if abs(filtered) < LARGEST else y
+        s.signals[Y, 0, l] = y if known else np.nan
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        seen = s.seen[l] > 0.0
+        informed = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))
+        # w and e of this sample are those of the theta that has learned from it
+        linearise(s, l)
+        fitted = predict(s, False, l)
+        e = s.measured[l] - fitted if seen & informed else 0.0
+        # what is left of an interpolated sample is rounding, and no regressor
+        e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
+        begun = s.usable[l] >= 0.5 * SETTLING * n
+        v = e + noise(s, l) if begun else 0.0
+        s.y_hat[l] += s.shift[l]
+        y = s.measured[l] if seen else s.y_hat[l]
+        y = y if abs(y) < LARGEST else 0.0
+        known = seen | (informed & ((na == 0) | (s.without[l] < na)))
+        s.without[l] = 0.0 if seen else s.without[l] + 1.0
+        remember(s, y, known, v, e if begun else 0.0, l)
+        s.usable[l] += s.ok[l]
+        if (first_f > 0) & (s.usable[l] < SETTLING * n):
+            w = y
+            for i in range(na):
+                w -= s.theta[i, l] * s.signals[Y, i + 1, l]
+            w -= s.theta[at_offset, l] if at_offset >= 0 else 0.0
+            s.signals[OWN + W, 0, l] = w if abs(w) < LARGEST else s.signals[OWN + W, 0, l]
+
+    step: Step = push
+    return step
+
+
+@lru_cache
+def steps(p: Places) -> ModelSteps:
+    """The compiled steps of a model with these orders."""
+    return ModelSteps(_regress(p), _push(p))

@@ -1,0 +1,72 @@
+"""Columns that come alive late, against filters of sixty digits that begin with a prior of 1e30."""
+
+import math
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+
+from driftfit import FLS, RLS, Kalman, Regression, track
+
+T, N, ALIVE = 45, 2, 25
+LARGE = Decimal(10) ** 20
+
+
+def twin(y, u, q, r, lam, first=True):
+    """theta, std and log density of every sample; variances that are next to infinite are. r=None: estimated."""
+    exact = np.vectorize(Decimal, otypes=[object])
+    theta, P, unit = exact(np.zeros(N)), exact(np.eye(N)) * Decimal(10) ** 30, exact(np.eye(N))
+    squares, count, paths = Decimal(0), 0, []
+    for t, (reading, phi) in enumerate(zip(exact(y), exact(u), strict=True)):
+        P = P / Decimal(lam) + (unit * Decimal(q) if t or first else 0)
+        g, log_p = P @ phi, math.nan
+        s, e = phi @ g + Decimal(r or 1), reading - phi @ theta
+        if s < LARGE:
+            far = float(e * e / s)
+            if r is not None:
+                log_p = -0.5 * (math.log(2.0 * math.pi * float(s)) + far)
+            elif count:
+                wide = math.log(math.pi * float(squares * s)) + (count + 1) * math.log1p(far / float(squares))
+                log_p = math.lgamma((count + 1) / 2) - math.lgamma(count / 2) - 0.5 * wide
+            squares, count = squares + e * e / s, count + 1
+        theta, P = theta + g * (e / s), P - np.outer(g, g) / s
+        scale = Decimal(1) if r is not None else squares / max(count, 1)
+        std = [math.sqrt(x * scale) if x < LARGE else math.inf for x in P.diagonal()]
+        paths.append((theta.astype(float), std, log_p))
+    return (np.array(part) for part in zip(*paths, strict=True))
+
+
+TRACKERS = {
+    "Kalman": (Kalman(q=0.01, r=0.5), (0.01, 0.5, 1.0)), "RLS": (RLS(0.95), (0.0, None, 0.95)),
+    "Kalman, sqrt": (Kalman(q=0.01, r=0.5, form="sqrt"), (0.01, 0.5, 1.0)),
+    "FLS": (FLS(20.0), (0.05, None, 1.0, False)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("tracker", "numbers"), TRACKERS.values(), ids=TRACKERS)
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_a_column_that_comes_alive_late_is_that_of_a_wide_prior(tracker, numbers, unit):
+    rng = np.random.default_rng(1)
+    u = rng.standard_normal((T, N))
+    u[:ALIVE, 1] = 0.0
+    y = u @ [1.0, -2.0] + 0.7 * rng.standard_normal(T)
+    run = track(Regression(N), tracker, y, u * [1.0, unit])
+    if unit != 1.0 and isinstance(tracker, Kalman | FLS):
+        tracker = type(tracker)(**{**tracker.settings(), **drift(tracker, unit)})
+        run = track(Regression(N), tracker, y, u * [1.0, unit])
+    with localcontext() as context:
+        context.prec = 60
+        theta, std, log_p = twin(y, u, *numbers)
+    scales = np.array([1.0, unit])
+    assert np.isinf(run.std[:ALIVE, 1]).all()
+    later = slice(2, None)  # the scale is known from the second sample on
+    np.testing.assert_allclose(run.theta * scales, theta, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(run.std[later] * scales, std[later], rtol=1e-9)
+    np.testing.assert_allclose(run.log_density[later], log_p[later], rtol=1e-9, atol=1e-11)
+    assert np.isnan(run.log_density[ALIVE])
+
+
+def drift(tracker, unit):
+    """The setting of the same drift where the second column is in another unit."""
+    factors = np.array([1.0, unit])
+    return {"q": tuple(0.01 / factors**2)} if isinstance(tracker, Kalman) else {"mu": tuple(20.0 * factors**2)}

@@ -1,0 +1,182 @@
+"""Transfer functions in coloured noise: innovations, gradients, a slow twin, bias and coverage."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
+from driftfit.checks import check_model
+from driftfit.models.polynomial_steps import SETTLING
+from driftfit.run.program import Program
+from driftfit.smooth.problem import replay
+
+BJ = BoxJenkins(2, 1, 1, 2, offset=True)
+THETA = np.array([1.0, 0.5, 0.5, 0.9, 1.5, -0.7, 3.0])
+
+
+def plant(theta, T, seed, noise=0.5):
+    """y, u, e of BJ at theta, from rest."""
+    b1, b2, c, d, f1, f2, offset = theta
+    rng = np.random.default_rng(seed)
+    u, e = rng.normal(size=T), noise * rng.normal(size=T)
+    response = signal.lfilter([0.0, b1, b2], [1.0, -f1, -f2], u)
+    return response + offset + signal.lfilter([1.0, c], [1.0, -d], e), u, e
+
+
+def held(model, theta, y, u):
+    """The run with theta held constant."""
+    return track(model, Kalman(q=0.0, r=1.0, p0=1e-20, theta0=tuple(theta)), y, u)
+
+
+def test_the_innovations_at_the_true_parameters_are_the_noise():
+    y, u, e = plant(THETA, 2000, 0)
+    run = held(BJ, THETA, y, u)
+    np.testing.assert_allclose(run.innovation[500:], e[500:], atol=1e-9)
+    np.testing.assert_allclose(run.prediction[500:], (y - e)[500:], atol=1e-9)
+
+
+def test_the_regressors_are_the_gradient_of_the_prediction():
+    """Up to the damping of their filters, which is 1 - SETTLING n / N after N samples."""
+    y, u, _ = plant(THETA, 12_000, 1)
+    phi, step = replay(held(BJ, THETA, y, u))["phi"][..., 0], 1e-5
+    for i, name in enumerate(BJ.names):
+        away = step * np.eye(BJ.n)[i]
+        up, down = (held(BJ, THETA + sign * away, y, u).prediction[11_000:] for sign in (1.0, -1.0))
+        error = phi[11_000:, i] - (up - down) / (2.0 * step)
+        assert np.sqrt(np.mean(error**2)) < 0.03 * np.sqrt(np.mean(phi[11_000:, i] ** 2)), name
+
+
+def twin(y, u, p0, forgetting):
+    """theta of ARMAX(1, 1, 1) under RLS, written from the equations."""
+    n = 3
+    theta, P, usable = np.zeros(n), p0 * np.eye(n), 0
+    old = {name: 0.0 for name in ("y", "u", "e", "yf", "uf", "ef")}
+    rows = []
+    for t in range(len(y)):
+        c = theta[2]
+        while abs(c) >= 0.9999:
+            c *= 0.9
+        inner = 1.0 - 1.0 / max(usable / (SETTLING * n), 1.0)
+        uf = u[t] - inner * c * old["uf"]
+        phi = np.array([old["y"], old["u"], old["e"]])
+        psi = np.array([old["yf"], old["uf"], old["ef"]]) if usable >= SETTLING * n else phi
+        if t > 0:
+            e = y[t] - phi @ theta
+            P = P / forgetting
+            k = P @ psi / (1.0 + psi @ P @ psi)
+            theta, P = theta + k * e, P - np.outer(k, psi @ P)
+        c = theta[2]
+        while abs(c) >= 0.9999:
+            c *= 0.9
+        late = y[t] - phi @ np.array([*theta[:2], c]) if usable >= 0.5 * SETTLING * n else 0.0
+        yf, ef = y[t] - inner * c * old["yf"], late - inner * c * old["ef"]
+        old = {"y": y[t], "u": u[t], "e": late, "yf": yf, "uf": uf, "ef": ef}
+        usable += t > 0
+        rows.append(theta)
+    return np.array(rows)
+
+
+def armax_record(T, seed, c=0.7):
+    rng = np.random.default_rng(seed)
+    u, e = rng.normal(size=T), 0.3 * rng.normal(size=T)
+    y = signal.lfilter([0.0, 1.0], [1.0, -0.8], u) + signal.lfilter([1.0, c], [1.0, -0.8], e)
+    return y, u
+
+
+def test_recursive_maximum_likelihood_is_its_slow_twin():
+    """While C is stable, which it is here, the prediction is linear at theta itself."""
+    y, u = armax_record(600, 2)
+    run = track(ARMAX(1), RLS(0.995, p0=100.0), y, u)
+    np.testing.assert_allclose(run.theta[1:], twin(y, u, 100.0, 0.995)[1:], rtol=1e-6, atol=1e-8)
+
+
+def test_no_bias_in_coloured_noise_and_bands_that_cover():
+    """Least squares in ARX is wrong by many of its deviations where the measurement is noisy."""
+    errors, inside, biased = [], [], []
+    for seed in range(40):
+        y, u, e = plant(THETA, 1000, 200 + seed)
+        run = track(BJ, AdaptiveKalman(), y, u)
+        errors.append((run.theta[-1] - THETA)[[0, 1, 4, 5]])
+        inside.append(np.abs(errors[-1]) < 1.96 * run.std[-1][[0, 1, 4, 5]])
+        noisy = signal.lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], u) + e
+        least = track(ARX(2, 2), RLS(1.0), noisy, u)
+        biased.append(abs(least.theta[-1][0] - 1.5) / least.std[-1][0])
+    assert np.abs(np.median(errors, axis=0)).max() < 0.01
+    assert np.mean(inside) >= 0.93
+    assert np.median(biased) > 5.0
+
+
+def test_a_gain_that_jumps_is_followed():
+    rng = np.random.default_rng(3)
+    T = 2000
+    u = rng.normal(size=T)
+    gain = np.where(np.arange(T) < 1000, 1.0, 1.6)
+    y = signal.lfilter([1.0], [1.0, -0.8], np.r_[0.0, (gain * u)[:-1]]) + 0.2 * rng.normal(size=T)
+    run = track(OE(1, 1), AdaptiveKalman(), y, u)
+    for t, b in ((999, 1.0), (1199, 1.6), (1999, 1.6)):
+        assert abs(run.theta[t, 0] - b) < min(0.15, 4.0 * run.std[t, 0])
+        assert abs(run.theta[t, 1] - 0.8) < 0.05
+
+
+def test_missing_data_and_gaps_do_no_harm():
+    y, u, _ = plant(THETA, 1500, 4)
+    rng = np.random.default_rng(5)
+    y[rng.random(1500) < 0.1], u[rng.random(1500) < 0.05] = np.nan, np.nan
+    y[700:760] = np.nan
+    time = np.arange(1500.0) + np.where(np.arange(1500) >= 900, 50.0, 0.0)
+    run = track(BJ, AdaptiveKalman(), y, u, time=time)
+    assert np.isfinite(run.theta[100:]).all()
+    assert np.abs(run.theta[-1] - THETA)[[0, 1, 4, 5]].max() < 0.25
+
+
+def test_the_forecast_of_coloured_noise_decays():
+    y, u, _ = plant(THETA, 1000, 6)
+    live = Live(BJ, Kalman(q=0.0, r=0.25, p0=1e-20, theta0=tuple(THETA)))
+    for t in range(1000):
+        live.update(y[t], u[t])
+    future = np.random.default_rng(7).normal(size=30)
+    forecast = live.forecast(30, future)
+    whole_u = np.r_[u, future]
+    quiet = signal.lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], whole_u)[1000:] + 3.0
+    e = held(BJ, THETA, y, u).innovation[-1]
+    noise = y[-1] - signal.lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], u)[-1] - 3.0
+    expected = quiet + (0.9 * noise + 0.5 * e) * 0.9 ** np.arange(30)
+    np.testing.assert_allclose(forecast.y_hat, expected, atol=1e-8)
+    response = np.r_[1.0, (0.9 + 0.5) * 0.9 ** np.arange(29)]
+    np.testing.assert_allclose(forecast.y_std, 0.5 * np.sqrt(np.cumsum(response**2)), rtol=1e-6)
+
+
+def test_the_promises_of_a_model():
+    assert check_model(BJ, THETA) == []
+
+
+def test_orders_and_names():
+    assert BoxJenkins([1, 2], 1, 1, [1, 0], [1, 2]).names == ("b1[u1]", "b1[u2]", "b2[u2]", "c1", "d1", "f1[u1]")
+    assert ARMAX(2, 1, 1, inputs=["heat"]).names == ("a1", "a2", "b1[heat]", "c1")
+    assert OE(1, 2, offset=True).bind(1).dimensions == ((1, 0), (0, None), (0, None), (1, None))
+    parts = BJ.parts(THETA)
+    assert [parts[name].tolist() for name in "ACD"] == [[1.0], [1.0, 0.5], [1.0, -0.9]]
+    assert parts["B"][0].tolist() == [0.0, 1.0, 0.5]
+    assert parts["F"][0].tolist() == [1.0, -1.5, 0.7]
+    with pytest.raises(ValueError, match="different numbers of inputs"):
+        OE([1, 1], [1, 1, 1])
+    with pytest.raises(ValueError, match="needs an input"):
+        OE(1, 1).bind(0)
+    with pytest.raises(ValueError, match="nothing to estimate"):
+        OE(0, 0)
+
+
+def test_instruments_are_for_lags_that_are_outputs():
+    with pytest.raises(ValueError, match="does not say which of its regressors"):
+        track(ARMAX(1), InstrumentalVariables(0.99), *armax_record(50, 8))
+
+
+def test_a_field_of_two_owners_is_refused():
+    """State of model and tracker is one record, in which a name means one thing."""
+
+    class Careless(RLS):
+        def state(self, n):
+            return {**super().state(n), "signals": 0.0}
+
+    with pytest.raises(ValueError, match="both have a field signals"):
+        Program(ARMAX(1).bind(1), Careless(0.99)).tile()
