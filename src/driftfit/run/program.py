@@ -209,12 +209,18 @@ def _copy(results: Array, out: Array) -> None:
         out.view(out.dtype[names[0]].base).reshape(T, -1)[...] = results.view(np.float64).reshape(T, -1)
         return
     for name in names:
-        into, given = out[name].reshape(T, -1), results[name].reshape(T, -1)
-        if into.shape[1] >= SHORT:
-            into[...] = given
-            continue
-        for k in range(into.shape[1]):
-            into[:, k] = given[:, k]
+        put_columns(results[name], out[name])
+
+
+def put_columns(given: Array, into: Array) -> None:
+    """Copy (T, ..), whose rows may be short and far apart."""
+    T = len(into)
+    given, into = given.reshape(T, -1), into.reshape(T, -1)
+    if into.shape[1] >= SHORT:
+        into[...] = given
+        return
+    for k in range(into.shape[1]):
+        into[:, k] = given[:, k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
