@@ -1,8 +1,9 @@
 """Time and accuracy beside river's linear models, in its own `evaluate.progressive_val_score`.
 
-Every model predicts each sample and then learns it, behind river's StandardScaler. Microseconds per sample
-are processor time, the least of repeated runs after one that compiles; they contain the scaler, the metric and the
-dictionaries, which are printed as "nothing learned". The error is the root mean square over the whole stream, the start included.
+Every model predicts each sample and then learns it, behind river's StandardScaler. Microseconds per sample are
+processor time, the least of repeated runs after one that compiles; they contain the scaler, the metric and the
+dictionaries, which are printed as "nothing learned". The error is the root mean square over the whole stream, the start
+included.
 
     approval    river's TrumpApproval: 1001 days, six pollsters
     walk k      k coefficients that are random walks, noise 0.5, 4000 samples, simulated

@@ -425,3 +425,26 @@ def test_resumed_runs_and_structures_are_judged_by_the_density_of_the_mixture(tr
         square = (run.innovation / run.innovation_std) ** 2
         gaussian = -0.5 * (np.log(2.0 * np.pi * run.innovation_std**2) + square)[said.judged].sum()
         assert abs(gaussian - total) > 1.0
+
+
+@pytest.mark.parametrize("tracker", [RLS(1.0), RLS(0.98), FLS(300.0)], ids=repr)
+@pytest.mark.parametrize(("quantum", "held"), [(1.0, 400), (1.0, 20), (2.0, 20), (2.0, 1)])
+def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(tracker, quantum, held):
+    """The variance of what readings share does not shrink with their number; without it 0.3 to 0.9 of them cover."""
+    inside = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        x = np.ones(400) if held == 400 else 1.0 + 0.5 * np.repeat(rng.normal(size=400 // held), held)
+        theta = 5.0 * rng.random()
+        run = track(Regression(1), tracker, quantum * np.round((theta * x + 0.3 * rng.normal(size=400)) / quantum), x)
+        if np.isfinite(run.std[-1, 0]):
+            inside.append(abs(run.theta[-1, 0] - theta) <= 1.96 * run.std[-1, 0])
+    assert len(inside) >= 38
+    assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 40)
+
+
+def test_a_fine_meter_shares_no_error_of_rounding():
+    rng = np.random.default_rng(0)
+    run = track(Regression(1), RLS(1.0), 3.0 + 0.3 * rng.normal(size=400), np.ones(400))
+    assert run.std[-1, 0] == pytest.approx(np.sqrt(run.state["scale"] / 400.0), rel=1e-9)
+    assert run.state["fold"] == 1.0

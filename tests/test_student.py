@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from driftfit import FLS, RLS, AdaptiveKalman, Bank, Change, InstrumentalVariables, Regression, Sensor, track
-from driftfit.trackers.parts.student import log_student
+from driftfit.trackers.student import log_student
 
 N = 2
 """Parameters; Regression(2) is compiled for all trackers by other tests too."""

@@ -32,7 +32,7 @@ from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.results import Track
-from driftfit.run.conformal import ConformalFactor
+from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.piecewise import piecewise

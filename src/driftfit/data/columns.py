@@ -112,9 +112,40 @@ def times_of_column(series: nw.Series[Any], where: str, base: int) -> tuple[Arra
     return np.asarray(series.to_numpy()), None if zone is None else zone_name(zone)
 
 
+DAY_FIRST = r"^(\d{1,2})([./-])(\d{1,2})[./-](\d{4})(?:[ T]+(\d{1,2}:\d{2}(?::\d{2}(?:\.\d+)?)?))?$"
+"""31.1.2024, 31/01/2024 12:00, 1/31/2024: day, separator, month (or the reverse), year, time of day."""
+
+
+def _year_first(text: pl.Series, where: str) -> pl.Series:
+    """Dates that end with the year as 2024-01-31; other columns as they are.
+
+    With dots the day is first. With another separator a number above 12 tells which of the two it is; ValueError if
+    there is none.
+    """
+    known = text.drop_nulls()
+    if not len(known) or not known.str.contains(DAY_FIRST).all():
+        return text
+    first, second = (text.str.extract(DAY_FIRST, k).cast(pl.Int64) for k in (1, 3))
+    dots = bool((known.str.extract(DAY_FIRST, 2) == ".").all())
+    if not dots and not (first > 12).any() and not (second > 12).any():
+        raise ValueError(
+            f"{where}: the dates of column {text.name!r}, such as {known[0]!r}, may have the day or the month first, "
+            "and none of them tells which; write them as 2024-01-31."
+        )
+    day, month = (first, second) if dots or (first > 12).any() else (second, first)
+    parts = pl.DataFrame({
+        "year": text.str.extract(DAY_FIRST, 4), "month": month.cast(pl.String).str.zfill(2),
+        "day": day.cast(pl.String).str.zfill(2), "clock": text.str.extract(DAY_FIRST, 5).fill_null("00:00:00"),
+    })  # fmt: skip
+    parts = parts.with_columns(clock=pl.when(pl.col("clock").str.count_matches(":") == 1).then(pl.col("clock") + ":00")
+                               .otherwise(pl.col("clock")).str.replace(r"^(\d):", "0$1:"))  # fmt: skip
+    dates = parts.select(pl.format("{}-{}-{} {}", "year", "month", "day", "clock")).to_series()
+    return dates.alias(text.name).zip_with(text.is_not_null(), pl.Series([None], dtype=pl.String))
+
+
 def _dates_of_text(text: pl.Series, where: str, base: int) -> pl.Series:
     try:
-        dates = text.str.to_datetime(time_unit="us", strict=False)
+        dates = _year_first(text, where).str.to_datetime(time_unit="us", strict=False)
     except pl.exceptions.ComputeError:  # the first cells contain no date from which to infer the format
         dates = pl.Series(text.name, [None] * len(text), dtype=pl.Datetime("us"))
     wrong = (dates.is_null() & text.is_not_null()).arg_true()

@@ -1,8 +1,9 @@
 """Files: CSV and Parquet, one or many, read with polars.
 
 CSV is read as text, so that messages can name a cell that is not a number. Lines that begin with # are comments, and
-the header determines whether cells are separated by comma, semicolon or tab. If some of several files cannot be read,
-they are left out with a warning and kept with their reasons.
+the header determines whether cells are separated by comma, semicolon or tab. Where semicolons separate cells, numbers
+may have decimal commas, and dots between thousands. Text that is not UTF-8 is taken as Windows-1252. If some of several
+files cannot be read, they are left out with a warning and kept with their reasons.
 """
 
 from __future__ import annotations
@@ -116,10 +117,38 @@ def _csv(path: str, wanted: Wanted) -> tuple[list[str], pl.DataFrame]:
         header = next((line for line in file if not line.startswith("#")), "")
     separator = max(",;\t", key=header.count)
     options: dict[str, Any] = {"infer_schema": False, "comment_prefix": "#", "separator": separator}
+    options["encoding"] = _encoding(path)
     names = pl.read_csv(path, n_rows=0, **options).columns
     frame = pl.read_csv(path, columns=[name for name in names if name in wanted.names], **options)
+    if separator == ";":
+        frame = frame.with_columns(_with_points(frame[name]) for name in wanted.numbers if name in frame.columns)
     whole = frame.select(pl.col(name).str.strip_chars() for name in wanted.by if name in frame.columns)
     return names, frame.with_columns(_whole(column) for column in whole)
+
+
+def _encoding(path: str) -> str:
+    """That of the header and the first cells."""
+    with open(path, "rb") as file:
+        start = file.read(1 << 16)
+    try:
+        start[: start.rfind(b"\n") + 1 or None].decode("utf-8")
+    except UnicodeDecodeError:
+        return "windows-1252"
+    return "utf8"
+
+
+COMMA = r"^\s*[+-]?(\d+|\d{1,3}(\.\d{3})+)?(,\d*)?([eE][+-]?\d+)?\s*$"
+"""A number with a decimal comma, perhaps with dots between thousands."""
+
+
+def _with_points(text: pl.Series) -> pl.Series:
+    """A column whose numbers have decimal commas, with points; another one as it is."""
+    comma = text.str.contains(",", literal=True)
+    if not comma.any() or not text.filter(comma).str.contains(COMMA).all():
+        return text
+    if text.filter(~comma).str.contains(r"\.\d{0,2}$|\.\d{4,}").any():  # both kinds of numbers: leave it to the message
+        return text
+    return text.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
 
 
 def _whole(text: pl.Series) -> pl.Series:

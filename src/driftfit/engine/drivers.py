@@ -195,7 +195,7 @@ def as_compiled(tile: Array) -> Array:
 @lru_cache(maxsize=256)
 def _beginning(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """The type of a record up to the first entry of its open fields."""
-    fields = dtype.fields or {}
+    fields: Mapping[str, Any] = dtype.fields or {}
     (first, at, *_), names = fields[OPEN[0]], [name for name in fields if name not in OPEN]
     beginning = np.dtype(
         {"names": names, "formats": [dtype[name] for name in names],

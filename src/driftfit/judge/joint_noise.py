@@ -82,7 +82,7 @@ class JointNoise:
         S, nu = np.concatenate([np.zeros((1, ny, ny)), S]), np.concatenate([[0.0], nu])
         with np.errstate(invalid="ignore"):
             self.cov: Array = S[after] / nu[after, None, None]
-        before = after - whole
+        before: Array = after - whole
         d = np.where(before >= ny, keep * nu[before] - ny + 1.0, 0.0)
         self.log_density: Array = _log_density(z, q, keep * S[before], d)
 
@@ -121,7 +121,7 @@ class JointNoise:
             place = np.ix_(at, seen)
             rows_y[place] = np.linalg.solve(L, y[place].T).T
             rows_u[place] = np.linalg.solve(L, blocks[place])
-        names = [name for each in run.names for name in each]
+        names = tuple(name for each in run.names for name in each)
         return Regression(names, ny=ny, shared=True), rows_y, rows_u
 
 

@@ -78,7 +78,7 @@ class Equation(Model):
             self._set("inputs", formula.inputs)
         else:
             self._set("inputs", input_names("Equation", "inputs", self.inputs))
-        if absent := [name for name in formula.inputs if name not in self.inputs]:
+        if absent := [name for name in formula.inputs if name not in self.input_names]:
             raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
         given = self.start
         if isinstance(given, Sequence) and not isinstance(given, str) and all(len(one) == 2 for one in given):
@@ -186,7 +186,7 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
         good = abs(s.value[l]) < LARGEST
         for i in range(n):
             good = good & (abs(s.phi[i, l]) < LARGEST)
-        return good
+        return good  # type: ignore[no-any-return]
 
     @kernel
     def regress(s: State, l: int) -> None:

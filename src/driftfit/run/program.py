@@ -87,9 +87,15 @@ class Program:
     def start(self) -> State:
         """Fields of a lane before the first sample, other than those of the model."""
         if self.output is None:
-            return self.tracker.state_for(self.model)
+            return self.tracker_start
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory_for(self.steps.doubts), **self.tracker.state_for(own)}
+        return {**own.memory_for(self.steps.doubts), **self.tracker_start}
+
+    @cached_property
+    def tracker_start(self) -> State:
+        """The tracker's fields before the first sample."""
+        alone = None if self.output is None else self.alone
+        return self.tracker.state_for(self.model if alone is None else alone.model)
 
     @cached_property
     def steps(self) -> TrackerSteps:
@@ -203,12 +209,18 @@ def _copy(results: Array, out: Array) -> None:
         out.view(out.dtype[names[0]].base).reshape(T, -1)[...] = results.view(np.float64).reshape(T, -1)
         return
     for name in names:
-        into, given = out[name].reshape(T, -1), results[name].reshape(T, -1)
-        if into.shape[1] >= SHORT:
-            into[...] = given
-            continue
-        for k in range(into.shape[1]):
-            into[:, k] = given[:, k]
+        put_columns(results[name], out[name])
+
+
+def put_columns(given: Array, into: Array) -> None:
+    """Copy (T, ..), whose rows may be short and far apart."""
+    T = len(into)
+    given, into = given.reshape(T, -1), into.reshape(T, -1)
+    if into.shape[1] >= SHORT:
+        into[...] = given
+        return
+    for k in range(into.shape[1]):
+        into[:, k] = given[:, k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:
@@ -236,7 +248,7 @@ def _started(programs: Sequence[Program]) -> Array:
     starts = {one: one.start for one in programs}
     memory = model.memory_for(programs[0].steps.doubts)
     tracker = programs[0].tracker
-    if both := sorted((set(memory) & set(starts[programs[0]])) - set(tracker.replaces)):
+    if both := sorted((set(memory) & set(programs[0].tracker_start)) - set(tracker.replaces)):
         raise ValueError(
             f"{type(model).__name__} and {type(tracker).__name__} both have a field {', '.join(both)} in their state, "
             "which would be one and the same; rename it in one of them, or list it in the tracker's `replaces`."

@@ -15,12 +15,12 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
-from driftfit.run.conformal import quantile, widened
+from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
 from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.student import log_student, residuals_before
+from driftfit.trackers.student import log_student, residuals_before
 
 
 class Lane(NamedTuple):
@@ -223,7 +223,7 @@ class Track(Plain):
         """(T,): log density of each used sample given earlier ones, NaN where there is none.
 
         It is the Gaussian density of the forecast, -1/2 (log 2 pi s + e^2 / s), or Student's if the tracker estimates
-        the noise variance (`driftfit.trackers.parts.student`); for a tracker that weighs hypotheses it is that of their
+        the noise variance (`driftfit.trackers.student`); for a tracker that weighs hypotheses it is that of their
         mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
         s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))

@@ -13,7 +13,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps, output_type
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import lanes_of
+from driftfit.run.program import BLOCK, lanes_of, put_columns
 from driftfit.run.result import Track
 from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import NONE, Walk, free
@@ -51,16 +51,24 @@ def attentive(steps: TrackerSteps) -> TrackerSteps:
     return steps._replace(predict=noting, begin=noting_first, store=collect_all)
 
 
-def replay(run: Track) -> Array:
-    """Run the tracker over its record again and return the samples as it received them, (T,) records.
+def replay(run: Track) -> dict[str, Array]:
+    """Run the tracker over its record again and return the samples as it received them, field by field, (T, .., 1).
 
-    Their fields are phi, y, dt, valid, ok, used_noise (the factor of the noise variance) and more, each with a lane.
+    The fields are phi, y, dt, valid, ok, e, used_noise (the factor of the noise variance), and what the tracker notes.
     """
-    program = run.program
+    program, T = run.program, len(run)
     tile = program.tile()
-    out = np.empty(len(run), output_type(tile, (*COLLECTED, "used_noise", *run.tracker.smoother_fields)))
-    program.drivers(steps=attentive(program.steps)).run(tile, *lanes_of(run.record), out)
-    return out
+    own = (*COLLECTED, "used_noise", *run.tracker.smoother_fields)
+    block = np.empty(min(BLOCK, T), output_type(tile, own))
+    seen = {name: np.empty((T, *block[name].shape[1:]), block[name].dtype) for name in (*own, "ok", "e")}
+    loop = program.drivers(steps=attentive(program.steps)).run
+    for a in range(0, T, BLOCK):  # results that stay in the cache: the rest of them is not needed
+        part = slice(a, min(a + BLOCK, T))
+        rows = block[: part.stop - a]
+        loop(tile, *lanes_of(run.record.part(part)), rows)
+        for name, values in seen.items():
+            put_columns(rows[name], values[part])
+    return seen
 
 
 def walk_of(run: Track, prior: RandomWalk | None = None) -> Walk:

@@ -13,7 +13,7 @@ outside the usual range are left out (`driftfit.trackers.parts.outlying_readings
 due to coarse readings (`driftfit.trackers.parts.resolution`). Outliers that keep coming are a change of level: a leap
 of the parameters (`driftfit.trackers.parts.modes.ladder`), or more noise. Readings of a sensor that is frozen at its
 last value are left out too (`driftfit.trackers.parts.frozen`). If innovations are correlated, the previous one is an
-additional regressor (`driftfit.trackers.parts.coloured`).
+additional regressor (`driftfit.trackers.parts.modes.coloured`).
 
 The results are the mean and covariance of the mixture. The one-step variance excludes the outlier level, so its band is
 for samples that are not outliers.
@@ -43,7 +43,6 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -56,6 +55,7 @@ from driftfit.trackers.parts.coordinates import (
 from driftfit.trackers.parts.diffuse import SCRATCH, knowing_nothing, prediction, spanned_variance, take_in
 from driftfit.trackers.parts.excitation import learn_information, learn_scales, learned, no_excitation, window
 from driftfit.trackers.parts.frozen import held_readings, leave_out_frozen, not_frozen
+from driftfit.trackers.parts.modes.coloured import colour, learn_colour, white, whiten_noise
 from driftfit.trackers.parts.modes.filters import (
     enter_filters,
     innovate,
@@ -172,7 +172,7 @@ def begin(s: State, l: int) -> None:
     if s.settled[l] > 0:
         predict(s, l)
         whiten_noise(s, l)
-        follow(s, whiten_within(s, l), l)
+        follow(s, whiten_within(s, s.white.ctypes.data, l), l)
         mixture(s, l)
         if s.ok[l] > 0.0:
             located_within(s, l)

@@ -66,7 +66,7 @@ class Tracker(Settings, ABC):
     """
     learns_noise: ClassVar[bool] = False
     """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
-    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.parts.student`).
+    Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.student`).
     """
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""

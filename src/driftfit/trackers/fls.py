@@ -34,7 +34,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
@@ -47,11 +47,11 @@ from driftfit.trackers.parts.diffuse import (
     enter,
     knowing,
     knowing_nothing,
-    spanned_variance,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
+from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import correct, learn_scale, no_scale
+from driftfit.trackers.rls import correct, learn_variance, no_scale
 
 
 @kernel
@@ -70,8 +70,8 @@ def begin(s: State, l: int) -> None:
     s.begun[l] = 1.0 if s.dt[l] > 0.0 else s.begun[l]
     enter(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
-    spanned_variance(s, l)
+        learn_variance(s, l)
+    spanned_folded(s, l)
 
 
 def price(mu: Any) -> Any:
@@ -176,4 +176,4 @@ class FLS(Tracker):
         return RandomWalk(q, None, theta0, p0, at_first_sample=True, slopes=self.differences == 2)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, folded, begin, read_extra=read_drift, machines=MACHINES)

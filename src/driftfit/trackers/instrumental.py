@@ -43,7 +43,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
@@ -59,7 +59,8 @@ from driftfit.trackers.parts.diffuse import (
     symmetric_product,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.rls import fade, learn_scale, no_scale
+from driftfit.trackers.parts.shared_rounding import folded
+from driftfit.trackers.rls import fade, learn_variance, no_scale
 
 FOLLOWING = 0.05
 """Share of the distance to theta that the auxiliary model moves at a sample: it lags by twenty samples."""
@@ -116,7 +117,7 @@ def learn(s: State, l: int) -> None:
         left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
         s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
     s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @lru_cache
@@ -166,7 +167,7 @@ def steps(na: int) -> TrackerSteps:
                 s.G[j, i, l] = s.P[i, j, l]
         follow(s, l)
 
-    return TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
+    return TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@
 
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
-limit of coarse readings (`driftfit.trackers.parts.resolution`).
+limit of coarse readings (`driftfit.trackers.parts.resolution`). Errors of rounding that readings share widen ``std``
+(`driftfit.trackers.parts.shared_rounding`).
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -33,7 +34,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
@@ -46,11 +47,11 @@ from driftfit.trackers.parts.diffuse import (
     knowing_nothing,
     measurement,
     reform,
-    spanned_variance,
     take_in,
     wander,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
+from driftfit.trackers.parts.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 
 
 @kernel
@@ -83,7 +84,7 @@ def forget(s: State, l: int) -> None:
 
 def no_scale() -> dict[str, Any]:
     """Fields of an estimated noise variance before the first innovation."""
-    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved()}
+    return {"squares": 0.0, "count": 0.0, "scale": np.nan, **unresolved(), **nothing_shared()}
 
 
 @kernel
@@ -98,10 +99,18 @@ def learn_scale(s: State, l: int) -> None:
 
 
 @kernel
+def learn_variance(s: State, l: int) -> None:
+    """Learn the scale, and what readings of a coarse meter share."""
+    per_noise = s.s[l]
+    learn_scale(s, l)
+    share_rounding(s, per_noise, l)
+
+
+@kernel
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     measurement(s, l)
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @kernel
@@ -115,8 +124,8 @@ def begin(s: State, l: int) -> None:
             s.S[i, j, l] *= shrink
     enter(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
-    spanned_variance(s, l)
+        learn_variance(s, l)
+    spanned_folded(s, l)
     # the cap applies from the first direction on: regressors may lack excitation before they span everything
     for i in range(n):
         known = s.rank[l] > rank and s.P[i, i, l] > 0.0
@@ -140,7 +149,7 @@ def correct_direction(s: State, l: int) -> None:
     for i in range(s.theta.shape[0]):
         for j in range(i + 1):
             s.P[i, j, l] += gain * s.g[i, l] * s.g[j, l]
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @kernel
@@ -169,13 +178,13 @@ def begin_direction(s: State, l: int) -> None:
     wander(s, np.sqrt(forgotten(s, l)), l)
     reform(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
+        learn_variance(s, l)
     hand_over(s, l)
-    spanned_variance(s, l)
+    spanned_folded(s, l)
 
 
-EXPONENTIAL = TrackerSteps(forget, correct, diagonal, begin, machines=MACHINES)
-DIRECTIONAL = TrackerSteps(nothing, correct_direction, diagonal, begin_direction, machines=MACHINES)
+EXPONENTIAL = TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
+DIRECTIONAL = TrackerSteps(nothing, correct_direction, folded, begin_direction, machines=MACHINES)
 
 
 @dataclass(frozen=True)

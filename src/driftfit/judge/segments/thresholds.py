@@ -1,23 +1,23 @@
 """The gain of log-likelihood that a break requires in correlated noise.
 
-    g_b        gain from a break at b, chi-square with n degrees of freedom; the largest over b counts
+    g_b                                            gain from a break at b, chi-square with n degrees of freedom
     1, 1 - a_1, 1 - a_1 - a_2, ..., E, E, ...      a whitened step, E = 1 - sum a
     lambda_b = (1 + sum a_k^2) / 2 / (sum of the squares before E + E^2 b (N - b) / N)
 
-lambda_b is one less the correlation of the steps at b and b + 1. In white noise it is N / (2 b (N - b)), and neighbouring
-places are nearly the same test; if E is small each place is a test by itself. The probability that g_b exceeds c anywhere
-is, for discrete places,
+lambda_b is one less the correlation of the steps at b and b + 1. In white noise it is N / (2 b (N - b)), and
+neighbouring places are nearly the same test; if E is small each place is a test by itself. The probability that g_b
+exceeds c anywhere is, for discrete places,
 
-    P(chi2_n > c) c sum_b lambda_b nu(sqrt(2 c lambda_b)),     nu(x) = (2 / x) (Phi(x/2) - 1/2) / (x/2 Phi(x/2) + phi(x/2))
+    P(chi2_n > c) c sum_b lambda_b nu(sqrt(2 c lambda_b))
+    nu(x) = (2 / x) (Phi(x/2) - 1/2) / (x/2 Phi(x/2) + phi(x/2))
 
-and for two breaks together P(chi2_2n > c) c^2 n / (4 (n + 1)) times the sum of the products over pairs, since on average
-n / (4 (n + 1)) of a direction in 2 n dimensions is left for each of two moving halves.
+and for two breaks together P(chi2_2n > c) c^2 n / (4 (n + 1)) times the sum of the products over pairs, since on
+average n / (4 (n + 1)) of a direction in 2 n dimensions is left for each of two moving halves. Both are larger by the
+factor 1 + 4 (1 + sum a) / (1 - sum a) / N because a is estimated: (1 + sum a) / (1 - sum a) / N is the variance of
+log(1 - sum a) for p = 1, and four of it is what simulated records with a of 0.3 to 0.9 need.
 
-Both are larger by the factor 1 + 4 (1 + sum a) / (1 - sum a) / N because a is estimated: (1 + sum a) / (1 - sum a) / N
-is the variance of log(1 - sum a) for p = 1, and four of it is what simulated records with a of 0.3 to 0.9 need.
-
-Source: Siegmund (1985), Siegmund and Yakir (2007). Departure: regressors other than a constant are treated as one, which
-has the largest share in common with the noise. Cost: O(N).
+Source: Siegmund (1985), Siegmund and Yakir (2007). Departure: regressors other than a constant are treated as one,
+which has the largest share in common with the noise. Cost: O(N).
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
 from driftfit.trackers.base import Tracker
-from driftfit.trackers.parts.student import log_student
+from driftfit.trackers.student import log_student
 
 
 class LiveSelection(Kept):

@@ -15,17 +15,19 @@ from driftfit.trackers.parts import diffuse
 def column_scale(phi: Array, weight: Array) -> Array:
     """Root mean square of each column of phi over the samples that are used; 1 for columns of zeros."""
     T, n = phi.shape
-    scale = np.empty(n)
+    top, squares, scale, count = np.zeros(n), np.zeros(n), np.ones(n), 0
+    for t in range(T):  # row by row, because a column takes a cache line for each number
+        if weight[t] > 0.0:
+            count += 1
+            for i in range(n):
+                top[i] = max(top[i], abs(phi[t, i]))
+    for t in range(T):
+        if weight[t] > 0.0:
+            for i in range(n):
+                squares[i] += (phi[t, i] / top[i]) ** 2 if top[i] > 0.0 else 0.0
     for i in range(n):
-        top, count, squares = 0.0, 0, 0.0
-        for t in range(T):
-            if weight[t] > 0.0:
-                top = max(top, abs(phi[t, i]))
-                count += 1
-        for t in range(T):
-            if weight[t] > 0.0 and top > 0.0:
-                squares += (phi[t, i] / top) ** 2
-        scale[i] = top * np.sqrt(squares / count) if top > 0.0 else 1.0
+        if top[i] > 0.0:
+            scale[i] = top[i] * np.sqrt(squares[i] / count)
     return scale
 
 

@@ -97,10 +97,11 @@ def whiten(s: State, l: int) -> None:
 
 
 @kernel
-def whiten_within(s: State, l: int) -> int:
-    """x if columns are free; returns the column along which phi leaves the span of earlier regressors, or -1."""
+def whiten_within(s: State, phi: int, l: int) -> int:
+    """x of the regressor at address ``phi`` if columns are free; returns the column along which it leaves the span of
+    earlier regressors, or -1."""
     n, L = s.d.shape
-    machine_place(s.S.ctypes.data, s.white.ctypes.data, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
+    machine_place(s.S.ctypes.data, phi, s.work.ctypes.data, s.at_start.ctypes.data, n, L, l)
     for i in range(n):
         s.x[i, l] = s.work[ROW, i, l]
     return int(s.at_start[ENTERING, l])
@@ -117,17 +118,17 @@ def frame(s: State, l: int) -> None:
 
 
 @kernel
-def new_row(s: State, j: int, l: int) -> float:
+def new_row(s: State, phi: Array, j: int, l: int) -> float:
     """Make the rest of phi row j of M; returns the sign by which that row was multiplied."""
     n = s.theta.shape[0]
-    rest = s.white[j, l]
+    rest = phi[j, l]
     for i in range(j):
         rest -= s.x[i, l] * s.S[i, j, l]
     sign = 1.0 if rest > 0.0 else -1.0
     fresh = s.S[j, j, l] == 0.0
     s.S[j, j, l] = abs(rest)
     for k in range(j + 1, n):
-        rest = s.white[k, l]
+        rest = phi[k, l]
         for i in range(j):
             rest -= s.x[i, l] * s.S[i, k, l]
         s.S[j, k, l] = sign * rest

@@ -1,15 +1,17 @@
 """Frozen readings: a sensor that repeats its last value although the system moves.
 
 Whether the sensor is frozen is a two-state chain, which enters with probability ENTER at every reading and stays with
-probability STAY. A frozen sensor repeats its last reading for certain. A sensor that works repeats it with probability
-max(delta p(y), a) <= 1, where p is the predicted density of the output, delta the resolution, the smallest step between
-two readings so far, and a the share of readings that repeated although they were not frozen. So
+probability STAY. A frozen sensor repeats its last reading for certain. A sensor that works repeats it with at most the
+probability max(delta p, a) <= 1, where delta is the resolution, the smallest step between two readings so far, p the
+largest predicted density of the values that are rounded to the reading, and a the share of readings that repeated
+although they were not frozen. So
 
-    pi <- odds / (1 + odds),    odds = pi' / (1 - pi') / max(delta p(y), a),    pi' = ENTER (1 - pi) + STAY pi
+    pi <- odds / (1 + odds),    odds = pi' / (1 - pi') / max(delta p, a),    pi' = ENTER (1 - pi) + STAY pi
 
 if the reading repeats, and 0 if it does not. A reading that is more likely frozen than not is not used: theta is held,
 with its uncertainty growing as in a gap, and the lag of the reading is that of a missing one. One repeated reading is
-enough where readings have many digits; a coarse meter needs several, and none is enough where repeats are predicted.
+enough where readings have many digits; a coarse meter needs several, and none is enough where repeats are predicted. A
+summary counts those of two in a row and more, because one in a few thousand readings repeats by chance.
 
 Source: a hidden Markov chain with a known emission; ours. Cost per sample: a few operations.
 """
@@ -32,7 +34,7 @@ FIRST = 10.0
 
 def not_frozen() -> dict[str, Any]:
     """Fields before the first reading."""
-    return {"frozen": 0.0, "before": np.nan, "held": 0.0}
+    return {"frozen": 0.0, "before": np.nan, "held": 0.0, "in_a_row": 0.0, "frozen_readings": 0.0}
 
 
 @kernel
@@ -43,7 +45,7 @@ def leave_out_frozen(s: State, l: int) -> None:
         s.before[l] = s.y[l]
         frozen = 0.0
         if repeats & (s.steps[l] >= FIRST) & (s.valid[l] > 0.0) & (s.s[l] < np.inf) & (s.s[l] > 0.0):
-            e = s.y[l] - s.y_hat[l]
+            e = max(abs(s.y[l] - s.y_hat[l]) - 0.5 * s.quantum[l], 0.0)
             prior = ENTER * (1.0 - s.frozen[l]) + STAY * s.frozen[l]
             others = s.repeats[l] - 1.0 - s.held[l]
             chance = max(
@@ -56,11 +58,13 @@ def leave_out_frozen(s: State, l: int) -> None:
         if frozen > 0.5:
             s.ok[l], s.seen[l] = 0.0, 0.0
             s.held[l] += 1.0
+        s.in_a_row[l] = s.in_a_row[l] + 1.0 if frozen > 0.5 else 0.0
+        s.frozen_readings[l] += 0.0 if s.in_a_row[l] < 2.0 else 2.0 if s.in_a_row[l] == 2.0 else 1.0
 
 
 def held_readings(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
     """Its remark in a summary: nothing if no sensor was frozen."""
-    count = int(lane["held"])
+    count = int(lane["frozen_readings"])
     return (
         (("Frozen", f"{count} readings that repeat the one before where a change was expected: not used"),)
         if count

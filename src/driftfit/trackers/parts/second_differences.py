@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import TrackerSteps, diagonal
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.diffuse import (
     LEFT,
@@ -34,15 +34,15 @@ from driftfit.trackers.parts.diffuse import (
     hand_over,
     knowing_nothing,
     prediction,
-    spanned_variance,
     symmetric_product,
     take_in_row,
     wander,
 )
 from driftfit.trackers.parts.information import shear
 from driftfit.trackers.parts.resolution import resolve
+from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import read_drift
-from driftfit.trackers.rls import learn_scale, no_scale
+from driftfit.trackers.rls import learn_variance, no_scale
 
 
 def state(mu: Array, theta0: Array) -> Mapping[str, Any]:
@@ -115,7 +115,7 @@ def measurement(s: State, l: int) -> None:
 def correct(s: State, l: int) -> None:
     resolve(s, l)
     measurement(s, l)
-    learn_scale(s, l)
+    learn_variance(s, l)
 
 
 @kernel
@@ -154,8 +154,8 @@ def begin(s: State, l: int) -> None:
     enter(s, l)
     hand_over(s, l)
     if s.s[l] < np.inf:
-        learn_scale(s, l)
-    spanned_variance(s, l)
+        learn_variance(s, l)
+    spanned_folded(s, l)
 
 
-STEPS = TrackerSteps(drift, correct, diagonal, begin, read_extra=read_drift, machines=MACHINES)
+STEPS = TrackerSteps(drift, correct, folded, begin, read_extra=read_drift, machines=MACHINES)

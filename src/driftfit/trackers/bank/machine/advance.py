@@ -431,7 +431,7 @@ def lone_density(sample: Array) -> float:
     if nu < math.inf:
         ratio = math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu)
         wide = math.log(math.pi * nu * s) + (nu + 1.0) * math.log(1.0 + far * far / (nu * s))
-        return ratio - 0.5 * wide
+        return ratio - 0.5 * wide  # type: ignore[no-any-return]
     return -0.5 * (math.log(2.0 * math.pi * s) + far * far / s)  # type: ignore[no-any-return]
 
 

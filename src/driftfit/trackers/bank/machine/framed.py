@@ -173,7 +173,7 @@ def enter_bank(s: State, column: int, l: int) -> None:
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
-    sign = new_row(s, column, l)
+    sign = new_row(s, s.phi, column, l)
     s.root[l] = 1
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column

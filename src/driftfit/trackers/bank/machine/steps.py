@@ -228,7 +228,7 @@ def correct(s: State, l: int) -> None:
 @kernel
 def in_coordinates(s: State, l: int) -> None:
     """Process one sample in the coordinates of the start; a sample outside the span changes no weight."""
-    column, y_hat = whiten_within(s, l), prediction(s, l)
+    column, y_hat = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l)
     write_walks(s, l)
     hand_over(s, l)
     if column >= 0:

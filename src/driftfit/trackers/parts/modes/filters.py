@@ -236,7 +236,7 @@ def enter_filters(s: State, j: int, l: int) -> None:
         s.x[i, l] = 0.0
     innovate(s, l)
     noise = s.noise[l] * s.leverage[l] * max(s.r[l], s.coarse[l])
-    sign = new_row(s, j, l)
+    sign = new_row(s, s.white, j, l)
     for k in range(K):
         for i in range(n):
             s.C[max(i, j), min(i, j), k, l] = -sign * s.gain[i, k, l]

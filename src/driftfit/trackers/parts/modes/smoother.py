@@ -6,7 +6,7 @@
 with f_t the probabilities after sample t and T their transitions, for drift modes and likewise for noise levels v_tj,
 and o_t the probability that sample t was an outlier. A smoother of that random walk (`driftfit.smooth.exact`) estimates
 theta from all samples, with the averaged drift and noise, on the regressors and outputs from which coloured noise was
-taken (`driftfit.trackers.parts.coloured`). Before the filters start nothing drifts.
+taken (`driftfit.trackers.parts.modes.coloured`). Before the filters start nothing drifts.
 
 Source: the backward pass is Kim's (1994), eq. 2.20; smoothing one random walk given its result, instead of one for each
 mode, is ours.

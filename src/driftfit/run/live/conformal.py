@@ -13,7 +13,8 @@ f^2 changes by two constant factors, so a stream and a record have the same bits
 nothing.
 
 Source: Gibbs and Candes, Adaptive conformal inference under distribution shift (2021), eq. 2, as a step of log f
-instead of alpha, as in Angelopoulos, Candes and Tibshirani, Conformal PID control for time series prediction (2023), section 2.
+instead of alpha, as in Angelopoulos, Candes and Tibshirani, Conformal PID control for time series prediction (2023),
+section 2.
 Cost per sample: a few operations.
 """
 
