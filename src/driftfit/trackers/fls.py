@@ -40,6 +40,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, plain, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
 from driftfit.trackers.parts import second_differences
+from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
     SCRATCH,
@@ -49,7 +50,6 @@ from driftfit.trackers.parts.diffuse import (
     knowing_nothing,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import correct, learn_variance, no_scale
 

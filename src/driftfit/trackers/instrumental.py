@@ -49,6 +49,7 @@ from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers import rls
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.shared_rounding import folded
 from driftfit.trackers.parts.diffuse import (
     LEFT,
     MACHINES,
@@ -59,7 +60,6 @@ from driftfit.trackers.parts.diffuse import (
     symmetric_product,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
-from driftfit.trackers.parts.shared_rounding import folded
 from driftfit.trackers.rls import fade, learn_variance, no_scale
 
 FOLLOWING = 0.05

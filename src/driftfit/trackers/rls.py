@@ -7,7 +7,7 @@
 It minimises sum lambda^(t-k) (y_k - phi_k' theta)^2 with a memory of 1/(1 - lambda) nominal samples. P is in units of
 the noise variance, which is estimated on-line: sum(e^2 / s) / count over the samples after the start, and not below the
 limit of coarse readings (`driftfit.trackers.parts.resolution`). Errors of rounding that readings share widen ``std``
-(`driftfit.trackers.parts.shared_rounding`).
+(`driftfit.trackers.parts.coarse.shared_rounding`).
 
 Use it if all parameters drift alike and nothing is known about noise and drift. Without excitation exponential
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
@@ -38,6 +38,7 @@ from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
     SCRATCH,
@@ -51,7 +52,6 @@ from driftfit.trackers.parts.diffuse import (
     wander,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
-from driftfit.trackers.parts.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 
 
 @kernel

@@ -183,9 +183,9 @@ def _level(search: Search, found: Noise) -> Array:
     chance = SPREAD / (ends[0] - starts[0])
     share = max(0.0, 1.0 - 1.5 * chance / max(float(np.var(level)), chance))
     centre = float(np.median(level))
-    path: Array = np.interp(np.arange(len(search.c)), 0.5 * (starts + ends), level)
-    levels: Array = overall * np.exp(share * (path - centre))
-    return levels
+    around: Array = np.interp(np.arange(len(search.c)), 0.5 * (starts + ends), level) - centre
+    found_level: Array = overall * np.exp(share * around)
+    return found_level
 
 
 def jointly(search: Search, found: Noise, others: tuple[Array, ...], quiet: float) -> Noise:

@@ -28,6 +28,7 @@ import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import Array, State, kernel
+from driftfit.trackers.parts.coarse.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.diffuse import (
     LEFT,
     MACHINES,
@@ -40,7 +41,6 @@ from driftfit.trackers.parts.diffuse import (
 )
 from driftfit.trackers.parts.information import shear
 from driftfit.trackers.parts.resolution import resolve
-from driftfit.trackers.parts.shared_rounding import folded, spanned_folded
 from driftfit.trackers.parts.varying_drift import read_drift
 from driftfit.trackers.rls import learn_variance, no_scale
 
