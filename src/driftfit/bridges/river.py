@@ -14,6 +14,7 @@ Needs river 0.21 or later (``pip install "driftfit[river]"``).
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,7 @@ class TrackedRegressor(base.Regressor):
         river measures a model by walking through all that it refers to, functions excepted. A stream refers to compiled
         code that all models share, so it is behind a function.
         """
-        self._stream = lambda: live
+        self._stream: Callable[[], Live | None] = lambda: live
         self._state = {} if live is None else live.lane()
         self._width = 0 if live is None else live.model.m
         self._early = 0 if live is None else 5 * live.model.n
@@ -87,10 +88,10 @@ class TrackedRegressor(base.Regressor):
 
     def __getstate__(self) -> dict[str, Any]:
         live = self._live
-        return {**vars(self), "_stream": None if live is None else live.to_bytes(), "_state": None}
+        return {**self.__dict__, "_stream": None if live is None else live.to_bytes(), "_state": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
+        self.__dict__.update(state)
         self._hold(None if state["_stream"] is None else Live.from_bytes(state["_stream"]))
 
     def learn_one(self, x: dict[Any, Any], y: Any) -> None:
