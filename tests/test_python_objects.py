@@ -52,6 +52,11 @@ SETTINGS = """
 ARX(2, 2)
 ARX(2, [1, 2], nk=[0, 1], inputs=["flow", "head"], intercept=True)
 ARX(1, 1, ny=["level", "temperature"])
+ARMAX(2, 2, 1)
+OE(2, 2)
+BoxJenkins(2, 1, 1, 2)
+PolynomialModel(1, 1, 1, 1, 1)
+Equation("flow = theta.k * sqrt(p1 - p2) - theta.c")
 Regression(3)
 Regression(["income", "rate"], intercept=True)
 Regression(2, ny=2, shared=True)
@@ -205,5 +210,8 @@ def test_a_notebook_shows_what_a_result_is(everything):
 def test_nothing_public_is_left_out(everything):
     listed = {type(one) for one in everything.values()} | {type(made(text)) for text in SETTINGS}
     public = {one for name in driftfit.__all__ if inspect.isclass(one := getattr(driftfit, name))}
-    assert {one for one in public - listed if not inspect.isabstract(one)} == {driftfit.DataWarning}
+    assert {one for one in public - listed if not inspect.isabstract(one)} == {
+        driftfit.DataWarning,
+        driftfit.ConformalFactor,
+    }
     assert all(issubclass(type(made(text)), Settings) for text in SETTINGS)

@@ -14,7 +14,7 @@ Needs river 0.21 or later (``pip install "driftfit[river]"``).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ class TrackedRegressor(base.Regressor):
         code that all models share, so it is behind a function.
         """
         self._stream: Callable[[], Live | None] = lambda: live
-        self._state: Mapping[str, Any] = {} if live is None else live.lane()
+        self._state = {} if live is None else live.lane()
         self._width = 0 if live is None else live.model.m
         self._early = 0 if live is None else 5 * live.model.n
 
@@ -88,7 +88,7 @@ class TrackedRegressor(base.Regressor):
 
     def __getstate__(self) -> dict[str, Any]:
         live = self._live
-        return {**vars(self), "_stream": None if live is None else live.to_bytes(), "_state": None}
+        return {**self.__dict__, "_stream": None if live is None else live.to_bytes(), "_state": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
