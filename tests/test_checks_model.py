@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import driftfit
-from driftfit import ARX, HammersteinWiener, Regression
+from driftfit import ARMAX, ARX, OE, BoxJenkins, Equation, HammersteinWiener, PolynomialModel, Regression
 from driftfit.checks import check_model
 from driftfit.models import found
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
@@ -17,7 +17,10 @@ CURVED = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(3), inte
 SYSTEM = (-0.3, 0.5, 0.2, 0.1, 0.2, 0.1, 0.04, -0.03, -0.06, 0.1)
 READY = {
     "ARX": (ARX(1, [2, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(2, intercept=True), None),
-    "HammersteinWiener": (CURVED, SYSTEM),
+    "HammersteinWiener": (CURVED, SYSTEM), "ARMAX": (ARMAX(1, 1, 1), (0.5, 1.0, 0.3)), "OE": (OE(1, 1), (1.0, 0.5)),
+    "BoxJenkins": (BoxJenkins(2, 1, 1, 2, offset=True), (1.0, 0.5, 0.5, 0.9, 1.5, -0.7, 3.0)),
+    "PolynomialModel": (PolynomialModel(1, [1, 1], nf=[1, 0], nk=[1, 2]), (0.5, 1.0, 0.5, 0.3)),
+    "Equation": (Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1]"), (1.0, 0.5, 0.4)),
 }  # fmt: skip
 
 

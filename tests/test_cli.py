@@ -157,7 +157,7 @@ def test_missing_and_unreadable_files(file, tmp_path):
 @pytest.mark.parametrize(
     ("model", "hint"),
     [
-        ("arrx:1,1", "did you mean ARX?"),
+        ("arrx:1,1", "did you mean ARX or ARMAX?"),
         ("arx:1,x", "'x' is neither a number nor a setting"),
         ("arx:1,1,nkk=1", "did you mean nk?"),
         ("arx:1,1,1,1,1,1,1", "too many numbers"),

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 
 from driftfit import AdaptiveKalman, Equation, Kalman, Live, Regression, track
-from driftfit.checks import check_model
 from driftfit.cli.parts.expressions import read
 from driftfit.models.base import Model
 from driftfit.models.formulas import parse
@@ -91,10 +90,6 @@ def test_forecasts_and_simulations_play_the_equation():
     np.testing.assert_allclose(ahead.y_hat[:2], expected, rtol=1e-9)
     assert np.isfinite(ahead.y_std[0])
     assert np.isnan(ahead.y_std[1])
-
-
-def test_the_promises_of_a_model():
-    assert check_model(Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1]"), (1.0, 0.5, 0.4)) == []
 
 
 @pytest.mark.parametrize(

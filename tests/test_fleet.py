@@ -12,7 +12,7 @@ import pytest
 from driftfit import ARX, RLS, AugmentedFLS, Kalman, Track, track
 from driftfit.data.known import Known
 from driftfit.data.record import Records
-from driftfit.run import lanes
+from driftfit.run import parallel_lanes
 from driftfit.run.fleet import run_fleet
 from driftfit.run.program import Program
 
@@ -142,9 +142,9 @@ def test_an_interrupt_keeps_what_is_finished(monkeypatch):
         yield next(iter(as_completed(waiting)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(lanes, "ThreadPoolExecutor", SlowAfterTheFirst)
-    monkeypatch.setattr(lanes, "as_completed", interrupted)
-    monkeypatch.setattr(lanes, "cores", lambda: 1)
+    monkeypatch.setattr(parallel_lanes, "ThreadPoolExecutor", SlowAfterTheFirst)
+    monkeypatch.setattr(parallel_lanes, "as_completed", interrupted)
+    monkeypatch.setattr(parallel_lanes, "cores", lambda: 1)
     with pytest.warns(UserWarning, match=r"interrupted: \d+ of 70 series are finished"):
         fleet = track(MODEL, KALMAN, y, u, by="row")
     assert fleet.failed

@@ -5,7 +5,6 @@ import pytest
 from scipy import signal
 
 from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
-from driftfit.checks import check_model
 from driftfit.models.polynomial_steps import SETTLING
 from driftfit.run.program import Program
 from driftfit.smooth.problem import replay
@@ -144,10 +143,6 @@ def test_the_forecast_of_coloured_noise_decays():
     np.testing.assert_allclose(forecast.y_hat, expected, atol=1e-8)
     response = np.r_[1.0, (0.9 + 0.5) * 0.9 ** np.arange(29)]
     np.testing.assert_allclose(forecast.y_std, 0.5 * np.sqrt(np.cumsum(response**2)), rtol=1e-6)
-
-
-def test_the_promises_of_a_model():
-    assert check_model(BJ, THETA) == []
 
 
 def test_orders_and_names():

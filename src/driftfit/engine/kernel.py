@@ -330,7 +330,10 @@ def _in_a_row(context: Any, numbers: Any) -> Any:
 
 
 packed = internals.named_intrinsic("packed", _in_a_row)
-"""packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine."""
+"""packed((a, b, ..)): the address of these whole numbers, which ``wholes(address, 1, count)`` reads in the routine.
+
+It holds until the function that packs them returns, so the routine must be called in the same function.
+"""
 
 
 @kernel

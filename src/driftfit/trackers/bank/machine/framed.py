@@ -139,15 +139,6 @@ FRAMED = (machine_walks, machine_enter)
 
 
 @kernel
-def addresses(s: State) -> int:
-    """The address of those of the fields that these routines work on."""
-    return packed((  # type: ignore[no-any-return]
-        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
-        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
-    ))  # fmt: skip
-
-
-@kernel
 def begin_framed(s: State, l: int) -> None:
     """The single leaf with which the bank begins: z ~ N(d, I), in units of the noise variance if that is unknown."""
     n = s.theta.shape[0]
@@ -164,7 +155,12 @@ def write_walks(s: State, l: int) -> None:
     """Write the covariances that changes add at the next sample, in these coordinates."""
     n, L = s.d.shape
     unit = 1.0 if s.unknown[l] > 0 else s.r[l]
-    machine_walks(addresses(s), unit, s.table[MEMORY_AT, 2, 0], n, L, l)
+    # packed here: what a function packs is gone when it returns
+    fields = packed((
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+    ))  # fmt: skip
+    machine_walks(fields, unit, s.table[MEMORY_AT, 2, 0], n, L, l)
 
 
 @kernel
@@ -177,7 +173,11 @@ def enter_bank(s: State, column: int, l: int) -> None:
     s.root[l] = 1
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
-    machine_enter(addresses(s), s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
+    fields = packed((
+        memory_at(s), s.table.ctypes.data, s.counters.ctypes.data, s.S.ctypes.data, s.W.ctypes.data,
+        s.c.ctypes.data, s.x.ctypes.data, s.d.ctypes.data, s.Pz.ctypes.data, s.g.ctypes.data, s.at_start.ctypes.data,
+    ))  # fmt: skip
+    machine_enter(fields, s.unknown[l], s.table[MEMORY_AT, 2, 0], s.counters.shape[0], n, L, l)
 
 
 @kernel
