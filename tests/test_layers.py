@@ -56,3 +56,10 @@ def test_pages_import_what_is_public(page):
     """From the library itself or one level below it; systems and bridges are modules of their own."""
     found = re.findall(r"^from driftfit\.([\w.]+) import", page.read_text(encoding="utf-8"), re.MULTILINE)
     assert [one for one in found if "." in one and one.split(".")[0] not in ("systems", "bridges")] == []
+
+
+def test_what_a_function_packs_does_not_leave_it():
+    """The numbers of `packed` are on the stack of the function that packs them, and gone when it returns."""
+    sources = [*(Path(__file__).parents[1] / "src").rglob("*.py")]
+    assert sum("= packed((" in source.read_text(encoding="utf-8") for source in sources) >= 3
+    assert [source.name for source in sources if "return packed((" in source.read_text(encoding="utf-8")] == []
