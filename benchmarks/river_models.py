@@ -34,9 +34,9 @@ MODELS: dict[str, Callable[[], Any]] = {
     "LinearRegression, Adam": lambda: linear_model.LinearRegression(optim.Adam(0.1)),
     "PARegressor": linear_model.PARegressor,
     "BayesianLinearRegression": lambda: linear_model.BayesianLinearRegression(smoothing=0.98),
-    "driftfit RLS": lambda: TrackedRegressor(RLS(0.98)),
-    "driftfit Kalman": lambda: TrackedRegressor(Kalman(q=0.01, r=0.25)),
-    "driftfit AdaptiveKalman": TrackedRegressor,
+    "our RLS": lambda: TrackedRegressor(RLS(0.98)),
+    "our Kalman": lambda: TrackedRegressor(Kalman(q=0.01, r=0.25)),
+    "our AdaptiveKalman": TrackedRegressor,
 }
 
 

@@ -2,7 +2,7 @@
 
 Two parameters walk at random in noise of 0.3; samples 100 on are counted. "below 0.8" is the share of records in whose
 bands less than 80 % of the path lies: with a slow walk a record can look as if nothing moved.
-Run: python benchmarks/smoothing_coverage.py [records, 200 by default]
+Run: python benchmarks/smoothing_coverage.py [records, 200 by default] [--quick]
 """
 
 import sys
@@ -28,4 +28,5 @@ def main(records: int = 200) -> None:
 
 
 if __name__ == "__main__":
-    main(*(int(given) for given in sys.argv[1:2]))
+    quick = "--quick" in sys.argv
+    main(*([2] if quick else (int(given) for given in sys.argv[1:2])))

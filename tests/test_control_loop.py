@@ -45,7 +45,7 @@ def test_output_then_input_is_the_record(model, tracker, y, u):
             assert all(same(a, b) for a, b in zip(split.forecast(3, u[t : t + 3]), ahead, strict=True))
         split.apply(u[t])
         assert not split.awaits
-        for name in set(fields(whole._tile)) - {"u", *whole.tracker.scratch}:
+        for name in set(fields(whole._tile)) - {"u", *tracker.scratch}:
             assert same(whole._tile[name], split._tile[name]), (t, name)
     assert same(split.theta, track(model, tracker, y, u).theta[-1])
 

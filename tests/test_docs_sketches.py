@@ -39,8 +39,8 @@ GIVEN = {
 }
 """By page, what its sketches take for granted besides `COMMON`."""
 
-NO_CODE = {"flexible_least_squares.md", "instrumental_variables.md", "structure.md"}
-"""Pages whose indented lines are formulas."""
+NO_CODE = {"coloured_noise.md", "flexible_least_squares.md", "instrumental_variables.md", "spark.md", "structure.md"}
+"""Pages whose indented lines are formulas, or need Java."""
 
 
 def blocks(page):

@@ -37,6 +37,7 @@ ELSEWHERE = {
     "driftfit serve": ("tests/test_service_page.py", '"driftfit", "serve", "--demo"'),
     "python examples/controller.py": ("tests/test_embedded.py", '["controller.py"]'),
     "python -m lab bench accuracy": ("lab/tests/test_bench.py", '["bench", "accuracy", "--quick"'),
+    "python -m lab structure": ("lab/tests/test_structure.py", '["structure", "--picture"'),
     "python -m lab bench speed": ("lab/tests/test_bench.py", '["bench", "speed", "--quick"'),
 }  # fmt: skip
 """Commands, by how they begin, with the test that runs them quickly and what stands there."""
@@ -101,6 +102,8 @@ def test_benchmarks_run_quickly(command, monkeypatch):
     assert "--quick" in said or "quick: Annotated" in said
     if "import statsmodels" in said:
         pytest.importorskip("statsmodels", reason="there is no statsmodels")
+    if "bridges" in said and "spark" in script:
+        pytest.importorskip("pyspark", reason="there is no pyspark")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     monkeypatch.setattr("sys.argv", [script, *given, "--quick"] if "typer" not in said else [script, "--quick"])
     printed = io.StringIO()
