@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from typing import Any
 
 JAVA = (17, 21)
@@ -70,6 +71,8 @@ def session(master: str = "local[2]", **settings: Any) -> Any:
         "spark.sql.execution.arrow.maxRecordsPerBatch": "32000",
         "spark.sql.maxConcurrentOutputFileWriters": "8",  # a batch is written by kind without being sorted again
     }
+    if master.startswith("local"):  # the workers are this interpreter, whichever comes first on the PATH
+        os.environ.setdefault("PYSPARK_PYTHON", sys.executable)
     for name, value in {**usual, **given}.items():
         builder = builder.config(name, value)
     return builder.getOrCreate()
