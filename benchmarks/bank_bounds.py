@@ -92,7 +92,7 @@ def watch() -> tuple[Any, list[str]]:
 def move_apart() -> None:
     """Put `APART` NaN after every array of banks made from now on."""
     from driftfit.trackers.bank import bank, memory
-    from driftfit.trackers.bank.layout import REPORTED, ROW, WINDOWS
+    from driftfit.trackers.bank.layout import MEMORY_AT, REPORTED, ROW, WINDOWS
 
     packed = bank.packed
     inside = [name for name in memory.PACKED if name not in REPORTED]
@@ -109,6 +109,7 @@ def move_apart() -> None:
             new[at + shifts[name] : at + shifts[name] + size] = old[at : at + size]
         for name in (*inside, *WINDOWS):
             table[ROW[name], 0] += 8 * shifts["scratch" if name in WINDOWS else name]
+        table[MEMORY_AT, 2] = len(new)  # several outputs put copies behind it
         return {**state, "memory": new}
 
     bank.packed = apart
