@@ -19,7 +19,7 @@ from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type, repeat_tile
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.states.layout import Layout, words_of
@@ -221,6 +221,21 @@ def put_columns(given: Array, into: Array) -> None:
         return
     for k in range(into.shape[1]):
         into[:, k] = given[:, k]
+
+
+def put_fields(rows: Array, into: Mapping[str, Array], first: int) -> None:
+    """Copy fields of rows of eight-byte numbers to rows ``first`` and following of arrays of the same types."""
+    words, fields = rows.view(np.int64).reshape(len(rows), -1), rows.dtype.fields or {}
+    for name, values in into.items():
+        put_words(words, fields[name][1] // 8, values.view(np.int64).reshape(len(values), -1), first)
+
+
+@Driver
+def put_words(words: Array, column: int, into: Array, first: int) -> None:
+    """Copy columns of words, row by row: NumPy takes 30 ns for each short row, or reads all rows for each column."""
+    for t in range(words.shape[0]):
+        for k in range(into.shape[1]):
+            into[first + t, k] = words[t, column + k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:

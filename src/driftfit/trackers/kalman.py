@@ -143,6 +143,10 @@ class Kalman(Tracker):
         return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
     @property
+    def pads(self) -> bool:
+        return True
+
+    @property
     def steps(self) -> TrackerSteps:
         if self.form == "sqrt":
             return square_root.STEPS
