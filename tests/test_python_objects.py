@@ -27,6 +27,7 @@ from driftfit import (
     Regression,
     Sensor,
     frontier,
+    pool,
     select,
     track,
     tune,
@@ -77,6 +78,8 @@ Kalman(q=1e-4, r=0.1)
 Kalman(q=np.array([1e-4, 0.0]), r=0.1, theta0=[1, 2], p0=np.eye(2), form="sqrt")
 RLS(0.98)
 RLS(0.9, p0=1.0, theta0=[1.0, np.pi])
+Kalman(q=1e-4, r=0.1, laws={"theta1": Law.returns(50, 0.2), "theta2": Law.season(24, harmonics=2)})
+Law.trend(1e-6)
 FLS(mu=100.0)
 AugmentedFLS(10.0)
 AdaptiveKalman()
@@ -160,6 +163,8 @@ def objects():
     found |= {"Selection": select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0)), "Segmentation": run.segment()}
     found |= {"Frontier": frontier(ARX(2, 2), Y, U), "detect": run.detect("innovation")}
     found |= {"Forecast": run.forecast(2, U[:2]), "Prediction": run.ahead(2), "Response": run.step_response(5)}
+    found["Constrained"] = run.constrain("a1 >= 0")
+    found["Pooled"] = pool(track(Regression(1), Kalman(q=0.0, r=1.0), Y.reshape(10, 20), U.reshape(10, 20), by="row"))
     found["Blocks"] = track(HammersteinWiener(1, 1), RLS(1.0), Y, U).blocks()
     return found
 

@@ -49,9 +49,11 @@ from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.laws.law import Law
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
+from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
 from driftfit.use.rational import rational_model
@@ -86,6 +88,7 @@ __all__ = [
     "Hybrid",
     "InstrumentalVariables",
     "Kalman",
+    "Law",
     "Legendre",
     "Live",
     "LiveOutputs",
@@ -114,6 +117,7 @@ __all__ = [
     "huber",
     "piecewise",
     "plot_tree",
+    "pool",
     "prepare",
     "rational_model",
     "segment",
