@@ -31,6 +31,7 @@ from driftfit.models.hammerstein_wiener.trackers.extended_kalman import Extended
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
 from driftfit.models.regression import Regression
+from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
 from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
@@ -48,6 +49,7 @@ from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.instrumental import InstrumentalVariables
+from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.laws.law import Law
 from driftfit.trackers.rls import RLS
@@ -87,6 +89,7 @@ __all__ = [
     "HammersteinWiener",
     "Hybrid",
     "InstrumentalVariables",
+    "JointKalman",
     "Kalman",
     "Law",
     "Legendre",
@@ -104,6 +107,7 @@ __all__ = [
     "Sensor",
     "Shared",
     "Sigmoid",
+    "StateSpace",
     "Track",
     "Tracker",
     "__version__",

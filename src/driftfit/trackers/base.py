@@ -68,6 +68,8 @@ class Tracker(Settings, ABC):
     """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
     Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.student`).
     """
+    follows_states: ClassVar[bool] = False
+    """Whether it moves the hidden states of a model (`Model.hidden`) between samples; it then needs such a model."""
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
