@@ -15,6 +15,8 @@ def ready(kind, values=VALUES, **settings):
         return kind.from_fls_mu(values["mu"], n=4, s=8.0)
     if values is SLOW and kind.output_error:  # the noise of an ARX record drives the system, it is none of the sensor
         settings = {"q_w": values["r"]} | settings
+    if any(field.name == "r" and field.default == 1.0 for field in fields(kind)):  # a dispersion: here the noise
+        settings = {"r": values["r"]} | settings
     unknown = set(kind.required) - values.keys() - settings.keys()
     assert not unknown, f"{kind.__name__}: give the required settings {sorted(unknown)} a value in contract_table.py"
     return kind(**{name: values[name] for name in kind.required if name not in settings} | settings)

@@ -131,6 +131,7 @@ def test_what_does_not_fit_a_law_is_refused():
         (lambda: Law.season(4, harmonics=2), "half a circle"), (lambda: Law("returns"), "needs time, std"),
         (lambda: Law.trend(-1.0), "at least 0"), (lambda: Kalman(q=np.eye(2), r=1.0, laws=LAWS), "must be"),
         (lambda: track(Regression(2), TRACKER, *data()).smooth(), "has laws"),
+        (lambda: track(Regression(2), TRACKER, *data()).ahead(2), "laws by which theta moves"),
         (lambda: tune(Regression(2), Kalman(laws=LAWS), *data()), "laws"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):

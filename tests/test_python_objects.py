@@ -84,6 +84,7 @@ Kalman(q=1e-4, r=0.1, laws={"theta1": Law.returns(50, 0.2), "theta2": Law.season
 Law.trend(1e-6)
 FLS(mu=100.0)
 AugmentedFLS(10.0)
+DynamicGLM("poisson", q=1e-4, p0=1.0)
 AdaptiveKalman()
 ExtendedKalman(q=1e-4, r=0.1)
 OutputError()

@@ -47,6 +47,7 @@ from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor,
 from driftfit.trackers.bank.results.pictures import plot_tree
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.dynamic_glm import DynamicGLM
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.joint_kalman import JointKalman
@@ -81,6 +82,7 @@ __all__ = [
     "DataWarning",
     "DeadZone",
     "Decide",
+    "DynamicGLM",
     "Equation",
     "ExtendedKalman",
     "FirstFloor",

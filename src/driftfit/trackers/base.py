@@ -75,6 +75,11 @@ class Tracker(Settings, ABC):
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
 
+    @property
+    def beyond(self) -> str:
+        """Why theta is not a random walk, or y not phi' theta and noise; empty if they are, as most verbs assume."""
+        return ""
+
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
         """The model for a linear record with these lags, if the tracker does not work with all models; used by tests.

@@ -276,6 +276,10 @@ class JointKalman(Tracker):
     follows_states: ClassVar[bool] = True
     scratch: ClassVar[tuple[str, ...]] = ("g", "W", "L", "moved", "shown")
 
+    @property
+    def beyond(self) -> str:
+        return "moves hidden states"
+
     def __post_init__(self) -> None:
         for name in ("q", "p0"):
             given = getattr(self, name)

@@ -186,6 +186,10 @@ class Kalman(Tracker):
             return square_root.STEPS
         return TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
 
+    @property
+    def beyond(self) -> str:
+        return "" if self.laws is None else "has laws by which theta moves"
+
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)
         if self.laws is not None:
@@ -200,7 +204,7 @@ class Kalman(Tracker):
 
     def random_walk(self, model: Model) -> RandomWalk:
         if self.laws is not None:
-            raise ValueError("smoothing and forecasts of theta need random walks; this Kalman has laws.")
+            raise ValueError("smoothing needs random walks; this Kalman has laws.")
         n = model.n
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
         return RandomWalk(matrix("Kalman", "q", self.q, n), self.r, vector("Kalman", "theta0", self.theta0, n), p0)
