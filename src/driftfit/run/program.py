@@ -60,6 +60,13 @@ class Program:
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
 
+    def __post_init__(self) -> None:
+        if (self.model.hidden is not None) != self.tracker.follows_states:
+            raise ValueError(
+                f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
+                "followed by JointKalman, which moves its hidden states and follows nothing else."
+            )
+
     def __reduce__(self) -> Any:
         """A copy, or a program sent to another process, consists of its fields."""
         return Program, (self.model, self.tracker, self.output, self.shared)
