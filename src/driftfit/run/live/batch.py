@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.clock import LOOK, Clock, Pace, instant
-from driftfit.data.known import Known
+from driftfit.data.known import NOISE, Known
 from driftfit.data.labels import times_of
 from driftfit.data.limits import Gate
 from driftfit.data.record import Reading, Record, Records
@@ -23,6 +23,7 @@ from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.late_input import check_applied
+from driftfit.run.live.rule import FROZEN
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
@@ -163,9 +164,10 @@ class Batched(ABC):
     ) -> Batch:
         """Process T samples at once: results and state are those of `update` for each of them in turn, bit for bit.
 
-        Signals and factors are given as to `track`. Where nothing follows single samples (no ``lag``, no alarms), the
-        compiled loop of a record does the work, at the cost of a record per sample and some 30 us per call; otherwise
-        the samples go through it one by one. The first call compiles the loop, unless `track` has done so before.
+        Signals and factors are given as to `track`. Where nothing needs the state after every sample (no ``lag``, no
+        alarm on a frozen model), the compiled loop of a record does the work, at the cost of a record per sample and
+        some 30 us per call; otherwise the samples go through it one by one. The first call compiles the loop, unless
+        `track` has done so before.
 
         Parameters
         ----------
@@ -244,8 +246,11 @@ class Batched(ABC):
     def _drive(self, record: Record, out: Array) -> None:
         """Drive the tile over the samples, and let alarms and windows see each of them."""
         y, u, known = lanes_of(record)
-        if not self._watching and not self._windows:
+        if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
             self._loop(self._tile, y, u, known, out)
+            for lane, alarm in self._watching:
+                noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
+                alarm.take_many(out, lane, noise, record.time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
