@@ -90,7 +90,7 @@ def test_late_rows_are_put_in_order(tmp_path):
     assert unit.counts["late"] == 1
     assert unit.counts["duplicate"] == 3
     assert unit.waiting == 5
-    state, section = unit.state(), unit.section
+    state, streams = unit.state(), unit.streams
     run = run_of(y[:195], u[:195])
     assert np.array_equal(unit.live.theta, run.theta[-1])
     times, rows = engine.journal.rows_of(1)
@@ -98,7 +98,7 @@ def test_late_rows_are_put_in_order(tmp_path):
     assert len(rows) == 200
     again = Section(0, unit.settings).add(1, "a")
     again.restore(state, {})
-    for before, after in zip(section.waiting.of(0), again.section.waiting.of(0), strict=True):
+    for before, after in zip(streams.waiting.of(0), again.streams.waiting.of(0), strict=True):
         assert np.array_equal(before, after)
     assert np.array_equal(again.live.theta, run.theta[-1])
     engine.close()

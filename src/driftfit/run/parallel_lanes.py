@@ -135,7 +135,8 @@ def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
     """Tiles at their start, one record per row of ``lanes``."""
     count, L = lanes.shape
     first = [programs[k] for k in lanes[0]]
-    tiles = repeat_tile(tile_of(first), count)
+    one = all(program is first[0] for program in first)
+    tiles = repeat_tile(first[0].lanes(L) if one else tile_of(first), count)
     if any(programs[k] is not first[lane] for row in lanes for lane, k in enumerate(row.tolist())):
         starts = {key: one.start for key, one in {id(one): one for one in programs}.items()}
         for name in first[0].start:

@@ -159,6 +159,16 @@ class Program:
             self._drivers[keep, steps] = found
         return found
 
+    def lanes(self, count: int) -> Array:
+        """A tile with this program in every lane, at its start; not to be changed, since it is made once."""
+        if count not in self._wide:
+            self._wide[count] = tile_of([self] * count)
+        return self._wide[count]
+
+    @cached_property
+    def _wide(self) -> dict[int, Array]:
+        return {}
+
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
         tile = repeat_tile(self._begin, 1)

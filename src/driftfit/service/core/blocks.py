@@ -26,6 +26,11 @@ class Blocks:
         self._count = np.zeros(0, np.int64)
         self._first, self._last = np.zeros(0, np.int64), np.zeros(0, np.int64)
 
+    @property
+    def capacity(self) -> int:
+        """Units for which there is room."""
+        return len(self._count)
+
     def grow(self, capacity: int) -> None:
         """Make room for more units."""
         more = capacity - len(self._count)

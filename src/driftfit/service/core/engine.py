@@ -34,6 +34,9 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it does other work."""
+PACE = 0.01
+"""Seconds from one transaction to the next at least: with single samples in a message the fixed cost of a group, about
+a millisecond, would otherwise be most of the work."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -110,7 +113,9 @@ class Engine:
     def run(self) -> None:
         """Work until `stop`."""
         while not self._stop.is_set():
+            begun = time.monotonic()
             self.step(IDLE)
+            self._stop.wait(begun + PACE - time.monotonic())
         if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
@@ -209,7 +214,7 @@ class Engine:
             # the state contains every sample that was processed, which is all before the present group
             upto = self._pending.log[0] if self._pending.log is not None else self.next
             self._pending.snapshots.append((number, upto, unit.state()))
-            self._pending.blocks += unit.section.blocks.flush(unit.place, number)
+            self._pending.blocks += self.units.sections[unit.streams.index].blocks.flush(unit.place, number)
         upto = self._pending.log[0] if self._pending.log is not None else self.next
         needed = next(iter(self._dirty.values()))[0] if self._dirty else upto
         if self._pending:

@@ -34,7 +34,7 @@ class Results(NamedTuple):
     @property
     def n(self) -> int:
         """Number of parameters."""
-        return (self.values.shape[1] - THETA) // 2
+        return int(self.values.shape[1] - THETA) // 2
 
     @property
     def theta(self) -> Array:

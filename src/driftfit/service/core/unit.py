@@ -1,4 +1,4 @@
-"""One unit: what is seldom used of it; its stream is a row of the arrays of `driftfit.service.core.section`.
+"""One unit: what is seldom used of it; its stream is a row of the arrays of `driftfit.service.core.streams`.
 
 Everything that changes the state comes from the journal in one order, so that the journal alone determines it: samples,
 and actions (hold, reset, new limits, the rule of an alarm).
@@ -11,7 +11,7 @@ import time as wall
 from array import array
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -20,18 +20,16 @@ from driftfit.data.storage import rebuild
 from driftfit.engine.kernel import Array
 from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.rule import AlarmRule
+from driftfit.service.core.streams import Streams
 from driftfit.service.settings.config import UnitSettings, valid_range
 from driftfit.streams import Live
 
-if TYPE_CHECKING:
-    from driftfit.service.core.section import Section
-
 
 class Unit:
-    """A unit of the service, at a place of its section."""
+    """A unit of the service, at a place of its streams."""
 
-    def __init__(self, number: int, name: str, section: Section, place: int) -> None:
-        self.number, self.name, self.section, self.place = number, name, section, place
+    def __init__(self, number: int, name: str, streams: Streams, place: int) -> None:
+        self.number, self.name, self.streams, self.place = number, name, streams, place
         self.rare: Counter[str] = Counter()
         """How often something happened, other than samples that came and were used."""
         self.failure = ""
@@ -45,34 +43,34 @@ class Unit:
 
     @property
     def settings(self) -> UnitSettings:
-        """Those of its section."""
-        return self.section.settings
+        """Those of its streams."""
+        return self.streams.settings
 
     @property
     def counts(self) -> Counter[str]:
         """How often what happened."""
-        samples, used = self.section.counted[self.place].tolist()
+        samples, used = self.streams.counted[self.place].tolist()
         return Counter({name: count for name, count in (("samples", samples), ("used", used)) if count}) + self.rare
 
     @property
     def limits(self) -> dict[str, tuple[float, float]]:
         """Valid ranges by signal."""
-        return dict(zip(self.settings.columns, map(tuple, self.section.limits[self.place].tolist()), strict=True))
+        return dict(zip(self.settings.columns, map(tuple, self.streams.limits[self.place].tolist()), strict=True))
 
     @property
     def live(self) -> Live:
         """Its stream, as a copy."""
-        return self.section.stream(self.place)
+        return self.streams.stream(self.place)
 
     @property
     def waiting(self) -> int:
         """Samples that wait for late ones."""
-        return len(self.section.waiting.of(self.place)[0])
+        return len(self.streams.waiting.of(self.place)[0])
 
     def fail(self, number: int, error: Exception, out: Out) -> None:
         """Stop this unit until an operator restarts it."""
         self.failure = f"{type(error).__name__}: {error}"[:500]
-        self.section.clear(self.place)
+        self.streams.clear(self.place)
         out.event(number, self.number, "failed", {"error": self.failure})
 
     def remember(self, time: Array | None, rows: Array, out: Out) -> None:
@@ -115,9 +113,9 @@ class Unit:
         out.event(number, self.number, "calibrated" if what == "calibrated" else "action", detail)
 
     def _act(self, what: str, action: Mapping[str, Any]) -> None:
-        section, place = self.section, self.place
+        streams, place = self.streams, self.place
         if what == "restart":
-            section.clear(place)
+            streams.clear(place)
             self.failure, self.reference, self.alarms, self.alarmed = "", array("d"), [], False
             self.calibrated = self.settings.alarm is None
         elif what == "acknowledge":
@@ -125,18 +123,18 @@ class Unit:
         elif what == "limits":
             names = self.settings.columns
             for name, bounds in action["limits"].items():
-                section.limits[place, names.index(name)] = valid_range(name, bounds, names)
+                streams.limits[place, names.index(name)] = valid_range(name, bounds, names)
         elif self.failure:
             raise ValueError("the unit has failed; restart it.")
         elif what == "hold":
-            section.held[place] = bool(action["on"])
+            streams.held[place] = bool(action["on"])
         elif what == "reset":
             live = self.live
             live.reset(action.get("which"), p=action.get("p"), theta=action.get("theta"))
-            section.continue_from(place, live)
+            streams.continue_from(place, live)
         elif what == "calibrated":
             rules = [rebuild(rule, AlarmRule) for rule in action["rules"]]
-            program = section.program
+            program = streams.program
             self.alarms += [LiveAlarm(rule, program.tracker, program.names) for rule in rules]
             self.calibrated, self.reference = True, array("d")
         else:
@@ -146,14 +144,14 @@ class Unit:
         """The facts that the page shows besides the results."""
         return {
             "counts": dict(self.counts), "failure": self.failure, "acknowledged": self.acknowledged,
-            "calibrated": self.calibrated, "held": bool(self.section.held[self.place]), "waiting": self.waiting,
+            "calibrated": self.calibrated, "held": bool(self.streams.held[self.place]), "waiting": self.waiting,
             "limits": {name: [None if math.isinf(v) else v for v in pair] for name, pair in self.limits.items()},
             "hypotheses": self._hypotheses(),
         }  # fmt: skip
 
     def _hypotheses(self) -> dict[str, float] | None:
         """Present probabilities of the events of a `Bank`; None for other trackers."""
-        if self.failure or not self.section.program.tracker.weighs:
+        if self.failure or not self.streams.program.tracker.weighs:
             return None
         now = self.live.hypotheses
         return dict(zip(now.names, now.lag_prob[0].tolist(), strict=False))
@@ -161,7 +159,7 @@ class Unit:
     def state(self) -> bytes:
         """The state as bytes."""
         alarms = [alarm.plain() for alarm in self.alarms]
-        kept = [self.section.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.calibrated,
+        kept = [self.streams.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.calibrated,
                 self.reference.tobytes(), alarms, self.alarmed]  # fmt: skip
         packed: bytes = msgspec.msgpack.encode(kept)
         return packed
@@ -172,9 +170,9 @@ class Unit:
         self.failure, self.acknowledged, self.calibrated = rest
         self.rare, self.reference = Counter(rare), array("d")
         self.reference.frombytes(reference)
-        program = self.section.program
+        program = self.streams.program
         self.alarms = [LiveAlarm.of(alarm, program.tracker, program.names) for alarm in alarms]
-        self.section.unpack(self.place, packed, programs)
+        self.streams.unpack(self.place, packed, programs)
 
 
 class Out:

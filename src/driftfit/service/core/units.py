@@ -28,30 +28,30 @@ class Gathered:
     """What arrived for a section in some messages: a list for each column, one message after the other."""
 
     def __init__(self, settings: UnitSettings) -> None:
-        self.settings = settings
+        self.time, self.time_unit = settings.time, settings.time_unit
         self.places: list[int] = []
         self.lengths: list[int] = []
-        self.columns: list[list[Any]] = [[] for _ in settings.columns]
+        self.columns: dict[str, list[Any]] = {name: [] for name in settings.columns}
         self.times: list[Any] = []
 
     def add(self, place: int, samples: Samples) -> bool:
         """Add a message; False if it has no signal of the section."""
         given, count = samples.columns, samples.length
-        if not any(name in given for name in self.settings.columns):
+        if self.columns.keys().isdisjoint(given):
             return False
         self.places.append(place)
         self.lengths.append(count)
-        for column, name in zip(self.columns, self.settings.columns, strict=True):
+        for name, column in self.columns.items():
             _extend(column, given.get(name), count)
-        if self.settings.time is not None:
-            _extend(self.times, given.get(self.settings.time), count)
+        if self.time is not None:
+            _extend(self.times, given.get(self.time), count)
         return True
 
     def arrays(self) -> tuple[Array, Array | None, Array]:
         """(places (N,), times (N,), values (N, 1 + m))."""
         places = np.repeat(self.places, self.lengths)
-        values = np.column_stack([numbers_of(column) for column in self.columns])
-        return places, seconds_of(self.times, self.settings.time_unit) if self.settings.time else None, values
+        values = np.column_stack([numbers_of(column) for column in self.columns.values()])
+        return places, None if self.time is None else seconds_of(self.times, self.time_unit), values
 
 
 def _extend(column: list[Any], cells: Any, count: int) -> None:
@@ -114,7 +114,7 @@ class Units:
 
     def note_programs(self, pending: Pending) -> None:
         """Add to the next transaction what the states of this process are made with."""
-        for tag, about in (one.about() for one in self.sections):
+        for tag, about in (one.streams.about() for one in self.sections):
             if self._programs.get(tag) != about:
                 self._programs[tag] = about
                 pending.programs.append((tag, about))
@@ -155,7 +155,7 @@ class Units:
         unit = next(reversed(self._known), 0) + 1
         made = self.sections[section].add(unit, name)
         settings = made.settings
-        about = {"names": made.section.program.names, "y": settings.y, "u": settings.u,
+        about = {"names": made.streams.program.names, "y": settings.y, "u": settings.u,
                  "parts": settings.match.match(topic), "model": repr(settings.model),
                  "tracker": repr(settings.tracker)}  # fmt: skip
         pending.units.append((unit, name, section, topic, born, msgspec.json.encode(about).decode()))
@@ -171,7 +171,7 @@ class Units:
             if not units:
                 self.refused["no unit for the topic"] += samples.length
             for unit in units:
-                if not gathered[unit.section.index].add(unit.place, samples):
+                if not gathered[unit.streams.index].add(unit.place, samples):
                     unit.rare["no signal"] += samples.length
         found = []
         for section, one in zip(self.sections, gathered, strict=True):
@@ -184,9 +184,9 @@ class Units:
 
     def _paid(self, section: Section, one: Gathered) -> Array:
         """Which messages are within the rate of their units, on average over `SAVED` seconds."""
-        rate, now = section.settings.rate, time.monotonic()
-        saved, then = self._saved[section.index]
-        most = np.full(len(section.begun), SAVED * rate)
+        rate, now = section.streams.settings.rate, time.monotonic()
+        saved, then = self._saved[section.streams.index]
+        most = np.full(section.streams.capacity, SAVED * rate)
         most[: len(saved)] = np.minimum(SAVED * rate, saved + (now - then) * rate)
         places, lengths = np.array(one.places), np.array(one.lengths)
         left = most - np.bincount(places, lengths, len(most))
@@ -198,5 +198,5 @@ class Units:
                 most[place] -= count
             else:
                 section.units[place].rare["flood"] += count
-        self._saved[section.index] = np.where(left < 0.0, most, left), now
+        self._saved[section.streams.index] = np.where(left < 0.0, most, left), now
         return paid
