@@ -255,7 +255,7 @@ class Live(Operated, Stream):
                 self._keep(step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
         else:
             out = np.empty(len(y) if self.model.shared else 1, self._row_type)
-            self._drive(*self._row(y, u, known), out, time)
+            self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))
             step = self._reported(out)
         self._rest(resting)
         return step
