@@ -269,6 +269,21 @@ def test_a_smoothed_path_is_about_as_good_as_with_the_true_drift():
     assert np.mean(inside) > 0.91
 
 
+def test_bands_hold_where_the_walk_is_too_slow_to_be_seen():
+    inside = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        u, theta = rng.normal(size=(500, 3)), 1.0 + np.cumsum(0.003 * rng.normal(size=(500, 3)), axis=0)
+        run = track(MODEL, AdaptiveKalman(), np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=500), u)
+        path = run.smooth()
+        inside.append(np.mean(np.abs(path.theta - theta)[100:] < 1.96 * path.std[100:]))
+    assert 0.93 < np.mean(inside) < 0.97  # with the variances of the average drift alone: 0.91
+    whole = run.smooth(keep="cov")
+    np.testing.assert_allclose(whole.theta, path.theta, rtol=1e-6)
+    spread = np.sqrt([np.diag(whole.cov(t)) for t in range(0, 500, 50)])
+    np.testing.assert_allclose(spread, path.std[::50], rtol=1e-6)
+
+
 def test_drift_is_pooled_over_time_except_at_jumps():
     rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
     rate[7] = 200.0
