@@ -112,7 +112,7 @@ def share_rounding(s: State, per_noise: float, l: int) -> None:
 
 @kernel
 def share_among_filters(s: State, l: int) -> None:
-    """The same for a mixture of filters, whose covariance is s.P and whose mean and variance of readings are its own."""
+    """The same for a mixture of filters with covariance s.P, which has the mean and variance of its readings."""
     n, h = s.theta.shape[0], 0.0
     for i in range(n):
         for j in range(i + 1):
