@@ -17,6 +17,7 @@ from driftfit import (
     Regression,
     Sensor,
     frontier,
+    pool,
     select,
     track,
     tune,
@@ -50,6 +51,8 @@ def every_result():
     found |= {"Selection": select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0)), "Segmentation": run.segment()}
     found |= {"Frontier": frontier(ARX(2, 2), Y, U), "detect": run.detect("innovation")}
     found |= {"Forecast": run.forecast(2, U[:2]), "Prediction": run.ahead(2), "Response": run.step_response(5)}
+    found["Constrained"] = run.constrain("a1 >= 0")
+    found["Pooled"] = pool(track(Regression(1), Kalman(q=0.0, r=1.0), Y.reshape(10, 20), U.reshape(10, 20), by="row"))
     curved = HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2))
     found["HammersteinWiener"] = track(curved, RLS(1.0), Y, U)
     found["Blocks"] = found["HammersteinWiener"].blocks()

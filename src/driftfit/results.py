@@ -25,6 +25,7 @@ from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.bank.results.decided_path import EventSmoothed
 from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.use import simulate, system
+from driftfit.use.constraints.constrained import Constrained, constrain
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
 from driftfit.use.prediction import Prediction
@@ -159,6 +160,14 @@ class Track(result.Track, public=True):
     ) -> Crossing:
         """When a parameter or the output crosses a limit, with an interval; see `driftfit.use.crossing`."""
         return crossing(self._single("crossing"), what, below=below, above=above, horizon=horizon, u=u, level=level)
+
+    def constrain(self, *constraints: str) -> Constrained:
+        """theta known to be within bounds or on planes, as "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1".
+
+        The result has ``theta``, ``std``, ``band()``, ``cov(t)`` and ``prob``; see
+        `driftfit.use.constraints.constrained`.
+        """
+        return constrain(self, *constraints)
 
     def poles(self, at: Any = None) -> Array:
         """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.use.system`."""

@@ -8,6 +8,7 @@ from typing import Any
 from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
 from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
+from driftfit.use.constraints.constrained import Constrained, constrain_stream
 from driftfit.use.forecast import Forecast, forecast_stream
 from driftfit.use.live_system import LiveSystem
 
@@ -36,6 +37,10 @@ class Live(live.Live, public=True):
         outstanding the first row of u is the input that it would receive.
         """
         return forecast_stream(self, h, u)
+
+    def constrain(self, *constraints: str) -> Constrained:
+        """The present theta within constraints, as `Track.constrain`, with T = 1."""
+        return constrain_stream(self, *constraints)
 
     @property
     def system(self) -> LiveSystem:

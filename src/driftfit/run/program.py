@@ -19,9 +19,10 @@ from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type, repeat_tile
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.collected_samples import COLLECTED, collecting
 from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -59,6 +60,13 @@ class Program:
     """Which of several outputs it belongs to, in one of several lanes."""
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
+
+    def __post_init__(self) -> None:
+        if (self.model.hidden is not None) != self.tracker.follows_states:
+            raise ValueError(
+                f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
+                "followed by JointKalman, which moves its hidden states and follows nothing else."
+            )
 
     def __reduce__(self) -> Any:
         """A copy, or a program sent to another process, consists of its fields."""
@@ -158,6 +166,16 @@ class Program:
             self._drivers[keep, steps] = found
         return found
 
+    def lanes(self, count: int) -> Array:
+        """A tile with this program in every lane, at its start; not to be changed, since it is made once."""
+        if count not in self._wide:
+            self._wide[count] = tile_of([self] * count)
+        return self._wide[count]
+
+    @cached_property
+    def _wide(self) -> dict[int, Array]:
+        return {}
+
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
         tile = repeat_tile(self._begin, 1)
@@ -172,6 +190,16 @@ class Program:
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
         return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
+
+    def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
+        """(the routine that runs tiles like this one, an array for the results of T samples).
+
+        With ``collected`` it stores every sample as the tracker receives it, in double precision.
+        """
+        if not collected:
+            return self.fill, self.written(tile, T, keep, dtype)
+        fields = dict.fromkeys((*self.tracker.outputs, *COLLECTED))
+        return self.drivers(steps=collecting(self.steps)).run, np.empty(T, output_type(tile, tuple(fields)))
 
     def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
@@ -221,6 +249,21 @@ def put_columns(given: Array, into: Array) -> None:
         return
     for k in range(into.shape[1]):
         into[:, k] = given[:, k]
+
+
+def put_fields(rows: Array, into: Mapping[str, Array], first: int) -> None:
+    """Copy fields of rows of eight-byte numbers to rows ``first`` and following of arrays of the same types."""
+    words, fields = rows.view(np.int64).reshape(len(rows), -1), rows.dtype.fields or {}
+    for name, values in into.items():
+        put_words(words, fields[name][1] // 8, values.view(np.int64).reshape(len(values), -1), first)
+
+
+@Driver
+def put_words(words: Array, column: int, into: Array, first: int) -> None:
+    """Copy columns of words, row by row: NumPy takes 30 ns for each short row, or reads all rows for each column."""
+    for t in range(words.shape[0]):
+        for k in range(into.shape[1]):
+            into[first + t, k] = words[t, column + k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:

@@ -3,9 +3,10 @@
     phi_t of a structure = its columns of the union's phi_t
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
-them), so all structures use the same rows. Structures with equally many columns have states of the same shape and run
-in parallel, in fleets of up to 32. Several records are run separately, each from the start, and written one after the
-other.
+them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure
+has columns of zeros up to the next size (`driftfit.trackers.parts.padded`), and most share one compiled driver.
+Trackers that do not allow that take a driver for each number of columns. Several records are run separately, each from
+the start, and written one after the other.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.run.fleet import run_fleet
+from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
 from driftfit.run.result import Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.padded import padded, size_of
 
 TOGETHER = 32
 
@@ -94,21 +96,27 @@ class Pool:
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
         """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
-        sizes = sorted({s.n for s in structures if s.columns is not None})
-        for n in sizes:
-            same = [k for k, s in enumerate(structures) if s.n == n and s.columns is not None]
+        sizes = [s.n for s in structures if s.columns is not None]
+        together: dict[int, list[int]] = {}
+        for k, s in enumerate(structures):
+            if s.columns is not None:
+                together.setdefault(size_of(s.n, max(sizes)) if tracker.pads else s.n, []).append(k)
+        for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
-                runs = self._lanes(tracker, [structures[k] for k in part])
+                runs = self._lanes(tracker, [structures[k] for k in part], size)
                 found |= dict(zip(part, runs, strict=True))
         for k, structure in enumerate(structures):
             if structure.columns is None:
                 found[k] = self._alone(tracker, structure)
         return [found[k] for k in range(len(structures))]
 
-    def _lanes(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
-        count, T, n = len(structures), len(self.gaps), structures[0].n
-        u = np.concatenate([self.phi[:, list(s.columns or ())] for s in structures])
+    def _lanes(self, tracker: Tracker, structures: Sequence[Structure], size: int) -> list[Predicted]:
+        """Run structures of at most ``size`` columns in drivers of that size."""
+        count, T, R = len(structures), len(self.gaps), len(self.records)
+        u = np.zeros((count * T, size))
+        for k, structure in enumerate(structures):
+            u[k * T : k * T + T, : structure.n] = self.phi[:, list(structure.columns or ())]
         spans = self.spans
         first = np.array([k * T + span.start for k in range(count) for span in spans])
         length = np.array([span.stop - span.start for _ in range(count) for span in spans])
@@ -118,9 +126,14 @@ class Pool:
             tuple(range(len(first))), first, length, np.tile(self.y, count), u,
             Known(np.tile(known.columns, (count, 1))),
         )  # fmt: skip
-        fleet = run_fleet([Program(Regression(n), tracker)] * len(first), records)
-        R = len(spans)
-        return [joined([predicted(fleet[k * R + r]) for r in range(R)]) for k in range(count)]
+        program = Program(Regression(size), tracker)
+        starts = {n: padded(tracker, n, size) for n in {s.n for s in structures} if n < size}
+        begun = {k * R + r: starts[s.n] for k, s in enumerate(structures) if s.n in starts for r in range(R)}
+        lanes = run_lanes([program] * len(first), records, "std", begun)
+        runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes) if lane is not None]
+        if len(runs) < len(lanes):
+            raise KeyboardInterrupt
+        return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
 
     def _alone(self, tracker: Tracker, structure: Structure) -> Predicted:
         assert structure.model is not None

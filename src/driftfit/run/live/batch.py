@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.clock import LOOK, Clock, Pace, instant
-from driftfit.data.known import Known
+from driftfit.data.known import NOISE, Known
 from driftfit.data.labels import times_of
 from driftfit.data.limits import Gate
 from driftfit.data.record import Reading, Records
@@ -25,6 +25,7 @@ from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.late_input import check_applied
+from driftfit.run.live.rule import FROZEN
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
@@ -123,9 +124,10 @@ class Batched(ABC):
     ) -> Batch:
         """Process T samples at once: results and state are those of `update` for each of them in turn, bit for bit.
 
-        Signals and factors are given as to `track`. Where nothing follows single samples (no ``lag``, no alarms), the
-        compiled loop of a record does the work, at the cost of a record per sample and some 30 us per call; otherwise
-        the samples go through it one by one. The first call compiles the loop, unless `track` has done so before.
+        Signals and factors are given as to `track`. Where nothing needs the state after every sample (no ``lag``, no
+        alarm on a frozen model), the compiled loop of a record does the work, at the cost of a record per sample and
+        some 30 us per call; otherwise the samples go through it one by one. The first call compiles the loop, unless
+        `track` has done so before.
 
         Parameters
         ----------
@@ -204,17 +206,17 @@ class Batched(ABC):
         return records, taken
 
     def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
-        """Drive the tile over rows, and let alarms and windows see each of them.
-
-        ``time`` has the time of each row, or is that of all.
-        """
-        if not self._watching and not self._windows:
+        """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
+        if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
             self._loop(self._tile, y, u, known, out)
+            for lane, alarm in self._watching:
+                noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
+                alarm.take_many(out, lane, noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
             self._loop(self._tile, y[row], u[row], own, out[row])
-            self._keep(out["e"][t], out["s"][t], own[0], instant(time[t]) if isinstance(time, np.ndarray) else time)
+            self._keep(out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
     def _keep(self, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
         """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""

@@ -46,7 +46,7 @@ Factors = tuple[float, Any, float]
 ROWS = "rows"
 """The name of the alarm of outputs that share one theta."""
 
-_FLOAT = np.dtype(np.float64)
+_FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
 
 class Live(Operated, Stream):
@@ -161,19 +161,18 @@ class Live(Operated, Stream):
         if type(u) is not float or self._m != 1:
             if u is LATER and self._m:
                 return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
-            u = self._floats(u)
+            if type(u) is _ARRAY and self._m == 1 and u.size == 1:
+                u = u.item()
+            if type(u) is not float or self._m != 1:
+                u = self._floats(u)
         if time is None:
             return self._update(self._seen, y, u)
         return self._update_at(y, u, time)
 
     def _floats(self, u: Any) -> Any:
         """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
-        if type(u) is np.ndarray:
-            if self._m == 1 and u.size == 1:
-                u = u.item()
-                return u if type(u) is float else self._inputs(u).item()
-            if u.dtype is _FLOAT and u.shape == self._shape:
-                return u if self._m != 1 else u.item()
+        if type(u) is _ARRAY and u.dtype is _FLOAT and u.shape == self._shape and self._m != 1:
+            return u
         return one_or_all(self._inputs(u))
 
     def _update_at(self, y: float, u: Any, time: Any) -> Any:
@@ -256,7 +255,7 @@ class Live(Operated, Stream):
                 self._keep(step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
         else:
             out = np.empty(len(y) if self.model.shared else 1, self._row_type)
-            self._drive(*self._row(y, u, known), out, time)
+            self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))
             step = self._reported(out)
         self._rest(resting)
         return step
