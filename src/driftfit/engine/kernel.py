@@ -114,6 +114,7 @@ def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
     if not sizes:
         return work
     size, others = sizes[0], _for_sizes(work, sizes[1:])
+    work.for_constants = True
 
     @part
     def chosen(n: int, *rest: Any) -> Any:
