@@ -48,7 +48,8 @@ def test_trackers_whose_parameters_are_weighed_together_do_not_pad():
     assert not any(one.pads for one in (RLS(0.98), AugmentedFLS(1.0), Bank(), FLS(1.0, differences=2)))
 
 
-def test_sizes_are_few_and_never_larger_than_the_largest_structure():
-    assert [size_of(n, 9) for n in range(1, 10)] == [6] * 6 + [9] * 3
-    assert [size_of(n, 4) for n in range(1, 5)] == [4] * 4
-    assert size_of(30, 40) == 40
+def test_sizes_are_few_and_as_large_as_the_largest_structure():
+    assert [size_of([1, n], 9, 500) for n in range(1, 10)] == [6] * 6 + [9] * 3
+    assert size_of([2, 4], 4, 500) == 4
+    assert size_of([30], 40, 500) == 40
+    assert size_of([2, 4], 4, 10_000_000) == 0
