@@ -155,9 +155,6 @@ def track(
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
     to : path or None
         A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
-        columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start``.
-    to : path or None
-        A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
         columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start`` and ``prob``.
 
     Returns
