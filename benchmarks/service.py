@@ -2,7 +2,7 @@
 
     python benchmarks/service.py                 all parts at a small size, some two minutes
     python benchmarks/service.py mqtt            one part: journal, engine, mqtt, http, units, soak, fuzz
-    python benchmarks/service.py soak --seconds 3600
+    python benchmarks/service.py soak --seconds 900
     python benchmarks/service.py fuzz --count 100000
     python benchmarks/service.py --quick         the parts that need no broker, in seconds
 
@@ -171,31 +171,30 @@ def send(broker, messages, size, units, rate=1_000_000):
 
 
 def mqtt(options, folder):
-    """Over MQTT: the service, the floor, a consumer by hand; then the latency at a steady rate."""
-    for size, messages in ((1, 20_000), (20, 10_000)):
-        broker = Broker(folder)
-        floor = listened(broker, messages, size, options.units, lambda topic, body: None)
-        known = importlib.util.find_spec("filterpy") is not None
-        by_hand = listened(broker, messages, size, options.units, Peer().handle) if known else None
-        wall, cpu, _ = served(broker, folder / f"s{size}", messages, size, options.units)
+    """Over MQTT: the floor, a consumer by hand, the service without and with a sink; then latencies at a rate."""
+    known = importlib.util.find_spec("filterpy") is not None
+    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  client decode engine   sink")
+    for size, messages in ((1, 20_000), (20, 20_000)):
+        broker, count = Broker(folder), messages * size
+        line(f"{size}, empty (the floor)", count, listened(broker, messages, size, options.units, lambda *_: None))
+        if known:
+            line(f"{size}, filterpy by hand", count, listened(broker, messages, size, options.units, Peer().handle))
+        for what in ("none", "sqlite"):
+            found = served(broker, folder / f"{what}{size}", messages, size, options.units, sink=what)
+            line(f"{size}, the service, sink {what}", count, found[:2], found[3])
         broker.process.terminate()
-        for name, found in (("floor", floor), ("filterpy by hand", by_hand), ("service", (wall, cpu))):
-            if found is None:
-                continue
-            count, (seconds, used) = messages * size, found
-            say(
-                f"mqtt, {size} samples per message, {name} (samples/s, CPU us)",
-                f"{count / seconds:.0f} {used / count * 1e6:.1f}",
-            )
-        say(f"mqtt, {size} samples per message: CPU of the service / floor", f"{cpu / floor[1]:.2f}")
-    broker = Broker(folder)
-    rate = 20_000
-    _, cpu, found = served(broker, folder / "latency", 5_000, 20, options.units, rate // 20)
-    broker.process.terminate()
-    say(
-        f"mqtt at {rate} samples/s: p50, p99 from arrival to result (ms)",
-        f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}",
-    )
+    for rate in (5_000, 20_000):
+        broker = Broker(folder)
+        *_, found, _ = served(broker, folder / f"at{rate}", rate // 4, 20, options.units, rate // 20)
+        broker.process.terminate()
+        what = f"mqtt at {rate} samples/s in messages of 20: p50, p99 (ms)"
+        say(what, f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}")
+
+
+def line(what, count, found, stages=None):
+    seconds, used = found
+    each = [] if stages is None else [f"{stages.get(name, 0.0) / count * 1e6:7.2f}" for name in STAGES]
+    print(f"{what:<44}{count / seconds:>10.0f}{used / count * 1e6:>8.2f} {''.join(each)}", flush=True)
 
 
 class Peer:
@@ -253,25 +252,42 @@ def listened(broker, messages, size, units, handle):
     return found
 
 
-def served(broker, folder, messages, size, units, rate=1_000_000):
-    """(seconds, seconds of CPU, status) of the service, with a sink, for all messages."""
+STAGES = ("paho", "driftfit-source", "engine", "driftfit-sink")
+"""How the names of the threads begin."""
+
+
+def clocks():
+    """Seconds of CPU of every thread, by how its name begins."""
+    found = dict.fromkeys(STAGES, 0.0)
+    for thread in threading.enumerate():
+        for name in STAGES:
+            if thread.name.startswith(name):
+                found[name] += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+    return found
+
+
+def served(broker, folder, messages, size, units, rate=1_000_000, sink="sqlite"):
+    """(seconds, seconds of CPU, status, seconds of CPU by stage) of the service for all messages."""
     source = f'[source.plant]\nkind = "mqtt"\nurl = "mqtt://127.0.0.1:{broker.port}"\ntopic = "plant/+"\n'
-    sink = f'[[sink]]\nkind = "sqlite"\npath = "{folder}.db"\n'
-    config = parse(source + UNIT + sink)
+    more = "" if sink == "none" else f'[[sink]]\nkind = "{sink}"\npath = "{folder}.db"\n'
+    config = parse(source + UNIT + more)
     one = Engine(config, folder)
     warm(one, units)
-    runners = [SourceThread(one, config.sources[0]), SinkThread(one, config.sinks[0])]
-    worker = threading.Thread(target=one.run)
+    runners = [SourceThread(one, config.sources[0]), *(SinkThread(one, each) for each in config.sinks)]
+    worker = threading.Thread(target=one.run, name="engine")
     for thread in (*runners, worker):
         thread.start()
     time.sleep(1.0)
     sender, before = send(broker, messages, size, units, rate), one.samples
     while one.samples == before:
         time.sleep(0.01)
-    begun, cpu = time.perf_counter(), time.process_time()
+    begun, cpu, first = time.perf_counter(), time.process_time(), clocks()
     one.latencies.clear()
-    while one.samples - before < messages * size and time.perf_counter() - begun < 300:
+    while time.perf_counter() - begun < 300 and (
+        one.samples - before < messages * size or any(sink.count < messages * size for sink in runners[1:])
+    ):
         time.sleep(0.01)
+    last = clocks()
     found = time.perf_counter() - begun, time.process_time() - cpu, one.status()
     for runner in runners:
         runner.stop()
@@ -280,7 +296,7 @@ def served(broker, folder, messages, size, units, rate=1_000_000):
         thread.join(30)
     one.close()
     sender.wait()
-    return found
+    return *found, {name: last[name] - first[name] for name in STAGES}
 
 
 def warm(one, units):
@@ -295,7 +311,7 @@ def http(options, folder):
     rng, config = np.random.default_rng(0), parse(HTTP + UNIT)
     one = Engine(config, folder)
     warm(one, options.units)
-    runner, worker = SourceThread(one, config.sources[0]), threading.Thread(target=one.run)
+    runner, worker = SourceThread(one, config.sources[0]), threading.Thread(target=one.run, name="engine")
     runner.start()
     worker.start()
     bodies = []

@@ -22,7 +22,8 @@ from service_support import HTTP, MODEL, TRACKER, UNIT, configured, feed, messag
 
 from driftfit import track
 from driftfit.service.core.journal import Names
-from driftfit.service.sinks.contract import Event, Outcome, Result
+from driftfit.service.core.results import OK, Results
+from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.webhook import Webhook
 from driftfit.service.sources.replay import Replay
 from driftfit.service.sources.tail import Tail
@@ -49,16 +50,14 @@ def until(what, seconds=30.0):
     raise TimeoutError
 
 
-def outcome(count=3, first=1):
+def outcome(count=3, first=1, theta=0.5):
     """A small batch of one unit."""
-    results = [
-        Result(
-            first + k, "pump 1", 1.7e9 + k, 1.0, float("nan"), 0.1, 0.2, True, [0.5, 0.1], [0.1, float("inf")], False
-        )
-        for k in range(count)
-    ]
+    values = np.tile([0.0, 1.0, np.nan, 0.1, 0.2, theta, 0.1, 0.1, np.inf], (count, 1))
+    values[:, 0] = 1.7e9 + np.arange(count)
+    number, unit = first + np.arange(count), np.ones(count, np.int32)
+    parts = [Results(number, unit, np.full(count, OK, np.uint8), values)]
     events = [Event(first, "pump 1", 1.7e9, "alarm", {"kind": "band", "cause": "a1", "statistic": 4.0, "limit": 3.0})]
-    return Outcome(first, results, events, {"pump 1": {"names": ["a1", "b1"], "parts": {"pump": "1"}}})
+    return Outcome(first, parts, events, {1: "pump 1"}, {"pump 1": {"names": ["a1", "b1"], "parts": {"pump": "1"}}})
 
 
 @contextlib.contextmanager
@@ -287,8 +286,7 @@ def test_opcua_from_our_own_server():
     reader = Opcua("in", url, nodes, trigger="a1", period=0.02).open(None)
     begun = until(lambda: reader.read(0.5))
     assert begun.samples[0].columns["a1"][-1] == 0.5
-    batch = outcome(1, 2)
-    writer.write(batch._replace(results=[batch.results[0]._replace(theta=[0.75, 0.2])]))
+    writer.write(outcome(1, 2, theta=0.75))
     found = until(lambda: (one := reader.read(0.5)) and one.samples[0].columns["a1"][-1] == 0.75 and one)
     assert found.samples[0].topic == "plant/1"
     assert found.samples[0].columns["flow"][-1] == 1.0

@@ -160,9 +160,9 @@ def track(
     Returns
     -------
     Track, or a Fleet (from key to Track) for several series or several trackers; with ``to`` the numbers of series and
-    rows written. A model with several outputs (``ny``)
-    takes y (T, ny), or as many names, and returns `driftfit.fleets.Outputs`, or `driftfit.fleets.Shared` if the outputs
-    share one theta; ``tracker`` may then map the name of each output to its tracker, and weights may be (T, ny).
+    rows written. A model with several outputs (``ny``) takes y (T, ny), or as many names, and returns
+    `driftfit.Outputs` (from output to Track), or one Track if the outputs share one theta; ``tracker`` may then map the
+    name of each output to its tracker, and weights may be (T, ny).
 
     Raises
     ------

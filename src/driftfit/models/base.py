@@ -81,6 +81,11 @@ class Model(Settings, ABC):
         """The model of one of several outputs, if its regression needs none of the others; otherwise None."""
         return None
 
+    @property
+    def hidden(self) -> tuple[str, ...] | None:
+        """States among its parameters, which only a tracker that `follows_states` moves; None if it has none."""
+        return None
+
     @abstractmethod
     def memory(self) -> Mapping[str, Any]:
         """Fields of the record that hold the model's memory, with their values before the first sample."""

@@ -22,6 +22,7 @@ from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, o
 from driftfit.engine.kernel import Array, Driver
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.collected_samples import COLLECTED, collecting
 from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -59,6 +60,13 @@ class Program:
     """Which of several outputs it belongs to, in one of several lanes."""
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
+
+    def __post_init__(self) -> None:
+        if (self.model.hidden is not None) != self.tracker.follows_states:
+            raise ValueError(
+                f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
+                "followed by JointKalman, which moves its hidden states and follows nothing else."
+            )
 
     def __reduce__(self) -> Any:
         """A copy, or a program sent to another process, consists of its fields."""
@@ -158,6 +166,16 @@ class Program:
             self._drivers[keep, steps] = found
         return found
 
+    def lanes(self, count: int) -> Array:
+        """A tile with this program in every lane, at its start; not to be changed, since it is made once."""
+        if count not in self._wide:
+            self._wide[count] = tile_of([self] * count)
+        return self._wide[count]
+
+    @cached_property
+    def _wide(self) -> dict[int, Array]:
+        return {}
+
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
         tile = repeat_tile(self._begin, 1)
@@ -172,6 +190,16 @@ class Program:
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
         return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
+
+    def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
+        """(the routine that runs tiles like this one, an array for the results of T samples).
+
+        With ``collected`` it stores every sample as the tracker receives it, in double precision.
+        """
+        if not collected:
+            return self.fill, self.written(tile, T, keep, dtype)
+        fields = dict.fromkeys((*self.tracker.outputs, *COLLECTED))
+        return self.drivers(steps=collecting(self.steps)).run, np.empty(T, output_type(tile, tuple(fields)))
 
     def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""

@@ -30,7 +30,7 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
 from driftfit.use.draws import ahead_by_draws, simulate_by_draws
-from driftfit.use.prediction import Prediction, drift, moved, unbroken
+from driftfit.use.prediction import Prediction, drift, moved, unbroken, within
 from driftfit.use.system import covariances, taken
 
 
@@ -43,6 +43,7 @@ def ahead(run: Track, k: int) -> Prediction:
         If k is below 1, the model cannot be run forward, or theta has a slope.
     """
     whole("ahead", "k", k, 1)
+    within("ahead", run)
     if getattr(run.tracker, "differences", 1) > 1:
         raise ValueError(
             "ahead: predictions over a record assume a constant theta, but here it follows its slope; use run.forecast."
@@ -92,6 +93,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     ValueError
         If u does not fit the model, or the model cannot be run forward.
     """
+    within("simulate", run)
     h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
     inputs = inputs_for(run.model, u, h)
     if inputs.shape[1] != run.model.m:

@@ -3,8 +3,8 @@
     phi_t of a structure = its columns of the union's phi_t
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
-them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure has
-columns of zeros up to the next size (`driftfit.trackers.parts.padded`), so that one driver is compiled for most.
+them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure
+has columns of zeros up to the next size (`driftfit.trackers.parts.padded`), and most share one compiled driver.
 Trackers that do not allow that take a driver for each number of columns. Several records are run separately, each from
 the start, and written one after the other.
 """

@@ -70,6 +70,11 @@ class Layout:
         self.held = np.concatenate(held)
         self.owner = dict(owner)
 
+    @property
+    def size(self) -> int:
+        """Words of a state, W."""
+        return len(self.held)
+
     @cached_property
     def text(self) -> str:
         """Names, kinds and shapes of the fields in order, as in "theta:f4 P:f4,4 rank:i"."""

@@ -17,6 +17,9 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+
+from driftfit.engine.kernel import Array
 
 MOST_SAMPLES = 10_000
 """Samples of one message."""
@@ -116,3 +119,18 @@ def seconds(cell: Any, scale: float) -> float:
             return number(cell) * scale
         return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     return number(cell) * scale
+
+
+def numbers_of(cells: list[Any]) -> Array:
+    """Cells as numbers, as `number` gives them."""
+    try:
+        return np.array(cells, float)
+    except (TypeError, ValueError, OverflowError):
+        return np.array([number(cell) for cell in cells])
+
+
+def seconds_of(cells: list[Any], scale: float) -> Array:
+    """Times as seconds, as `seconds` gives them."""
+    if str in set(map(type, cells)):
+        return np.array([seconds(cell, scale) for cell in cells])
+    return numbers_of(cells) * scale
