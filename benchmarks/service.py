@@ -357,23 +357,29 @@ def units(options, folder):
 
 
 def soak(options, folder):
-    """A steady rate of 2,000 samples a second: memory at the beginning and at the end."""
-    config, rng = parse(HTTP + UNIT), np.random.default_rng(0)
+    """A steady rate of 2,000 samples a second, with a sink: memory, and samples, in ten parts of the time."""
+    sink = f'[[sink]]\nkind = "sqlite"\npath = "{folder / "sink.db"}"\n'
+    config, rng = parse(HTTP + UNIT + sink), np.random.default_rng(0)
     one = Engine(config, folder)
-    worker = threading.Thread(target=one.run)
+    runner, worker = SinkThread(one, config.sinks[0]), threading.Thread(target=one.run, name="engine")
+    runner.start()
     worker.start()
-    begun, clock, seen = time.monotonic(), 0, []
-    while time.monotonic() - begun < options.seconds:
+    begun, clock, part = time.monotonic(), 0, 0
+    print(f"{'soak: seconds':>14} {'samples':>9} {'in the sink':>12} {'MB':>7} {'CPU us':>7}", flush=True)
+    while part < 10:
         for unit in range(100):
             one.intake.put("web", Batch([decode(f"plant/{unit}", payload(clock, 20, rng))], arrived=time.monotonic()))
         clock += 20
-        seen.append(memory())
         time.sleep(max(0.0, begun + clock / 20 - time.monotonic()))
-    say(f"soak of {options.seconds} s: samples", f"{one.samples}")
-    tenth = max(1, len(seen) // 10)
-    say("soak: MB after a tenth, half, all of it", f"{seen[tenth]:.0f} {seen[len(seen) // 2]:.0f} {seen[-1]:.0f}")
+        passed = time.monotonic() - begun
+        if passed >= (part + 1) * options.seconds / 10:
+            part += 1
+            each = time.process_time() / max(one.samples, 1) * 1e6
+            print(f"{passed:>14.0f} {one.samples:>9} {runner.count:>12} {memory():>7.1f} {each:>7.1f}", flush=True)
+    runner.stop()
     one.stop()
-    worker.join(30)
+    for thread in (worker, runner):
+        thread.join(30)
     one.close()
 
 
