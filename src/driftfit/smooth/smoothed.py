@@ -104,7 +104,8 @@ class Smoothed:
 
     @cached_property
     def std(self) -> Array:
-        return np.sqrt(self.r * self._fold * self._path.var)
+        var = self.r * self._fold * self._path.var
+        return np.sqrt(var, out=var)
 
     @property
     def _fold(self) -> float:

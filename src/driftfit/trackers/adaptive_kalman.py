@@ -277,6 +277,10 @@ class AdaptiveKalman(Tracker):
         }
 
     @property
+    def pads(self) -> bool:
+        return True
+
+    @property
     def steps(self) -> TrackerSteps:
         return TrackerSteps(
             predict,

@@ -33,6 +33,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.smooth.parts.elimination import smooth_and_weigh
+from driftfit.smooth.parts.rank import column_scale
 from driftfit.smooth.parts.walk import Walk
 
 JUMP = 10.0
@@ -69,10 +70,11 @@ def average_drift(walk: Walk, time: Array) -> Walk:
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))
+    size = column_scale(walk.phi, walk.weight)
     paths, log_p = [], np.full((len(shapes), len(SCALES)), -np.inf)
     for k, (one, price) in enumerate(shapes):
         for j, scale in enumerate(SCALES):
-            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)))
+            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)), size)
             if solved is None:
                 return walk
             paths.append(solved[0].theta)
