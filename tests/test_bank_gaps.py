@@ -187,9 +187,9 @@ def test_a_bank_is_tuned_by_its_evidence():
     assert tuned.loglik == pytest.approx(track(Regression(N), tuned.tracker, y, u).loglik, abs=1e-9)
     assert tuned.loglik > track(Regression(N), wrong, y, u).loglik + 50.0
     nominal, jump = tuned.tracker.changes
-    for better in (Change(jump.q, prob=0.3 * jump.prob), Change(jump.q, prob=3.0 * jump.prob),
-                   Change(0.2 * np.asarray(jump.q), prob=jump.prob), Change(5.0 * np.asarray(jump.q), prob=jump.prob)):  # fmt: skip
-        other = Bank([nominal, better], KNOWN, p0=2.0)
+    for size, chance in ((1.0, 0.3), (1.0, 3.0), (0.2, 1.0), (5.0, 1.0)):
+        near = Change(size * np.asarray(jump.q), prob=chance * jump.prob)
+        other = Bank([nominal, near], KNOWN, p0=2.0)
         assert track(Regression(N), other, y, u).loglik < tuned.loglik - 0.3
     assert tuned.chosen["scale[change 0]" if "scale[change 0]" in tuned.chosen else "scale[none]"] < 0.1
 
