@@ -52,6 +52,7 @@ from driftfit.engine.drivers import ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import input_names, whole
 from driftfit.models.base import Model
+from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomial_steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
 
 
@@ -188,11 +189,7 @@ class PolynomialModel(Model):
             "damped": np.zeros(self.n),
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
-            "shift": 0.0,
-            "measured": np.nan,
-            "without": 0.0,
-            "started": 0.0,
-            "usable": 0.0,
+            **MEMORY,
         }
 
     @property
