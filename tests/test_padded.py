@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from driftfit import FLS, RLS, AdaptiveKalman, AugmentedFLS, Bank, Kalman, Regression, track
+from driftfit import FLS, RLS, AdaptiveKalman, AugmentedFLS, Bank, Kalman, Law, Regression, track
 from driftfit.run.program import Program
 from driftfit.trackers.parts.padded import padded, size_of
 
@@ -46,9 +46,11 @@ def test_a_parameter_that_is_known_and_never_excited_changes_no_bit(tracker, rec
 def test_trackers_whose_parameters_are_weighed_together_do_not_pad():
     """A cap on the trace, or leaves of a tree, would see the parameter that is not there."""
     assert not any(one.pads for one in (RLS(0.98), AugmentedFLS(1.0), Bank(), FLS(1.0, differences=2)))
+    assert not Kalman(q=0.1, r=1.0, laws={"b1": Law.trend(0.1)}).pads
 
 
-def test_sizes_are_few_and_never_larger_than_the_largest_structure():
-    assert [size_of(n, 9) for n in range(1, 10)] == [6] * 6 + [9] * 3
-    assert [size_of(n, 4) for n in range(1, 5)] == [4] * 4
-    assert size_of(30, 40) == 40
+def test_sizes_are_few_and_as_large_as_the_largest_structure():
+    assert [size_of([1, n], 9, 500) for n in range(1, 10)] == [6] * 6 + [9] * 3
+    assert size_of([2, 4], 4, 500) == 4
+    assert size_of([30], 40, 500) == 40
+    assert size_of([2, 4], 4, 10_000_000) == 0

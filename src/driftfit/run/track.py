@@ -95,7 +95,8 @@ def _task(
 ) -> Task:
     check_roles("track", model, tracker, several=True)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
-    one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
+    if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
+        one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
     if kept.keep == "theta" and len(model.outputs) > 1:
         raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading

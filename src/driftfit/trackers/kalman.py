@@ -180,7 +180,7 @@ class Kalman(Tracker):
 
     @property
     def pads(self) -> bool:
-        return True
+        return self.laws is None
 
     @property
     def steps(self) -> TrackerSteps:

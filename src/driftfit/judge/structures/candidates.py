@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
-from driftfit.run.result import Track, burn_in, track_record
+from driftfit.run.result import Lane, Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.padded import padded, size_of
 
@@ -96,20 +96,39 @@ class Pool:
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
         """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
-        sizes = [s.n for s in structures if s.columns is not None]
+        columns = [k for k, s in enumerate(structures) if s.columns is not None]
+        shared = tracker.pads and columns
+        sizes = [structures[k].n for k in columns]
+        size = size_of(sizes, len(self.names), len(self.gaps)) if shared else 0
         together: dict[int, list[int]] = {}
-        for k, s in enumerate(structures):
-            if s.columns is not None:
-                together.setdefault(size_of(s.n, max(sizes)) if tracker.pads else s.n, []).append(k)
+        for k in columns:
+            together.setdefault(size or structures[k].n, []).append(k)
         for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
                 runs = self._lanes(tracker, [structures[k] for k in part], size)
                 found |= dict(zip(part, runs, strict=True))
+        for models in self._families(tracker, structures):
+            for k, model in models.items():
+                wide = model.as_large_as(list(models.values())) if len(models) > 1 else model
+                runs = [run_within(Program(wide, tracker), Program(model, tracker), one) for one in self.records]
+                found[k] = joined([predicted(run) for run in runs])
+        return [found[k] for k in range(len(structures))]
+
+    def _families(self, tracker: Tracker, structures: Sequence[Structure]) -> list[dict[int, Model]]:
+        """The models that are no columns, by their place: those that share a driver, and each of the others."""
+        families: dict[Any, dict[int, Model]] = {}
         for k, structure in enumerate(structures):
             if structure.columns is None:
-                found[k] = self._alone(tracker, structure)
-        return [found[k] for k in range(len(structures))]
+                assert structure.model is not None
+                shared = tracker.pads and structure.model.family is not None
+                families.setdefault((structure.model.family if shared else k, shared), {})[k] = structure.model
+        found: list[dict[int, Model]] = []
+        for models in families.values():
+            sizes = [model.n for model in models.values()]
+            together = size_of(sizes, max(sizes), len(self.gaps)) > 0
+            found += [models] if together else [{k: model} for k, model in models.items()]
+        return found
 
     def _lanes(self, tracker: Tracker, structures: Sequence[Structure], size: int) -> list[Predicted]:
         """Run structures of at most ``size`` columns in drivers of that size."""
@@ -135,10 +154,21 @@ class Pool:
             raise KeyboardInterrupt
         return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
 
-    def _alone(self, tracker: Tracker, structure: Structure) -> Predicted:
-        assert structure.model is not None
-        program = Program(structure.model, tracker)
-        return joined([predicted(track_record(program, record)) for record in self.records])
+
+def run_within(wide: Program, program: Program, record: Record) -> Track:
+    """The run of a program over a record in the driver of a wider one (`Model.as_large_as`), or in its own."""
+    if wide.model is program.model:
+        return track_record(program, record)
+    n = program.model.n
+    tile = wide.tile(padded(program.tracker, n, wide.model.n))
+    out = wide.run(tile, record)
+    fields = {name: (out.dtype[name], place[1]) for name, place in (out.dtype.fields or {}).items()}
+    own = {
+        name: np.dtype((kind.base, (n, 1) if name in ("theta", "var") else kind.shape))
+        for name, (kind, _) in fields.items()
+    }
+    narrow = {"names": list(own), "formats": list(own.values()), "offsets": [place for _, place in fields.values()]}
+    return Track(program, record, Lane(out.view(np.dtype({**narrow, "itemsize": out.dtype.itemsize})), tile))
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:

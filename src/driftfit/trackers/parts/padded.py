@@ -8,7 +8,7 @@ that are 0. Results are those of n parameters, bit for bit; the cost is that of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,19 @@ import numpy as np
 from driftfit.trackers.base import Tracker
 
 SIZES = (6, 12, 24)
-"""Numbers of parameters of shared drivers: up to the first one a size that is too large costs little."""
+"""Numbers of parameters of shared drivers, so that a search meets few of them."""
+WORK = 5e7
+"""Samples of all structures times the square of the size, up to which a driver of that size saves time: some seconds of
+`AdaptiveKalman`, as long as compiling another driver takes."""
 
 
-def size_of(n: int, largest: int) -> int:
-    """The size of the driver for n parameters if the largest structure has ``largest``."""
-    return min(next((size for size in SIZES if size >= n), largest), largest)
+def size_of(sizes: Sequence[int], most: int, samples: int) -> int:
+    """The size of a driver for structures of these sizes, at most ``most``; 0 if each should have its own.
+
+    ``samples`` is the number of samples of each.
+    """
+    size = min(next((size for size in SIZES if size >= max(sizes)), most), most)
+    return size if len(sizes) * samples * size * size <= WORK else 0
 
 
 def padded(tracker: Tracker, n: int, N: int) -> Mapping[str, Any]:
