@@ -253,7 +253,8 @@ def put_columns(given: Array, into: Array) -> None:
 
 def put_fields(rows: Array, into: Mapping[str, Array], first: int) -> None:
     """Copy fields of rows of eight-byte numbers to rows ``first`` and following of arrays of the same types."""
-    words, fields = rows.view(np.int64).reshape(len(rows), -1), rows.dtype.fields or {}
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    words = rows.view(np.int64).reshape(len(rows), -1)
     for name, values in into.items():
         put_words(words, fields[name][1] // 8, values.view(np.int64).reshape(len(values), -1), first)
 
