@@ -30,25 +30,20 @@ from pathlib import Path
 
 import numpy as np
 
+from driftfit import track
+from driftfit.data.storage import describe
 from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
 from driftfit.service.threads import SinkThread, SourceThread
 
-UNIT = """
-[[unit]]
-match = "plant/{pump}"
-y = "y"
-u = ["u"]
-time = "t"
-dt = 1.0
-model = "ARX(1, 1)"
-tracker = "Kalman(q=1e-4, r=0.1)"
-rate = 1e6
-"""
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from service_support import HTTP
+from service_support import UNIT as TESTED
+
+UNIT = TESTED + "rate = 1e6\n"
 ODD = list(b'0123456789.,:[]{}"-eEtyu nulNa\\\x00\xff')
-HTTP = '[source.web]\nkind = "http"\n'
 
 
 def say(what, value):
@@ -98,33 +93,49 @@ def journal(options, folder):
 
 
 def engine(options, folder):
-    """The engine alone: decoded batches of 20 samples of each of 1,000 units, to stored results."""
-    rng, one = np.random.default_rng(0), Engine(parse(HTTP + UNIT), folder)
-    units, rounds = options.units, 10
+    """The engine alone: decoded batches of 20 samples of each of 1,000 units, to stored results; with alarms too."""
+    for kinds in ((), ("innovation", "band"), ("glr",)):
+        one = Engine(parse(HTTP + UNIT), folder / "-".join(("engine", *kinds)))
+        watched(one, options.units, kinds)
+        wall, cpu = fed(one, options.units, 10)
+        what = f"engine, {options.units} units, batches of 20{', alarms ' * bool(kinds)}{' and '.join(kinds)}"
+        say(f"{what} (samples/s, CPU us)", f"{wall:.0f} {cpu:.1f}")
+        one.close() if kinds else one.journal.close()
+    begun = time.perf_counter()
+    two = Engine(parse(HTTP + UNIT), folder / "engine")
+    say("recovery after a crash (samples/s)", f"{two.recovered / (time.perf_counter() - begun):.0f}")
+    two.close()
+
+
+def watched(one, units, kinds):
+    """Make the units, with the rules of a reference run."""
+    warm(one, units)
+    y, u = np.random.default_rng(0).normal(size=(2, 500))
+    settings = one.config.units[0]
+    run = track(settings.model, settings.tracker, y, u[:, None])
+    rules = [describe(run.detect(kind, every=1e6, reference=400).rule) for kind in kinds]
+    for name in one.units.names if kinds else ():
+        one.act(name, {"do": "calibrated", "rules": rules})
+    one.step(0.0)
+    assert all(len(unit.alarms) == len(kinds) for unit in one.units.resident)
+
+
+def fed(one, units, rounds):
+    """(samples/s, us of CPU of each) of some rounds of 20 samples of every unit, after the first."""
+    rng = np.random.default_rng(0)
     bodies = [[payload(20 * k, 20, rng) for _ in range(50)] for k in range(rounds)]
-    begun, cpu = None, None
     for k in range(rounds):
         if k == 1:
             begun, cpu = time.perf_counter(), time.process_time()
         for unit in range(units):
-            one.intake._batches.append(
-                ("web", Batch([decode(f"plant/{unit}", bodies[k][unit % 50])], arrived=time.monotonic()))
-            )
+            samples = decode(f"plant/{unit}", bodies[k][unit % 50])
+            one.intake._batches.append(("web", Batch([samples], arrived=time.monotonic())))
         while one.intake._batches:
             one.step(0.0)
     while one._pending:
         one.step(0.0)
-    wall, cpu = time.perf_counter() - begun, time.process_time() - cpu
     count = units * 20 * (rounds - 1)
-    say(
-        f"engine, {units} units, batches of 20 (samples/s, us of CPU each)",
-        f"{count / wall:.0f} {cpu / count * 1e6:.1f}",
-    )
-    begun = time.perf_counter()
-    one.close()
-    two = Engine(parse(HTTP + UNIT), folder)
-    say("recovery (samples/s)", f"{two.recovered / (time.perf_counter() - begun):.0f}")
-    two.close()
+    return count / (time.perf_counter() - begun), (time.process_time() - cpu) / count * 1e6
 
 
 class Broker:
@@ -357,23 +368,29 @@ def units(options, folder):
 
 
 def soak(options, folder):
-    """A steady rate of 2,000 samples a second: memory at the beginning and at the end."""
-    config, rng = parse(HTTP + UNIT), np.random.default_rng(0)
+    """A steady rate of 2,000 samples a second, with a sink: memory, and samples, in ten parts of the time."""
+    sink = f'[[sink]]\nkind = "sqlite"\npath = "{folder / "sink.db"}"\n'
+    config, rng = parse(HTTP + UNIT + sink), np.random.default_rng(0)
     one = Engine(config, folder)
-    worker = threading.Thread(target=one.run)
+    runner, worker = SinkThread(one, config.sinks[0]), threading.Thread(target=one.run, name="engine")
+    runner.start()
     worker.start()
-    begun, clock, seen = time.monotonic(), 0, []
-    while time.monotonic() - begun < options.seconds:
+    begun, clock, part = time.monotonic(), 0, 0
+    print(f"{'soak: seconds':>14} {'samples':>9} {'in the sink':>12} {'MB':>7} {'CPU us':>7}", flush=True)
+    while part < 10:
         for unit in range(100):
             one.intake.put("web", Batch([decode(f"plant/{unit}", payload(clock, 20, rng))], arrived=time.monotonic()))
         clock += 20
-        seen.append(memory())
         time.sleep(max(0.0, begun + clock / 20 - time.monotonic()))
-    say(f"soak of {options.seconds} s: samples", f"{one.samples}")
-    tenth = max(1, len(seen) // 10)
-    say("soak: MB after a tenth, half, all of it", f"{seen[tenth]:.0f} {seen[len(seen) // 2]:.0f} {seen[-1]:.0f}")
+        passed = time.monotonic() - begun
+        if passed >= (part + 1) * options.seconds / 10:
+            part += 1
+            each = time.process_time() / max(one.samples, 1) * 1e6
+            print(f"{passed:>14.0f} {one.samples:>9} {runner.count:>12} {memory():>7.1f} {each:>7.1f}", flush=True)
+    runner.stop()
     one.stop()
-    worker.join(30)
+    for thread in (worker, runner):
+        thread.join(30)
     one.close()
 
 

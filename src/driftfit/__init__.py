@@ -30,6 +30,7 @@ from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curv
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
+from driftfit.models.process import process_model
 from driftfit.models.regression import Regression
 from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
@@ -123,6 +124,7 @@ __all__ = [
     "plot_tree",
     "pool",
     "prepare",
+    "process_model",
     "rational_model",
     "segment",
     "select",

@@ -26,6 +26,7 @@ from driftfit.trackers.bank.results.decided_path import EventSmoothed
 from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.use import simulate, system
 from driftfit.use.constraints.constrained import Constrained, constrain
+from driftfit.use.continuous.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
 from driftfit.use.prediction import Prediction
@@ -196,6 +197,13 @@ class Track(result.Track, public=True):
     def to_scipy(self, at: int = -1, dt: float = 1.0, input: int | str = 0) -> Any:
         """The system at a sample as `scipy.signal.dlti`, from one input to y."""
         return system.to_scipy(self, at, dt, input)
+
+    def transfer(self, dt: float = 1.0, input: int | str = 0, at: int = -1) -> Transfer:
+        """The transfer function of one sample from an input, with bands, which converts itself to continuous time.
+
+        ``run.transfer(dt=0.1).continuous()`` has coefficients in the unit of dt, `time_constants` and the way back.
+        """
+        return transfer(self, dt, input, at)
 
     def long_run(self, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
         """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""

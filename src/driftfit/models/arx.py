@@ -236,6 +236,12 @@ class ARX(Model):
             at += nb
         return A, B
 
+    def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        if len(self.outputs) > 1:
+            return super().transfers(theta)
+        A, B = self.polynomials(theta)
+        return A, [(b, A) for b in B]
+
 
 @kernel
 def take_input(s: State, l: int) -> None:

@@ -175,12 +175,8 @@ class StateSpace(Model):
     def recursive(self) -> bool:
         return True
 
-    @property
-    def reach(self) -> int:
-        return self.system.reach
-
     def memory(self) -> Mapping[str, Any]:
-        depth, n = self.reach + 1, self.n
+        depth, n = self.system.reach + 1, self.n
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),

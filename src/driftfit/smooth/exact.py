@@ -42,4 +42,14 @@ def smooth(walk: Walk, keep: str = "std") -> Path:
     if found is None:
         G = triangular_root(walk.q * np.outer(scale, scale))
         found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
-    return found._replace(rank=rank)
+    return spread(walk, found)._replace(rank=rank)
+
+
+def spread(walk: Walk, path: Path) -> Path:
+    """The path with the variance between the paths under all drifts that are possible."""
+    if not len(walk.paths):
+        return path
+    away = np.sqrt(walk.belief)[:, None, None] * (walk.paths - path.theta)
+    cov = path.cov + np.einsum("kti,ktj->tij", away, away) if len(path.cov) else path.cov
+    lag = path.lag_cov + np.einsum("kti,ktj->tij", away[:, :-1], away[:, 1:]) if len(path.lag_cov) else path.lag_cov
+    return path._replace(var=path.var + np.sum(away**2, axis=0), cov=cov, lag_cov=lag)

@@ -9,12 +9,13 @@
     both       e = y - y_hat;  z <- z + g e / s;  P <- P - g g' / s
 
 The extended filter takes the derivatives of f and h at the estimate, which `StateSpace` computes exactly. The
-unscented one evaluates f and h at 2 n + 1 points; it sees how the equations bend within the uncertainty, and is the
-choice where the extended filter is too sure of itself, at 2 to 5 times the cost. Where equations are linear, both are
-the Kalman filter. From three parameters and states on k is 0, and no weight is negative (the cubature rule).
+unscented one evaluates f and h at 2 n + 1 points; it sees how the equations bend within the uncertainty, at up to twice
+the time. The extended filter is too sure of itself after a wide prior on what is multiplied, as a gain and a state.
+Where equations are linear, both are the Kalman filter. From three parameters and states on k is 0, and no weight is
+negative (the cubature rule).
 
-A parameter is held where it is by ``q`` and ``p0`` of 0. q of a state is how wrong its equation is
-at each sample. Both are only as good as these numbers: look at ``run.diagnose()``, and compare by ``run.loglik``.
+A parameter is held where it is by ``q`` and ``p0`` of 0. q of a state is how wrong its equation is at each sample. Both
+filters are only as good as these numbers: look at ``run.diagnose()``, and compare by ``run.loglik``.
 
 Where equations have no finite value at the estimate, or at a point of the unscented filter, the states stay and the
 sample is not used. A gap of several nominal samples repeats equations that do not use dt, at most `MOST` times.
@@ -140,7 +141,7 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift)
+    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
 
 
 @kernel
@@ -238,7 +239,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift)
+    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
 
 
 @dataclass(frozen=True)
@@ -256,8 +257,8 @@ class JointKalman(Tracker):
         not name.
     theta0 : (n,) or None
         Their mean. None: the ``start`` of the model.
-    method : "extended" or "unscented"
-        By derivatives, or by points.
+    method : "unscented" or "extended"
+        By points, or by derivatives.
 
     Raises
     ------
@@ -269,7 +270,7 @@ class JointKalman(Tracker):
     r: float | None = None
     p0: Any = None
     theta0: Any = None
-    method: str = "extended"
+    method: str = "unscented"
 
     required: ClassVar[tuple[str, ...]] = ("q", "r", "p0")
     drift_per_parameter: ClassVar[bool] = True

@@ -12,11 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from driftfit.data.clock import instant
 from driftfit.data.storage import describe, rebuild
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.likelihood_ratio import memory_of, scan
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
@@ -205,9 +204,7 @@ class LiveAlarm:
         after = np.tile(self.statistic, (int(fine.sum()) + 1, 1))
         first = max(window - count, 1)
         if first < len(after):
-            windows = sliding_window_view(every, window)[count + first - window :]
-            after[first:, 0] = np.cumsum(windows * windows, axis=1)[:, -1]
-            after[first:, 1] = np.abs(np.cumsum(windows, axis=1)[:, -1])
+            moving(every[count + first - window :], window, after[first:])
         return np.asarray(after[np.cumsum(fine)])
 
     def plain(self) -> dict[str, Any]:
@@ -232,6 +229,17 @@ class LiveAlarm:
         if state.get("memory"):
             alarm._findings[0] = alarm._memory.findings
         return alarm
+
+
+@Driver
+def moving(g: Array, window: int, into: Array) -> None:
+    """Sums of g^2 and absolute sums of g (k, 2) over windows of g (k + window - 1,), added from the oldest on."""
+    for k in range(into.shape[0]):
+        power, mean = 0.0, 0.0
+        for j in range(window):
+            power += g[k + j] * g[k + j]
+            mean += g[k + j]
+        into[k, 0], into[k, 1] = power, abs(mean)
 
 
 def check_rule(rule: Any) -> AlarmRule:

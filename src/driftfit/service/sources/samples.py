@@ -70,7 +70,7 @@ def decode(topic: str, payload: bytes | str) -> Samples:
     lengths = {len(value) for value in data.values() if isinstance(value, list)}
     if len(lengths) > 1:
         raise ValueError("lists of different lengths; one number per sample in each.")
-    return Samples(topic, _bounded(lengths.pop() if lengths else 1), data)
+    return Samples(topic, bounded(lengths.pop() if lengths else 1), data)
 
 
 def _with_nan(payload: bytes | str) -> Any:
@@ -88,11 +88,12 @@ def _of_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
     names = {name for row in rows[:MOST_SAMPLES] for name in row}
     if len(names) > MOST_FIELDS:
         raise ValueError(f"{len(names)} fields; at most {MOST_FIELDS} are read.")
-    count = _bounded(len(rows))
+    count = bounded(len(rows))
     return Samples(topic, count, {name: [row.get(name) for row in rows] for name in names})
 
 
-def _bounded(count: int) -> int:
+def bounded(count: int) -> int:
+    """A number of samples that one message may have; ValueError for another."""
     if not 0 < count <= MOST_SAMPLES:
         raise ValueError(f"{count} samples in one message; 1 to {MOST_SAMPLES} are read.")
     return count

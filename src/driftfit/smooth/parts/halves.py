@@ -100,7 +100,7 @@ def pivot(s: State, i: int, row: int, h: int) -> float:
     s.z[i, h] = f * z
     s.known_z[i, h] = f * known
     s.f[h] = f
-    return float(f)
+    return f  # type: ignore[no-any-return]
 
 
 @kernel
@@ -205,7 +205,7 @@ def report(s: State, samples: Any, found: Any, t: int, h: int) -> float:
     c = np.sqrt(1.0 - w * spread)
     found.c[t] = c
     found.rho[t] = np.sqrt(w) * e / c if w > 0.0 else np.nan
-    return float(w * e * e)
+    return w * e * e  # type: ignore[no-any-return]
 
 
 @kernel
