@@ -3,7 +3,7 @@
 from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
-from driftfit.fleets import Fleet, Outputs, Shared
+from driftfit.fleets import Fleet, Outputs
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -39,7 +39,7 @@ from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.piecewise import piecewise
 from driftfit.smooth.total_variation import total_variation
-from driftfit.streams import Live, LiveOutputs
+from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
@@ -97,7 +97,6 @@ __all__ = [
     "Law",
     "Legendre",
     "Live",
-    "LiveOutputs",
     "LiveSelection",
     "Model",
     "OutputError",
@@ -108,7 +107,6 @@ __all__ = [
     "Regression",
     "Saturation",
     "Sensor",
-    "Shared",
     "Sigmoid",
     "StateSpace",
     "Track",

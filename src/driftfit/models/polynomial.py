@@ -23,7 +23,9 @@ Every tracker of linear regressions follows theta by the linearisation of y_hat 
 parameters that drift. In contrast to least squares in an `ARX` model they are not biased by coloured noise, and their
 covariance is that of the prediction error estimate.
 
-theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. The start needs care, because
+theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
+beside the readings (`driftfit.models.polynomial_steps.BEYOND`), which a theta that one reading spoiled computes, are
+not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
 autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at
@@ -195,6 +197,7 @@ class PolynomialModel(Model):
             "damped": np.zeros(self.n),
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
+            "extent": np.zeros(1 + self.m),
             "shift": 0.0,
             "measured": np.nan,
             "without": 0.0,

@@ -97,6 +97,13 @@ class Tracker(Settings, ABC):
     def steps(self) -> TrackerSteps:
         """The compiled steps."""
 
+    @property
+    def pads(self) -> bool:
+        """Whether a parameter that is known to be 0 and never excited leaves the others bit for bit as they are without
+        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.padded`).
+        """
+        return False
+
     def state_for(self, model: Model) -> Mapping[str, Any]:
         """The state for a bound model."""
         return self.state(model.n)

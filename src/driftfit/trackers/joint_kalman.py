@@ -141,7 +141,7 @@ def _extended(equations: str, inputs: tuple[str, ...], hidden: int, timed: bool)
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift)
+    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
 
 
 @kernel
@@ -239,7 +239,7 @@ def _unscented(equations: str, inputs: tuple[str, ...], n: int, hidden: int, tim
         else:
             unusable(s, l)
 
-    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift)
+    return TrackerSteps(_repeated(move if hidden else _still, timed), correct, read_extra=read_drift, reads_model=True)
 
 
 @dataclass(frozen=True)

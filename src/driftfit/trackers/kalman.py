@@ -179,6 +179,10 @@ class Kalman(Tracker):
         return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
     @property
+    def pads(self) -> bool:
+        return self.laws is None
+
+    @property
     def steps(self) -> TrackerSteps:
         if self.laws is not None:
             return laws_filter.STEPS
