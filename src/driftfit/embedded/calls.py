@@ -65,6 +65,9 @@ class Calls(Expressions):
         if function in (np.sqrt, math.sqrt):
             self.ops[-1]["square root"] += 1
             return Value("real", f"R_SQRT({one.text})")
+        if function in (np.cos, np.sin):
+            self.ops[-1]["sine"] += 1
+            return Value("real", f"R({function.__name__}({one.text}))")
         if function in (np.int64, int):
             return Value("long", f"((int64_t){one.text})")
         if function in (np.float64, float):
