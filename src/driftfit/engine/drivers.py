@@ -186,9 +186,12 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
 
 
 def _filling(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
-    """A field behind others that ends with a cache line, so that no vector load of a lane block straddles two."""
-    words = np.dtype(list(fields)).itemsize // 8
-    return name, np.float64, (next(rows for rows in range(1, 9) if (words + rows * L) % 8 == 0), L)
+    """A field behind others that ends with a cache line, so that no vector load of a lane block straddles two.
+
+    It has as many rows for every L: a packed state of one lane is read into tiles of any width.
+    """
+    words = np.dtype(list(fields)).itemsize // (8 * L)
+    return name, np.float64, (8 - words % 8, L)
 
 
 def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
