@@ -14,7 +14,7 @@ so C remains a covariance whatever the function returns; a = inf teaches nothing
 times h + r). ``clean`` goes into the leaf's output lags, if the sensor ``cleans``.
 
 The function is compiled by itself, in a second or two, and the compiled routine of a bank calls it by its address
-(`driftfit.engine.callback`); the routine is not recompiled.
+(`driftfit.trackers.bank.leaves.callback`); the routine is not recompiled.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.callback import address_of, call
 from driftfit.engine.kernel import Array, State, floats, kernel, machine, shared
 from driftfit.engine.simd import WIDTH
 from driftfit.trackers.bank.layout import LAST
+from driftfit.trackers.bank.leaves.callback import address_of, call
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, S
 
 LARGEST, LEAST = 1e12, 1e-12
