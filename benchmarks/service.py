@@ -38,19 +38,12 @@ from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
 from driftfit.service.threads import SinkThread, SourceThread
 
-UNIT = """
-[[unit]]
-match = "plant/{pump}"
-y = "y"
-u = ["u"]
-time = "t"
-dt = 1.0
-model = "ARX(1, 1)"
-tracker = "Kalman(q=1e-4, r=0.1)"
-rate = 1e6
-"""
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from service_support import HTTP
+from service_support import UNIT as TESTED
+
+UNIT = TESTED + "rate = 1e6\n"
 ODD = list(b'0123456789.,:[]{}"-eEtyu nulNa\\\x00\xff')
-HTTP = '[source.web]\nkind = "http"\n'
 
 
 def say(what, value):

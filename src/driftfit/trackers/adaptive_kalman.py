@@ -43,6 +43,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -159,6 +160,7 @@ def interact(s: State, l: int) -> None:
 @kernel
 def report(s: State, l: int) -> None:
     mixture(s, l)
+    share_among_filters(s, l)
     if s.ok[l] > 0.0:
         located(s, l)
     interact(s, l)
@@ -174,6 +176,7 @@ def begin(s: State, l: int) -> None:
         whiten_noise(s, l)
         follow(s, whiten_within(s, s.white.ctypes.data, l), l)
         mixture(s, l)
+        share_among_filters(s, l)
         if s.ok[l] > 0.0:
             located_within(s, l)
         interact(s, l)
@@ -266,11 +269,16 @@ class AdaptiveKalman(Tracker):
             **no_proportion(),
             **unresolved(),
             **not_frozen(),
+            **nothing_shared_among_filters(),
             **no_weights(n),
             **white(n),
             **modes,
             **levels,
         }
+
+    @property
+    def pads(self) -> bool:
+        return True
 
     @property
     def steps(self) -> TrackerSteps:
