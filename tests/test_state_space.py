@@ -152,10 +152,10 @@ def test_gaps_repeat_equations_without_dt():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "a line for each"), ("x = x[-1] + theta.a \n x = x[-1]", "name of its own"), ("y = u", "no parameter"),
+        ("", "a line for each"), ("x = x[-1] + theta.a \n x = x[-1]", "must differ"), ("y = u", "no parameter"),
         ("x = x[-2] * theta.a \n y = x", r"may use x\[-1\]"), ("x = y * theta.a \n y = x", "must have a lag"),
         ("x = v * theta.a \n v = x \n y = v", r"may use v\[-1\]"), ("x = theta.x \n y = x", "parameter and of a state"),
-        ("x = theta.a * open('f') \n y = x", "is not understood"), ("dt = theta.a \n y = dt", "name of its own"),
+        ("x = theta.a * open('f') \n y = x", "is not understood"), ("dt = theta.a \n y = dt", "must differ"),
     ],
 )  # fmt: skip
 def test_what_is_no_system_is_refused(text, message):

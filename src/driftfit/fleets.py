@@ -10,9 +10,8 @@ from driftfit.engine.kernel import Array
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.joint_noise import JointNoise
-from driftfit.results import Track
+from driftfit.results import Exported, Track
 from driftfit.run import fleet, keyed_results, outputs, result
-from driftfit.show.cells import cell_of
 from driftfit.show.fleet_summary import FleetSummary, summarise
 from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.plots import plot_fleet, plot_outputs
@@ -25,11 +24,10 @@ from driftfit.use.forecast import Forecast, forecast_outputs
 
 if TYPE_CHECKING:
     import polars
-    import xarray
     from matplotlib.figure import Figure
 
 
-class Judged(keyed_results.KeyedResults):
+class Judged(keyed_results.KeyedResults, Exported):
     """Verbs of results by key; see `driftfit.judge.fleet_verdict`."""
 
     def values(self) -> Iterator[Track]:
@@ -43,9 +41,6 @@ class Judged(keyed_results.KeyedResults):
     def _rows(self) -> dict[Hashable, result.Track]:
         """The results sample by sample: of outputs that share one theta their rows."""
         return {key: run.rows for key, run in self.items()}
-
-    def _repr_html_(self) -> str:
-        return cell_of(self)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
@@ -88,31 +83,6 @@ class Judged(keyed_results.KeyedResults):
         record has them. See `driftfit.use.crossing`.
         """
         return crossings(self._rows(), self.by, what, below, above, horizon, u, level)
-
-    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
-        """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`.
-
-        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
-        """
-        from driftfit.show.export import to_table  # importing polars takes as long as all other imports
-
-        return to_table(self, kind, arrays)
-
-    def to_xarray(self) -> xarray.Dataset:
-        """All results as one xarray dataset, with one dimension more than a `Track`; see `driftfit.show.datasets`."""
-        from driftfit.show.datasets import to_xarray
-
-        return to_xarray(self)
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for any program that reads one."""
-        return self.to_table().__arrow_c_stream__(requested_schema)
-
-    def to_parquet(self, path: str | PathLike[str]) -> None:
-        """Write the same table as Parquet."""
-        from driftfit.show.export import to_parquet
-
-        to_parquet(self, path)
 
 
 class Fleet(fleet.Fleet, Judged, public=True):

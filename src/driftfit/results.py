@@ -38,7 +38,42 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Track(result.Track, public=True):
+class Exported:
+    """Tables, datasets, files, and what a notebook shows: the same for one result and for many."""
+
+    def _repr_html_(self: Any) -> str:
+        return cell_of(self)
+
+    def to_table(self: Any, kind: str = "polars", arrays: bool = False) -> Any:
+        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample, keys first; see
+        `driftfit.show.export`.
+
+        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
+        """
+        from driftfit.show.export import to_table  # importing polars takes as long as all other imports
+
+        return to_table(self, kind, arrays)
+
+    def to_xarray(self: Any) -> xarray.Dataset:
+        """The result as an xarray dataset with the dimensions time and parameter, and one more for keys; see
+        `driftfit.show.datasets`.
+        """
+        from driftfit.show.datasets import to_xarray
+
+        return to_xarray(self)
+
+    def __arrow_c_stream__(self: Any, requested_schema: object | None = None) -> object:
+        """The same table as an Arrow stream, for any program that reads one."""
+        return self.to_table().__arrow_c_stream__(requested_schema)
+
+    def to_parquet(self: Any, path: str | PathLike[str]) -> None:
+        """Write the same table as Parquet."""
+        from driftfit.show.export import to_parquet
+
+        to_parquet(self, path)
+
+
+class Track(result.Track, Exported, public=True):
     __doc__ = result.Track.__doc__
 
     @property
@@ -74,9 +109,6 @@ class Track(result.Track, public=True):
         """Present parameters, and one-step errors compared with those of simpler methods; print it."""
         return summarise(self)
 
-    def _repr_html_(self) -> str:
-        return cell_of(self)
-
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands, prediction against output, innovations; a matplotlib figure.
 
@@ -85,31 +117,6 @@ class Track(result.Track, public=True):
         ValueError for another number.
         """
         return plot_track(self.rows, level, ax)
-
-    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
-        """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`.
-
-        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
-        """
-        from driftfit.show.export import to_table  # importing polars takes as long as all other imports
-
-        return to_table(self, kind, arrays)
-
-    def to_xarray(self) -> xarray.Dataset:
-        """The result as an xarray dataset with the dimensions time and parameter; see `driftfit.show.datasets`."""
-        from driftfit.show.datasets import to_xarray
-
-        return to_xarray(self)
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """The same table as an Arrow stream, for any program that reads one."""
-        return self.to_table().__arrow_c_stream__(requested_schema)
-
-    def to_parquet(self, path: str | PathLike[str]) -> None:
-        """Write the same table as Parquet."""
-        from driftfit.show.export import to_parquet
-
-        to_parquet(self, path)
 
     def blocks(
         self, method: str = "svd-joint", input: str | None = None, output: str = "d1", at: float = 0.0

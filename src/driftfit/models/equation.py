@@ -43,6 +43,7 @@ from driftfit.engine.settings import input_names, numbers
 from driftfit.models.arx import GAP
 from driftfit.models.base import Model
 from driftfit.models.formulas import Formula, compiled, parse
+from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
 """Usable samples for each parameter in which the point of linearisation goes from the start to the estimate."""
@@ -139,8 +140,7 @@ class Equation(Model):
         depth = self.reach + 1
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan), "point": self.begins,
-            "first_point": self.begins, "value": 0.0, "shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0,
-            "started": 0.0,
+            "first_point": self.begins, "value": 0.0, **MEMORY,
         }  # fmt: skip
 
     @property
@@ -196,27 +196,20 @@ def _steps(equation: str, inputs: tuple[str, ...]) -> ModelSteps:
             for i in range(n):
                 s.point[i, l] = s.first_point[i, l]
             evaluate(s, l)
-        good, along = finite(s, l), 0.0
-        for i in range(n):
-            along += s.phi[i, l] * s.point[i, l]
-        s.shift[l] = s.value[l] - along if good else 0.0
+        good = finite(s, l)
+        shift = s.value[l] - along(s, l) if good else 0.0
         if not good:
             s.phi[0, l] = np.nan
-        s.measured[l] = s.y[l]
-        s.y[l] -= s.shift[l]
-        s.started[l] = 1.0 if good else s.started[l]
-        s.dt[l] = s.dt[l] if s.started[l] > 0.0 else 0.0
+        subtract(s, shift, good, l)
 
     @kernel
     def push(s: State, l: int) -> None:
         seen = s.seen[l] > 0.0
-        informed = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))
-        s.y_hat[l] += s.shift[l]
-        known = informed & (s.without[l] < reach)
-        s.without[l] = 0.0 if seen else s.without[l] + 1.0
+        predicted = informed(s, l)
+        known = predicted & (s.without[l] < reach)
+        restore(s, seen, l)
         s.y_lag[0, l] = s.measured[l] if seen else (s.y_hat[l] if known else np.nan)
-        s.usable[l] += s.ok[l]
-        share = min(1.0, s.usable[l] / (SETTLING * n)) if informed & (s.ok[l] > 0.0) else 0.0
+        share = min(1.0, s.usable[l] / (SETTLING * n)) if predicted & (s.ok[l] > 0.0) else 0.0
         for i in range(n):
             moved = s.point[i, l] + share * (s.theta[i, l] - s.point[i, l])
             s.point[i, l] = moved if abs(moved) < LARGEST else s.first_point[i, l]

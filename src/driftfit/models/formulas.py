@@ -1,8 +1,8 @@
 """Formulas as text: their parts, their value in numpy, and compiled code for the value and its derivatives.
 
 The text is read as a syntax tree, of which only arithmetic, comparisons, a conditional expression, names, lags and the
-functions of `FUNCTIONS` are accepted. From the tree code is written that does one operation a line and, beside it, the
-same line for the derivative with respect to every parameter on which it depends (forward differentiation).
+functions of `FUNCTIONS` are accepted. The tree is translated into code with one operation per line, each followed by
+its derivatives with respect to the parameters on which it depends (forward differentiation).
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _lag(node: ast.Subscript) -> int:
 
 @lru_cache(maxsize=256)
 def parse(text: str, known: bool = False) -> Formula:
-    """The parts of a formula; ValueError says what in it is not understood.
+    """The parts of a formula; ValueError names the part that is not understood.
 
     A formula without parameters is an error unless it may be ``known``.
     """
@@ -129,7 +129,7 @@ def parse(text: str, known: bool = False) -> Formula:
 
 
 def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, int], None]) -> None:
-    """Collect parameters and lags; ValueError for whatever is not allowed."""
+    """Collect parameters and lags; ValueError for anything that is not allowed."""
     match node:
         case ast.Constant(value=int() | float()) if not isinstance(node.value, bool):
             return

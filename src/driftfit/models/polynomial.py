@@ -54,6 +54,7 @@ from driftfit.engine.drivers import ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import input_names, whole
 from driftfit.models.base import Model
+from driftfit.models.linearised import MEMORY
 from driftfit.models.polynomial_steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
 
 FORGOTTEN = 40.0
@@ -198,11 +199,7 @@ class PolynomialModel(Model):
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
             "extent": np.zeros(1 + self.m),
-            "shift": 0.0,
-            "measured": np.nan,
-            "without": 0.0,
-            "started": 0.0,
-            "usable": 0.0,
+            **MEMORY,
         }
 
     @property

@@ -13,6 +13,7 @@ import numpy as np
 from driftfit.engine.drivers import LARGEST, SMALLEST, ModelSteps
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.models.arx import GAP
+from driftfit.models.linearised import along, informed, restore, subtract
 
 SETTLING = 4.0
 """Samples for each parameter, at the start, that are a pseudolinear regression."""
@@ -331,7 +332,7 @@ def _regress(p: Places) -> Any:
             s.signals[Y, i, l] = np.nan if broken else s.signals[Y, i, l]
             for j in range(m):
                 s.signals[OWN + EACH * j + U, i, l] = np.nan if broken else s.signals[OWN + EACH * j + U, i, l]
-            for r in (V, VF, E, EF):
+            for r in range(V, ONE):
                 s.signals[r, i, l] = 0.0 if broken else s.signals[r, i, l]
 
     @kernel
@@ -341,16 +342,12 @@ def _regress(p: Places) -> Any:
         take_inputs(s, l)
         y_hat = predict(s, True, l)
         gradient(s, l)
-        along, complete = 0.0, 1.0
+        complete = True
         for i in range(n):
-            complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
-            along += s.phi[i, l] * s.point[i, l]
-        known = (s.usable[l] >= SETTLING * n) & credible(s, y_hat - along, 0, l)
-        s.shift[l] = y_hat - along if known else 0.0
-        s.measured[l] = s.y[l]
-        s.y[l] -= s.shift[l]
-        s.started[l] = 1.0 if complete > 0.0 else s.started[l]
-        s.dt[l] = s.dt[l] if s.started[l] > 0.0 else 0.0
+            complete = complete & (abs(s.phi[i, l]) < LARGEST)
+        shift = y_hat - along(s, l)
+        known = (s.usable[l] >= SETTLING * n) & credible(s, shift, 0, l)
+        subtract(s, shift if known else 0.0, complete, l)
 
     step: Step = regress
     return step
@@ -392,25 +389,23 @@ def _push(p: Places) -> Any:
     @kernel
     def push(s: State, l: int) -> None:
         seen = s.seen[l] > 0.0
-        informed = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))
+        predicted = informed(s, l)
         # w and e of this sample are those of the theta that has learned from it
         enlarge(s, s.measured[l], 0, l)
         linearise(s, l)
         fitted = predict(s, False, l)
         fitted = possible(s, fitted, l) if seen else fitted
-        e = s.measured[l] - fitted if seen & informed else 0.0
+        e = s.measured[l] - fitted if seen & predicted else 0.0
         # what is left of an interpolated sample is rounding, and no regressor
         e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
         e = within(s, e, l)
         begun = s.usable[l] >= 0.5 * SETTLING * n
         v = within(s, e + noise(s, l), l) if begun else 0.0
-        s.y_hat[l] += s.shift[l]
+        known = seen | (predicted & ((na == 0) | (s.without[l] < na)))
+        restore(s, seen, l)
         y = s.measured[l] if seen else s.y_hat[l]
         y = y if seen | credible(s, y, 0, l) else 0.0
-        known = seen | (informed & ((na == 0) | (s.without[l] < na)))
-        s.without[l] = 0.0 if seen else s.without[l] + 1.0
         remember(s, y, known, v, e if begun else 0.0, l)
-        s.usable[l] += s.ok[l]
         if (first_f > 0) & (s.usable[l] < SETTLING * n):
             s.signals[OWN + W, 0, l] = responding(s, y, s.signals[OWN + W, 0, l], l)
 

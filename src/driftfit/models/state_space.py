@@ -1,4 +1,4 @@
-"""Equations with hidden states: signals that nobody measures, and the output that shows them.
+"""Equations with hidden states: signals that are not measured, and an output that depends on them.
 
     x_t = f(x_(t-1), inputs, lags, dt; theta) + w_t        a line for each hidden state
     y_t = h(x_t, inputs, lags, dt; theta) + v_t            the last line
@@ -9,8 +9,8 @@
         v = 3.2 + 0.9 * soc - theta.R0 * i - v1
     ''', start={"soc": 0.9, "v1": 0, "capacity": 2, "R1": 0.02, "R0": 0.05})
 
-The text is read as that of an `Equation`, and never evaluated. A name on the left of a line is a hidden state; that of
-the last line is the output. On the right, ``NAME[-1]`` is the state before, and ``NAME`` the state of the
+The text is read as that of an `Equation`, and never evaluated. The name on the left of a line is a hidden state, and on
+the left of the last line the output. On the right, ``NAME[-1]`` is the state before, and ``NAME`` the state of the
 same sample, in lines after its own. ``dt`` is the interval since the last sample in nominal samples. Equations that do
 not use it are applied once for each nominal sample of a gap, with the inputs held.
 
@@ -59,14 +59,14 @@ class System(NamedTuple):
 
 @lru_cache(maxsize=256)
 def system_of(text: str) -> System:
-    """The parts of equations, one a line; ValueError says what in them is not understood."""
+    """The parts of equations, one per line; ValueError names the part that is not understood."""
     given = [line.strip() for line in str(text).strip().splitlines() if line.strip()]
     if not given:
         raise ValueError("StateSpace: give a line for each hidden state, and one for the output.")
     lines = tuple(parse(line, known=True) for line in given)
     left = tuple(line.output for line in lines)
     if len(set(left)) < len(left) or TIME in left:
-        raise ValueError(f"StateSpace: every line needs a name of its own on the left, not dt; got {', '.join(left)}.")
+        raise ValueError(f"StateSpace: the names on the left must differ, and dt is not one; got {', '.join(left)}.")
     hidden, output = left[:-1], left[-1]
     parameters: dict[str, None] = {}
     inputs: dict[str, None] = {}

@@ -73,7 +73,7 @@ def prepare(
 ) -> list[Job]:
     """Tiles at their start for all series, the longest first.
 
-    With ``collected`` every sample is stored as the tracker receives it, beside the results.
+    With ``collected`` every sample is also stored as the tracker receives it.
     """
     groups = _groups(programs[:: records.ny])
     jobs = [job for group in groups for job in _jobs(programs, records, group, (keep, dtype, collected))]

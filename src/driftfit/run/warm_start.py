@@ -49,7 +49,7 @@ class End(NamedTuple):
         return self
 
     def to_bytes(self) -> bytes:
-        """What `Live.from_bytes` and ``warm_start=`` continue from: a few hundred bytes beside the state itself."""
+        """What `Live.from_bytes` and ``warm_start=`` continue from: a few hundred bytes more than the state itself."""
         lanes = [one.pack(one.tile(state)) for one, state in zip(self.programs, self.states, strict=True)]
         extra = {"last": self.last, "awaits": self.awaits, "dt": self.dt, "zone": self.zone}
         return storage.compact(*written(self.programs, lanes, extra))

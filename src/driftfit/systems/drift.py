@@ -77,13 +77,18 @@ class Ramp(Law):
 
 
 @dataclass(frozen=True)
-class SineIncrement(Law):
-    """Increments that follow a sine wave of ``omega`` radians per sample."""
+class _Sine(Law):
+    """The settings of a sine wave."""
 
     start: float
     amplitude: float
     omega: float
     phase: float = 0.0
+
+
+@dataclass(frozen=True)
+class SineIncrement(_Sine):
+    """Increments that follow a sine wave of ``omega`` radians per sample."""
 
     def path(self, T: int, rng: np.random.Generator) -> Array:
         steps = self.amplitude * np.cos(self.omega * np.arange(T) + self.phase)
@@ -91,13 +96,8 @@ class SineIncrement(Law):
 
 
 @dataclass(frozen=True)
-class SineOffset(Law):
+class SineOffset(_Sine):
     """A sine wave of ``omega`` radians per sample around ``start``."""
-
-    start: float
-    amplitude: float
-    omega: float
-    phase: float = 0.0
 
     def path(self, T: int, rng: np.random.Generator) -> Array:
         wave: Array = self.start + self.amplitude * np.sin(self.omega * np.arange(T) + self.phase)

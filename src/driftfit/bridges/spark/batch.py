@@ -59,7 +59,7 @@ def track(
         As for `driftfit.track`; the model has one output.
     y, u, time : names of columns
         Output, inputs and time (numbers, timestamps or dates). Rows without a time are counted and left out; so are
-        rows at a repeated time, of which the one with the smallest numbers stands: data frames have no order.
+        rows at a repeated time, of which the one with the smallest numbers is used, because data frames have no order.
     by : name or names of columns
         What identifies a unit. Rows in which all of them are null are reported as a unit that failed.
     dt : number, duration or step of the calendar
@@ -148,7 +148,7 @@ class Partition:
         """The part before of a unit that is cut into parts."""
 
     def run(self, table: pa.Table, more: bool) -> Iterator[pa.Table]:
-        """Results of some rows; ``more`` says that their only unit goes on in the next."""
+        """Results of some rows; ``more`` if their only unit continues in the next call."""
         piece = self._piece(table)
         self._going = piece if more else None
         if self.outputs == "samples" and piece.found is not None:

@@ -50,7 +50,7 @@ PLACES = {late.LATE: LATE, late.REPEATED: REPEATED, late.UNTIMED: UNTIMED}
 
 @dataclass(frozen=True)
 class Flow:
-    """What a worker is told of a stream, beside its task.
+    """The settings of a stream that a worker receives in addition to its task.
 
     ``before`` is the tracker that made the states so far, where it was another one; units whose newest time is before
     ``expired`` end.

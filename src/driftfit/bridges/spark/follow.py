@@ -28,7 +28,7 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
 
 STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
-"""What states have beside their unit and their times."""
+"""Columns of states, after those of their unit and their times."""
 
 
 def follow(
@@ -151,7 +151,7 @@ class _Batches:
         if not store.has(batch):
             done = [one for one in store.batches() if one < batch]
             store.write(self._table(rows, done[-1] if done else None), batch)
-            # two states stay: that of the batch before is needed if this one is lost
+            # two are kept: the state of the previous batch is needed if this one is lost
             if done:
                 store.forget(done[-1])
         if self.sink is not None:

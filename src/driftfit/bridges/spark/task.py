@@ -1,4 +1,4 @@
-"""What a worker of Spark is told, and how rows that are sorted by unit become series of arrays."""
+"""The settings that a worker of Spark receives, and how rows that are sorted by unit become series of arrays."""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@ Before sample t, y is expected within y_hat +- z f_t s_t^(1/2), with z the norma
     f_1 = 1,    log f_(t+1) = log f_t + STEP (1[|e_t| > z f_t s_t^(1/2)] - alpha)
 
 within 1 / MOST and MOST. The share of outputs outside is then alpha to within log(MOST) / (STEP T) in any record of T
-used samples, whatever the noise: where the noise is not what the tracker assumes, or the model is not the system, f is
-what its bands lack. f only scales a band, so it says nothing of a bias that lasts. Parameters are scaled by the same
+used samples, for every distribution of the noise: f corrects the width of bands that rest on a wrong noise or a wrong
+model. It only scales a band, and does not correct a lasting bias. Parameters are scaled by the same
 factor, which is a heuristic: their errors are not observed.
 
 f^2 changes by two constant factors, so a stream and a record have the same bits. Samples that are not used change

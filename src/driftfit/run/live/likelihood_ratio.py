@@ -15,10 +15,10 @@ without a fault S ~ N(0, V), V = v G + k^2 G C G. The statistics are
 as normal deviates (Wilson and Hilferty 1931), each the largest over windows of 8, 12, 16, 24, .., 384 samples. Level j
 has sums over blocks of 2^j samples, of which it keeps twelve; a block is the sum of two of the level below, so nothing
 is ever subtracted, and windows of 8 and 12 blocks are compared whenever a block is complete. The size of the change is
-d_j = g_j' V^-1 U / g_j' V^-1 g_j with U = sum phi x, and that of the noise sqrt(mean x^2), x without the clipping.
+d_j = g_j' V^-1 U / g_j' V^-1 g_j with U = sum phi x, and of the noise sqrt(mean x^2), with x not clipped.
 
 The score CUSUM of parameter j, both signs, is C <- max(0, C + log likelihood ratio of a shift by SHIFT standard
-deviations of the noise); that of the noise the same for its variance. They are given as sqrt(2 C), again a deviate.
+deviations of the noise). The CUSUM of the noise is the same for its variance. Reported is sqrt(2 C), again a deviate.
 
 A sample that cannot be used is passed over; an autoregression then waits until its lags are complete. Source: Lai
 (1998) for windowed likelihood ratios, Huber (1964) for the score, Bollerslev (1986) for h. Departures: the covariance
@@ -346,7 +346,7 @@ def scan_scores(phi: Array, g: Array, frozen: Frozen, memory: Memory, findings: 
 def levels(x: Array, numbers: Array, h: Array) -> float:
     """The variances h (T,) of residuals x (T,) in units of their scale; returns sum log h + g^2 / inside.
 
-    With this factor h = 1 is the best constant, whatever the tails.
+    With this factor h = 1 is the best constant for every distribution of x.
     """
     alpha, beta, v, clip = numbers[ALPHA], numbers[BETA], numbers[V], numbers[CLIP]
     total, level = 0.0, 1.0

@@ -5,7 +5,7 @@ streams.
     innovation    sums over the last W used samples of g_t^2 and of g_t (its absolute value), g = e / s, or its normal
                   score among normal innovations
     probability   the probability of a change in the tracker's window
-    glr, cusum    likelihood ratios or cumulated scores on a frozen reference model, beside the tracker
+    glr, cusum    likelihood ratios or cumulated scores on a frozen reference model
                   (`driftfit.run.live.likelihood_ratio`)
 
 A record and a stream use the same operations in the same order, so their results agree bit for bit.

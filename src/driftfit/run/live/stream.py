@@ -230,7 +230,7 @@ class Stream(Batched, Plain, storage.Kept):
         ]
         if "fields" in header:
             restore(source, live.programs, header, arrays, live._tile)
-        else:  # an .npz of arrays, as states were before they had bytes of their own
+        else:  # an .npz of arrays, as states were written before they were packed
             fields = {name: live._tile[name][0] for name in storage.fields(live._tile)}
             several = len(model.outputs) > 1
             storage.restore(source, trackers[0], arrays, "state_", fields if several else state_of(live._tile))

@@ -1,7 +1,7 @@
 """Many series continued from their states, in the lanes of tiles; results as columns in the order of their samples.
 
-What a process does that is given some samples of many series, their states, and no time: no `Track` is made for each
-of them. The samples, results and states of a series are those of its record, bit for bit.
+This is what a process needs that receives a few samples of many series, with their states, and must be fast: no
+`Track` is made for a series. The samples, results and states of a series are those of its record, bit for bit.
 """
 
 from __future__ import annotations

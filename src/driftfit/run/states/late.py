@@ -1,11 +1,11 @@
 """Late rows: samples wait until the newest time of their series is ``hold`` after them, and are released in order of
 time.
 
-With W the newest time minus hold, before some rows arrive and of what is known by then,
+Let W be the newest time minus hold before some rows arrive. A row of time t is
 
-    time <= W                            late, or repeated if it is the newest time: left out and counted
-    time of a row that waits or arrives  repeated: the first of them stands
-    otherwise                            waits, until time <= newest - hold
+    t <= W                               late, or repeated if t is the newest time: left out and counted
+    t is the time of another such row    repeated: the first of them is used
+    otherwise                            kept until t <= newest - hold
 
 so a series is processed in the order of its times, whatever the order within ``hold`` in which its rows arrive: the
 result is that of the sorted record. The order of rows that arrive together does not matter, other than which of several

@@ -137,7 +137,7 @@ def packed(tag: bytes, words: Array) -> bytes:
 
 
 def unpacked(data: bytes) -> tuple[bytes, Array]:
-    """(fingerprint, words); ValueError for what is not a packed state, is damaged, or is of a newer format."""
+    """(fingerprint, words); ValueError for bytes that are damaged, of a newer format, or no packed state."""
     if len(data) < HEAD.size or data[:4] != MAGIC:
         raise ValueError(f"{len(data)} bytes that are not a packed state, which begins with {MAGIC!r}.")
     _, version, sparse, check, tag, count = HEAD.unpack_from(data)

@@ -130,14 +130,13 @@ def _metric(data: bytes) -> dict[int, Any]:
         if field in (NAME, STRING):
             if not isinstance(value, bytes):
                 raise ValueError("a text of Sparkplug that is none.")
-            value = value.decode("utf-8")
+            metric[field] = value.decode("utf-8")
         elif field in (FLOAT, DOUBLE):
             if not isinstance(value, bytes) or len(value) != (4 if field == FLOAT else 8):
                 raise ValueError("a number of Sparkplug of the wrong size.")
-            (value,) = unpack_from("<f" if field == FLOAT else "<d", value)
-        elif not isinstance(value, int):  # data sets, templates, properties
-            continue
-        metric[field] = value
+            (metric[field],) = unpack_from("<f" if field == FLOAT else "<d", value)
+        elif isinstance(value, int):  # the others are data sets, templates, properties
+            metric[field] = value
     return metric
 
 

@@ -93,6 +93,6 @@ def learn_colour(s: State, l: int) -> None:
 
 
 def colour(lane: Mapping[str, Array]) -> tuple[tuple[str, str], ...]:
-    """What a summary says of it: nothing where innovations are white."""
+    """The line of the summary about coloured noise; none where innovations are white."""
     c = float(lane["colour"])
     return (("Coloured noise", f"v + {c:.2g} v of the sample before; the previous innovation is used"),) if c else ()

@@ -129,7 +129,7 @@ def likelihoods(s: State, l: int) -> float:
 
 @kernel
 def as_predicted(s: State, nearest: float, l: int) -> None:
-    """Add, filter by filter, the density without an outlier to the scratch row, where it is not that of ``joint``."""
+    """Add the density without an outlier to the scratch row of each filter, where ``joint`` has another."""
     K, J = s.mu.shape[0], s.nu.shape[0]
     factor = s.noise[l] * s.leverage[l]
     for j in range(J - 1):

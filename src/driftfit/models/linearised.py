@@ -1,0 +1,54 @@
+"""A prediction f(theta) that is not linear in theta, as a regression: the part that models of this kind share.
+
+With the gradient at a point theta',
+
+    phi_t = d f / d theta (theta'),     y_t - shift_t = phi_t' theta_t + v_t,     shift_t = f(theta') - phi_t' theta'
+
+``regress`` calls `subtract` once s.phi is known, and trackers see y_t - shift_t; ``push`` calls `restore`, after which
+s.y_hat is a prediction of y_t again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import State, kernel
+
+MEMORY: Mapping[str, Any] = {"shift": 0.0, "measured": np.nan, "without": 0.0, "usable": 0.0, "started": 0.0}
+"""The shift; y_t; successive samples without an output; usable samples; whether there was a complete regressor."""
+
+
+@kernel
+def along(s: State, l: int) -> float:
+    """phi' theta'"""
+    total = 0.0
+    for i in range(s.phi.shape[0]):
+        total += s.phi[i, l] * s.point[i, l]
+    return total
+
+
+@kernel
+def subtract(s: State, shift: float, complete: bool, l: int) -> None:
+    """y - shift takes the place of y; before the first complete regressor no time passes."""
+    s.shift[l] = shift
+    s.measured[l] = s.y[l]
+    s.y[l] -= shift
+    s.started[l] = 1.0 if complete else s.started[l]
+    s.dt[l] = s.dt[l] if s.started[l] > 0.0 else 0.0
+
+
+@kernel
+def informed(s: State, l: int) -> bool:
+    """Whether the prediction of this sample is one: all regressors were known, and span their directions."""
+    return (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))  # type: ignore[no-any-return]
+
+
+@kernel
+def restore(s: State, seen: bool, l: int) -> None:
+    """The prediction becomes one of y, and the sample is counted."""
+    s.y_hat[l] += s.shift[l]
+    s.without[l] = 0.0 if seen else s.without[l] + 1.0
+    s.usable[l] += s.ok[l]
