@@ -252,11 +252,13 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
 
     rows = rows_of(1, 3, 80)
     y, u, t = (rows[name].to_numpy() for name in "yut")
+    reference = track(MODEL, K, *np.random.default_rng(1).normal(size=(2, 400)))
     for dated in (False, True):
+        rule = reference.detect("glr" if dated else "innovation", every=20.0, reference=300).rule
         hold = np.timedelta64(4, "s") if dated else HOLD
         task = tasks.Task(MODEL, K, "y", ("u",), ("unit",), "t", "1s" if dated else None)
         time = (t * 1e6).astype("M8[us]") if dated else t
-        unit, state, found = Unit(task, hold, dated), None, []
+        unit, state, found = Unit(task, hold, dated, rule), None, []
         order = np.argsort(t + np.random.default_rng(1).uniform(0.0, 3.5, len(t)), kind="stable")
         for part in np.array_split(order, 12):
             stamps = time[part].astype(int) if dated else time[part]
@@ -269,7 +271,18 @@ def test_a_unit_with_keyed_state_gives_what_the_sorted_table_gives():
         for name, path in (("prediction", run.prediction), ("theta_b1[u]", run.theta[:, 2]), ("std_a1", run.std[:, 0])):
             assert same([one[name] for one in good], path[: len(good)])
         assert sorted({one["failed"] for one in found if "failed" in one}) == ["at a repeated time", "without a time"]
-        assert len(state) < 1100
+        alarms, watch = live_alarm(rule), []
+        stamps = np.array([one["t"] for one in good]).astype("M8[us]") if dated else t[: len(good)]
+        for one, stamp in zip(good, stamps, strict=True):
+            alarms[0].update(one["y"], one["u"], time=stamp)
+            watch.append((alarms[1].active, alarms[1].cause if alarms[1].active else None))
+        assert [(one["alarm"], one["cause"]) for one in good] == watch
+
+
+def live_alarm(rule):
+    """A stream and its alarm."""
+    live = Live(MODEL, K, dt="1s" if rule.kind == "glr" else None)
+    return live, live.detect(rule)
 
 
 def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tmp_path):

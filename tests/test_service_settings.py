@@ -104,7 +104,7 @@ def test_check_on_the_command_line(tmp_path):
     path.write_text(HTTP + UNIT.replace("Kalman", "Kallman"))
     done = CliRunner().invoke(app, ["serve", "--check", str(path)])
     assert done.exit_code == 2
-    assert f"{path}:11: tracker: there is no 'Kallman'; did you mean Kalman?" in " ".join(done.output.split())
+    assert f"{path}:11: tracker: there is no 'Kallman'; did you mean Kalman" in " ".join(done.output.split())
 
 
 @pytest.mark.parametrize(

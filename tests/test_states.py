@@ -53,7 +53,7 @@ def test_a_state_is_a_few_hundred_bytes_beside_its_numbers():
     live = Live(ARX(2, 2), K)
     for t in range(60):
         live.update(Y[t], U[t])
-    numbers = 8 * len(live.program.layout.held)
+    numbers = 8 * live.program.layout.size
     assert numbers < 0.7 * live._tile.nbytes
     assert len(live.program.pack(live._tile)) == numbers + 24
     assert len(live.to_bytes()) < numbers + 700

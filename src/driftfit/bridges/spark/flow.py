@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,7 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from driftfit.bridges.spark.pieces import COUNTS, LATE, REPEATED, SUMS, UNTIMED, add, filled, instants, named, results
+from driftfit.bridges.spark.pieces import (
+    COUNTS,
+    LATE,
+    REPEATED,
+    SUMS,
+    UNTIMED,
+    add,
+    alarm_of,
+    filled,
+    instants,
+    named,
+    results,
+    watch_of,
+)
 from driftfit.bridges.spark.task import (
     Series,
     Task,
@@ -22,12 +34,9 @@ from driftfit.bridges.spark.task import (
     units_of,
     words_after,
 )
-from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
-from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import Program, state_of
-from driftfit.run.result import burn_in
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced
 from driftfit.run.warm_start import End, carried
@@ -118,19 +127,12 @@ class Flow:
         """The alarms at every sample, as `LiveAlarm` gives them."""
         assert self.rule is not None
         causes: list[str | None] = [None] * len(some.rows)
-        plain = describe(self.rule)
         lanes = found.lanes()
         for j, k in enumerate(some.keys.tolist()):
-            program, (job, lane) = found.programs[j], lanes[j]
-            if known.watch[k] is None:
-                wait = max(burn_in(program.model.n) - int(earlier[k]), 0)
-                alarm = LiveAlarm(self.rule, program.tracker, program.names, wait)
-            else:
-                alarm = LiveAlarm.of({**json.loads(known.watch[k]), "rule": plain}, program.tracker, program.names)
-            count, first = int(some.length[j]), int(some.first[j])
+            (job, lane), count, first = lanes[j], int(some.length[j]), int(some.first[j])
+            alarm = alarm_of(self.rule, found.programs[j], known.watch[k], int(earlier[k]))
             causes[first : first + count] = alarm.take_many(job.out[:count], lane, np.ones(count))
-            alarm.onsets()
-            known.watch[k] = json.dumps({name: value for name, value in alarm.plain().items() if name != "rule"})
+            known.watch[k] = watch_of(alarm)
         return {"alarm": [cause is not None for cause in causes], "cause": pa.array(causes, pa.string())}
 
     def _left_out(self, known: Known, order: Array, fate: Array) -> Iterator[pa.Table]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,8 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from driftfit.bridges.spark.task import Series, Task, lists
+from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
+from driftfit.run.live.alarm import LiveAlarm
+from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import Program
+from driftfit.run.result import burn_in
 from driftfit.run.states.advance import Advanced
 
 ARROW = {
@@ -122,3 +127,16 @@ def filled(columns: Mapping[str, Any], schema: Mapping[str, str], like: pa.Table
         made[name] = pa.nulls(count, arrow) if column is None else column if isinstance(column, pa.ChunkedArray) else (
             column if isinstance(column, pa.Array) else pa.array(column, arrow))  # fmt: skip
     return pa.table(made)
+
+
+def alarm_of(rule: AlarmRule, program: Program, watch: str | None, earlier: int) -> LiveAlarm:
+    """The alarm of a unit, from what `watch_of` wrote, or after so many earlier samples without one."""
+    if watch is None:
+        return LiveAlarm(rule, program.tracker, program.names, max(burn_in(program.model.n) - earlier, 0))
+    return LiveAlarm.of({**json.loads(watch), "rule": describe(rule)}, program.tracker, program.names)
+
+
+def watch_of(alarm: LiveAlarm) -> str:
+    """The state of an alarm, without its rule."""
+    alarm.onsets()
+    return json.dumps({name: value for name, value in alarm.plain().items() if name != "rule"})

@@ -59,22 +59,26 @@ class Layout:
     def __init__(
         self, record: np.dtype[Any], names: Sequence[str], scratch: Collection[str], owner: Mapping[str, Any]
     ) -> None:
-        held = []
-        shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
-        places: Mapping[str, Any] = record.fields or {}
-        for name in names:
-            if name not in scratch:
-                (*shape, lanes), at = record[name].shape, places[name][1]
-                shapes[name] = (record[name].base.kind, tuple(shape))
-                held.append(at // (8 * lanes) + np.arange(prod(shape)))
-        self.shapes = shapes
-        self.held = np.concatenate(held)
-        self.owner = dict(owner)
-
-    @property
-    def size(self) -> int:
+        self.shapes: dict[str, tuple[str, tuple[int, ...]]] = {
+            name: (record[name].base.kind, record[name].shape[:-1]) for name in names if name not in scratch
+        }
+        self.size = sum(prod(shape) for _, shape in self.shapes.values())
         """Words of a state, W."""
-        return len(self.held)
+        self.owner = dict(owner)
+        self._rows: dict[int, Array] = {}
+
+    def rows(self, tile: Array) -> Array:
+        """The rows (W,) of `words_of` that a packed state holds.
+
+        They depend on the number of lanes, because what fills the cache line between fields does.
+        """
+        lanes = tile["theta"].shape[-1]
+        if lanes not in self._rows:
+            places: Mapping[str, Any] = tile.dtype.fields or {}
+            starts = (places[name][1] // (8 * lanes) for name in self.shapes)
+            counts = (prod(shape) for _, shape in self.shapes.values())
+            self._rows[lanes] = np.concatenate([at + np.arange(n) for at, n in zip(starts, counts, strict=True)])
+        return self._rows[lanes]
 
     @cached_property
     def text(self) -> str:
@@ -89,11 +93,11 @@ class Layout:
 
     def taken(self, tile: Array) -> Array:
         """The words (lanes, W) of the lanes of a tile."""
-        return np.ascontiguousarray(words_of(tile)[self.held].T)
+        return np.ascontiguousarray(words_of(tile)[self.rows(tile)].T)
 
     def put(self, tile: Array, lanes: Any, words: Array) -> None:
         """Set lanes of a tile to states, (W,) or (lanes, W)."""
-        words_of(tile)[self.held[:, None], lanes] = words.reshape(-1, len(self.held)).T
+        words_of(tile)[self.rows(tile)[:, None], lanes] = words.reshape(-1, self.size).T
 
     def field(self, words: Array, name: str) -> Array:
         """A field of numbers of states (.., W), as (.., k)."""
@@ -111,7 +115,7 @@ class Layout:
     def unpack(self, data: bytes) -> Array:
         """The inverse of `pack`; ValueError for anything else."""
         tag, words = unpacked(data)
-        if tag != self.tag or len(words) != len(self.held):
+        if tag != self.tag or len(words) != self.size:
             raise ValueError(
                 f"the bytes hold a state of another model, tracker, setting or version: their fingerprint is "
                 f"{tag.hex()}, that of {self.owner} is {self.tag.hex()}. Use the model and tracker with which they "

@@ -2,9 +2,8 @@
 
     gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
 
-A transaction contains whatever has arrived while the one before was written, so groups grow with the load and nothing
-waits for a timer. Cost: one transaction of 1 to 10 ms per group, and a few microseconds per sample
-(`benchmarks/service.py stages`).
+A transaction contains whatever has arrived since the one before, which is `PACE` seconds ago at least, so groups grow
+with the load. It takes 1 to 10 ms; a sample costs a few microseconds more (`benchmarks/service.py`).
 """
 
 from __future__ import annotations
