@@ -26,6 +26,7 @@ from rich.table import Table
 
 from benchmarks.end_to_end import signals
 from driftfit import ARX, Bank, Beam, Change, Kalman, Regression, Sensor, select, track
+from driftfit.run.program import lanes_of
 
 TRACKER = Kalman(q=1e-4, r=0.01)
 
@@ -47,6 +48,15 @@ def spent(job: Callable[[], Any], turns: int) -> float:
 def by_samples(T: int) -> Callable[[], Any]:
     y, u = signals(T)
     return lambda: track(ARX(2, 2), TRACKER, y, u)
+
+
+def into_used_memory(T: int) -> Callable[[], Any]:
+    """The same loop without new memory for its results, which the process would touch for the first time."""
+    y, u = signals(T)
+    run = track(ARX(2, 2), TRACKER, y, u)
+    program, given = run.program, lanes_of(run.record)
+    out = program.written(program.tile(), T)
+    return lambda: program.fill(program.tile(), *given, out)
 
 
 def by_parameters(n: int) -> Callable[[], Any]:
@@ -93,6 +103,13 @@ def by_candidates(count: int) -> Callable[[], Any]:
 def cases(quick: bool) -> Iterator[Case]:
     few = slice(0, 3) if quick else slice(None)
     yield "T", "track, n = 4", 1.0, [1000, 10_000, 100_000, 1_000_000, 4_000_000][few], by_samples
+    yield (
+        "T",
+        "its loop, into memory used before",
+        1.0,
+        [1000, 10_000, 100_000, 1_000_000, 4_000_000][few],
+        into_used_memory,
+    )
     yield "n", "one sample", 2.0, [2, 4, 12, 24, 48, 100][few], by_parameters
     yield (
         "series",

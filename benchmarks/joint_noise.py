@@ -2,9 +2,9 @@
 
 Two outputs on one regressor, noises of correlation 0.96 and standard deviation 1.02, gains that change by (0.3, -0.3)
 at 60 % of the record, or not at all. For every date of the change the evidence has a closed form: with R unknown
-(matrix normal, inverse Wishart), with R as `joint_noise` estimates it from the whole record and known up to a factor, which is
-what the leaves of a bank on its rows hold, and for an output alone. The change has the covariance R (x) 1 in all of
-them. Prints how often the probability of a change passes one half, and how far log odds are from the exact ones.
+(matrix normal, inverse Wishart), with R as `joint_noise` estimates it from the whole record and known up to a factor,
+which is what the leaves of a bank on its rows hold, and for an output alone. The change has the covariance R (x) 1 in
+all of them. Prints how often the probability of a change passes one half, and how far log odds are from the exact ones.
 
 Run: python benchmarks/joint_noise.py [--quick]
 """

@@ -186,8 +186,11 @@ def test_a_bank_is_tuned_by_its_evidence():
     tuned = tune(Regression(N), wrong, y, u)
     assert tuned.loglik == pytest.approx(track(Regression(N), tuned.tracker, y, u).loglik, abs=1e-9)
     assert tuned.loglik > track(Regression(N), wrong, y, u).loglik + 50.0
-    assert 0.001 < tuned.chosen["prob[jump]"] < 0.05
-    assert 10.0 < tuned.chosen["scale[jump]"] < 100.0  # a standard deviation of 1 is 32 times the given one
+    nominal, jump = tuned.tracker.changes
+    for size, chance in ((1.0, 0.3), (1.0, 3.0), (0.2, 1.0), (5.0, 1.0)):
+        near = Change(size * np.asarray(jump.q), prob=chance * jump.prob)
+        other = Bank([nominal, near], KNOWN, p0=2.0)
+        assert track(Regression(N), other, y, u).loglik < tuned.loglik - 0.3
     assert tuned.chosen["scale[change 0]" if "scale[change 0]" in tuned.chosen else "scale[none]"] < 0.1
 
 

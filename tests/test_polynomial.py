@@ -179,6 +179,24 @@ def test_a_field_of_two_owners_is_refused():
         Program(ARMAX(1).bind(1), Careless(0.99)).tile()
 
 
+def test_units_are_those_of_the_signals_and_fault_codes_leave_no_trace():
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=600)
+    y = signal.lfilter([0.0, 1.0], [1.0, -0.7], u) + 0.3 * rng.normal(size=600)
+    plain = track(OE(1, 1), AdaptiveKalman(), y, u)
+    np.testing.assert_allclose(plain.theta[-1], [1.0, 0.7], atol=0.03)
+    for of_y, of_u in ((1e-6, 1e-6), (1e6, 1e6), (1e-9, 1e3)):
+        other = track(OE(1, 1), AdaptiveKalman(), of_y * y, of_u * u)
+        np.testing.assert_allclose(other.theta[-1] / [of_y / of_u, 1.0], plain.theta[-1], rtol=1e-9)
+    for code, rows, signal_of in ((9999.0, [300], y), (-999.0, range(300, 305), y), (9999.0, [300], u)):
+        kept = signal_of[rows].copy()
+        signal_of[rows] = code
+        run = track(OE(1, 1), AdaptiveKalman(), y, u)
+        np.testing.assert_allclose(run.theta[-1], [1.0, 0.7], atol=0.03)
+        assert run.ok[-100:].all()
+        signal_of[rows] = kept
+
+
 def test_least_squares_forgets_its_start():
     """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep what they said."""
     truth, inside, off = np.array([1.0, 0.5, 0.3, 0.5, 0.8, 1.5, -0.7, 0.9, 2.0]), [], []

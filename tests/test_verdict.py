@@ -1,5 +1,7 @@
 """The verdict: distribution of the test, its error rate, what it names, and the comparison that it carries."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal, stats
@@ -16,6 +18,7 @@ from driftfit.judge.statistics.quadratic import quantile, tail
 from driftfit.judge.statistics.robust import orthonormal, robust_fit
 from driftfit.judge.statistics.supremum import scanned, suprema, together
 from driftfit.judge.statistics.whiteness import crossing, whiteness
+from driftfit.judge.verdict import Moved, sentence
 
 BRIDGE = 1.0 / (np.pi * np.arange(1, 400)) ** 2
 """Weights of the integral of a squared Brownian bridge."""
@@ -485,3 +488,26 @@ def test_constants_of_regressors_that_are_the_same():
     assert got["e"][20:, 0] == pytest.approx(twin.innovation[20:], rel=1e-6, abs=1e-8)
     assert np.abs(got["theta"]).max() < 100.0
     assert compare(run).constant_arx < 2.0 * np.std(y)
+
+
+@pytest.mark.parametrize(("mean", "told"), [(0.0, True), (2.0, False)])
+def test_a_change_that_lags_far_from_zero_explain_too_names_all_of_them(mean, told):
+    """An intercept that moves: with an output far from zero a change of its lag looks the same."""
+    named, instead = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        u, v, y = rng.normal(size=500), 0.3 * rng.normal(size=500), np.full(500, mean / 0.3)
+        for t in range(1, 500):
+            y[t] = 0.7 * y[t - 1] + 0.5 * u[t - 1] + mean + 0.6 * (t >= 250) + v[t]
+        moved = [m for m in track(ARX(1, 1, intercept=True), RLS(0.99), y, u).verdict().parameters if m.moves]
+        named += [{m.name, *m.instead} for m in moved]
+        instead += [m.instead for m in moved]
+    assert len(named) >= 4, named
+    assert all("intercept" in names for names in named)
+    assert any(instead) is not told
+
+
+def test_a_value_is_back_only_if_it_returned():
+    moved = Moved("a", 1.0, 0.01, 0.01, True, 9, "9", -0.4074, -0.415, 0.0007, -0.3203, 1, 9, ("b", "c"))
+    assert sentence(moved).endswith("then -0.3203 at the end (or b or c: their steps explain the record as well)")
+    assert "back to -0.407" in sentence(replace(moved, last=-0.407))

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -27,11 +29,11 @@ def heavy(y: float, y_hat: float, h: float, r: float, last: float) -> tuple[floa
 
 def move_apart() -> None:
     """Put `APART` NaN after every array of banks made from now on."""
-    from driftfit.trackers.bank import bank, memory
-    from driftfit.trackers.bank.layout import MEMORY_AT, REPORTED, ROW, WINDOWS
+    from driftfit.trackers.bank.layout import MEMORY_AT, PACKED, REPORTED, ROW, WINDOWS
 
+    bank: Any = import_module("driftfit.trackers.bank.bank")
     packed = bank.packed
-    inside = [name for name in memory.PACKED if name not in REPORTED]
+    inside = [name for name in PACKED if name not in REPORTED]
 
     def apart(arrays: Any, numbers: Any) -> dict[str, Any]:
         state = packed(arrays, numbers)
@@ -143,7 +145,7 @@ def reduction(rng: np.random.Generator, H: int) -> Any:
     )
     loss = "map" if rng.random() < 0.5 else rng.random((H, H)) * (1.0 - np.eye(H))
     wait = None if rng.random() < 0.5 else 0.01
-    kinds = [
+    kinds: list[Callable[[], Any]] = [
         lambda: Beam(leaves, window), lambda: Hybrid(leaves, min(window, 6), int(rng.integers(0, 3)), 20),
         lambda: Decide(depth, loss, force=True), lambda: Decide("auto", loss, depth, 0.01, wait, True),
         lambda: GPB(min(depth, 3)), lambda: IMM(), lambda: FirstFloor(depth, str(rng.choice(["prior", "posterior"]))),
@@ -172,7 +174,8 @@ def run_banks(seeds: range, quick: bool, noted: Noted) -> int:
         model, bank, record = drawn(rng, form, quick)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            run = track(model, bank, **record, **({"dt": 1.0} if "time" in record else {}))
+            settings: dict[str, Any] = {**record, "dt": 1.0} if "time" in record else record
+            run: Any = track(model, bank, **settings)
         each = list(run.values()) if len(model.outputs) > 1 else [run]
         for one in each:
             one.hypotheses.found()

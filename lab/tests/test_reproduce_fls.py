@@ -25,7 +25,7 @@ def test_medians_over_one_hundred_seeds_are_those_of_the_reference():
 def test_the_best_weights_give_the_reference_error(name, best):
     for method, (error, mu) in zip(METHODS, best, strict=False):
         found = np.median(measure(name, mu, range(40))[:, METHODS.index(method), 0])
-        assert found == pytest.approx(error, rel=0.08)
+        assert found == pytest.approx(error, rel=0.05)
 
 
 def test_dense_banded_and_recursive_solutions_agree():

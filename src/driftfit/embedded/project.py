@@ -254,7 +254,13 @@ def _ordinary(unit: Unit) -> Counter[str]:
 
 def _said(ops: Counter[str]) -> str:
     """Operations in words."""
-    kinds = {"multiply": "multiplication", "add": "addition", "divide": "division", "square root": "square root"}
+    kinds = {
+        "multiply": "multiplication",
+        "add": "addition",
+        "divide": "division",
+        "square root": "square root",
+        "sine": "sine",
+    }
     said = [f"{ops[kind]} {name}{'s' * (ops[kind] > 1)}" for kind, name in kinds.items() if ops[kind]]
     return ", ".join(said[:-1]) + f" and {said[-1]}" if len(said) > 1 else "".join(said)
 

@@ -58,7 +58,8 @@ class Moved:
     moving. ``at``, ``when``: the sample, and its time as text, of its clearest step. ``before``: its value before its
     first step. ``after``: the value furthest from that, and ``std`` the standard error of their difference. ``last``:
     its value after the last step, which is ``before`` again after a temporary fault. ``earliest``, ``latest``: first
-    and last sample of an interval that contains the date of its clearest step with 95 % confidence.
+    and last sample of an interval that contains the date of its clearest step with 95 % confidence. ``instead``: the
+    parameters whose step at that time would explain the record as well; the record does not tell which of them moved.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Moved:
     last: float
     earliest: int
     latest: int
+    instead: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,7 @@ class Verdict(Printed):
             )
         if not self.moving:
             return "The test cannot tell which ones: their regressors are too similar, or all of them move a little."
-        return f"These move: {'; '.join(_sentence(moved) for moved in self.parameters if moved.moves)}."
+        return f"These move: {'; '.join(sentence(moved) for moved in self.parameters if moved.moves)}."
 
     def _gain(self) -> str:
         steady = self.constants
@@ -238,13 +240,15 @@ def better_constants(rivals: tuple[Paired, ...]) -> Paired:
     return min(rivals[1:3], key=lambda rival: rival.rms)
 
 
-def _sentence(moved: Moved) -> str:
+def sentence(moved: Moved) -> str:
     """The change of one parameter in words."""
     text = f"{moved.name} from {moved.before:.4g} to {moved.after:.4g} about {moved.when}"
-    if abs(moved.last - moved.after) <= 2.0 * moved.std:
-        return text
-    back = "back to" if abs(moved.last - moved.before) < abs(moved.last - moved.after) else "then"
-    return f"{text}, {back} {moved.last:.4g} at the end"
+    if abs(moved.last - moved.after) > 2.0 * moved.std:
+        back = "back to" if abs(moved.last - moved.before) < 0.5 * abs(moved.after - moved.before) else "then"
+        text += f", {back} {moved.last:.4g} at the end"
+    if moved.instead:
+        text += f" (or {' or '.join(moved.instead)}: their steps explain the record as well)"
+    return text
 
 
 def p_text(p: float) -> str:
@@ -326,4 +330,6 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, w
     sample, *span = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
-    return Moved(name, L, p, own, named, sample, when, before, after, std, last, *span)
+    similar = steps.instead(i) if steps is not None and named else ()
+    instead = tuple(run.model.names[k] for k in similar)
+    return Moved(name, L, p, own, named, sample, when, before, after, std, last, *span, instead)

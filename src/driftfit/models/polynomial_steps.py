@@ -332,7 +332,7 @@ def _regress(p: Places) -> Any:
             s.signals[Y, i, l] = np.nan if broken else s.signals[Y, i, l]
             for j in range(m):
                 s.signals[OWN + EACH * j + U, i, l] = np.nan if broken else s.signals[OWN + EACH * j + U, i, l]
-            for r in (V, VF, E, EF):
+            for r in range(V, ONE):
                 s.signals[r, i, l] = 0.0 if broken else s.signals[r, i, l]
 
     @kernel

@@ -9,8 +9,9 @@ A large change of one parameter alters the regressors of an ARX model and its re
 parameters seem to change too; once the step is in the regression they no longer do. A slow drift takes several steps of
 the same parameter, a temporary fault two steps that return. The result contains the value before the first step, the
 value furthest from it in units of its standard error, and the last value. A parameter whose furthest value is within
-the error of the first is not named. Bai and Perron (1998) estimate several breaks in all parameters in this sequential
-way; here each step belongs to one parameter.
+the error of the first is not named. Where regressors are nearly collinear, as lags of an output far from zero and an
+intercept are, steps of several parameters explain the same: these are reported together. Bai and Perron (1998) estimate
+several breaks in all parameters in this sequential way; here each step belongs to one parameter.
 """
 
 from __future__ import annotations
@@ -65,10 +66,16 @@ class Attribution(NamedTuple):
     """(n,): value after its last step."""
     moves: Array
     """(n,): whether it has steps, and a significant difference."""
+    similar: tuple[tuple[int, ...], ...] = ()
+    """For each step, the other parameters whose step near that date explains as much."""
 
     def first(self, i: int) -> int | None:
         """The date of the step of parameter i that was found first; None if it has none."""
         return next((step.at for step in self.steps if step.parameter == i), None)
+
+    def instead(self, i: int) -> tuple[int, ...]:
+        """The other parameters to which that step may belong."""
+        return next((s for step, s in zip(self.steps, self.similar, strict=True) if step.parameter == i), ())
 
     def span(self, i: int) -> tuple[int, int] | None:
         """The interval of that date."""
@@ -88,24 +95,30 @@ def attribute(phi: Array, y: Array, test: Constancy, level: float, lags: int | N
     """Explain the changes in y (N,) on phi (N, n) by steps; ``test`` is `constancy(phi, y, lags)`."""
     N, n = phi.shape
     steps: list[Step] = []
+    similar: list[tuple[int, ...]] = []
     p, now = test.p_own.copy(), test
     while len(steps) < min(MOST, N // (4 * n + 8)):
         step = _next(_with(phi, steps), now, n, level)
         if step is None or any(s.parameter == step.parameter and abs(s.at - step.at) <= NEAR * N for s in steps):
             break
         p[step.parameter] = min(p[step.parameter], now.p_own[step.parameter])
+        X = _with(phi, steps)
         steps.append(step)
         later = constancy(_with(phi, steps), y, lags)
         if np.isnan(later.p_joint):
             steps.pop()
             break
+        reach = int(AROUND * N)
+        similar.append(tuple(i for i in _alike(X, now, n, step.at - reach, step.at + reach)[1] if i != step.parameter))
         now = later
     named = {step.parameter for step in steps}
     p = np.array([p[i] if i in named else now.p_own[i] for i in range(n)])
     before, after, std, last = _sizes(_with(phi, steps), y, steps, n, now.noise)
     far = np.abs(after - before) > scipy.special.ndtri(1.0 - 0.5 * level) * std
     spans = tuple(_span(phi, step, steps, test.noise) for step in steps)
-    return Attribution(p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)])
+    return Attribution(
+        p, tuple(steps), spans, before, after, std, last, far & [i in named for i in range(n)], tuple(similar)
+    )
 
 
 def _span(phi: Array, step: Step, steps: list[Step], noise: Noise | None) -> tuple[int, int]:
@@ -138,17 +151,22 @@ def _next(X: Array, test: Constancy, n: int, level: float) -> Step | None:
 def alike(phi: Array, test: Constancy) -> tuple[int, tuple[int, ...]]:
     """The date of the single step that explains most of y, and the parameters whose steps do so about as well."""
     N, n = phi.shape
+    return _alike(phi, test, n, n, N - n)
+
+
+def _alike(X: Array, test: Constancy, n: int, first: int, last: int) -> tuple[int, tuple[int, ...]]:
+    """The same for the first n columns of X (N, ..), and dates from ``first`` to ``last``."""
     if test.noise is None:
         return 0, ()
-    X, held = phi, test.noise.held
+    held = test.noise.held
     if len(test.noise.ar):
-        X, held = whitened(phi, held, test.noise.ar)
+        X, held = whitened(X, held, test.noise.ar)
     Q = np.linalg.qr(X)[0]
     e = held - Q @ (Q.T @ held)
-    found = [_dated(Q, X[:, i], e, n, N - n) for i in range(n)]
+    found = [_dated(Q, X[:, i], e, first, last) for i in range(n)]
     best = max(range(n), key=lambda i: found[i][1])
     at, gain = found[best]
-    noise = max(float(e @ e) - gain, 0.0) / N
+    noise = max(float(e @ e) - gain, 0.0) / len(X)
     return at, tuple(i for i in range(n) if gain - found[i][1] <= ALIKE * noise)
 
 

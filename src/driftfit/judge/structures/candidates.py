@@ -106,8 +106,8 @@ class Pool:
         for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
-                runs = self._lanes(tracker, [structures[k] for k in part], size)
-                found |= dict(zip(part, runs, strict=True))
+                predictions = self._lanes(tracker, [structures[k] for k in part], size)
+                found |= dict(zip(part, predictions, strict=True))
         for models in self._families(tracker, structures):
             for k, model in models.items():
                 wide = model.as_large_as(list(models.values())) if len(models) > 1 else model
@@ -162,13 +162,15 @@ def run_within(wide: Program, program: Program, record: Record) -> Track:
     n = program.model.n
     tile = wide.tile(padded(program.tracker, n, wide.model.n))
     out = wide.run(tile, record)
-    fields = {name: (out.dtype[name], place[1]) for name, place in (out.dtype.fields or {}).items()}
-    own = {
-        name: np.dtype((kind.base, (n, 1) if name in ("theta", "var") else kind.shape))
-        for name, (kind, _) in fields.items()
-    }
-    narrow = {"names": list(own), "formats": list(own.values()), "offsets": [place for _, place in fields.values()]}
-    return Track(program, record, Lane(out.view(np.dtype({**narrow, "itemsize": out.dtype.itemsize})), tile))
+    return Track(program, record, Lane(out.view(_narrow(out.dtype, n)), tile))
+
+
+def _narrow(rows: Any, n: int) -> Any:
+    """The type of rows of results of which only the first n parameters are read."""
+    kinds = {name: rows[name] for name in rows.names}
+    own = [(one.base, (n, 1) if name in ("theta", "var") else one.shape) for name, one in kinds.items()]
+    offsets = [rows.fields[name][1] for name in kinds]
+    return np.dtype({"names": [*kinds], "formats": own, "offsets": offsets, "itemsize": rows.itemsize})
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:

@@ -432,7 +432,7 @@ class Live(Operated, Stream):
     def std(self) -> Array:
         """Their standard deviations: inf for parameters that are not determined yet, NaN without a covariance."""
         var = self._of_lanes("var")
-        return np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
+        return np.sqrt(var) if self.programs[0].tracker.covariance else np.full(var.shape, np.nan)
 
     @property
     def cov(self) -> Array:

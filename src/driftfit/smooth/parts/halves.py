@@ -53,7 +53,7 @@ def workspace(n: int) -> Array:
     Beside z, b and theta are those of the problem whose solution is the constant path ``truth``; ``error`` is the
     largest distance of its solution from that.
     """
-    both = {"U": (n, n), "C": (n, n), "g": (n,), "v": (n,), "f": (), "product": (), "a": (BLOCK, n, n)}
+    both = {"U": (n, n), "C": (n, n), "g": (n,), "v": (n,), "r": (n,), "f": (), "product": (), "a": (BLOCK, n, n)}
     both |= {"z": (n,), "known_z": (n,), "b": (BLOCK, n), "known_b": (BLOCK, n), "theta": (n,), "known": (n,)}
     fields: list[Any] = [(name, np.float64, (*shape, 2)) for name, shape in both.items()]
     fields += [(name, np.float64, (n,)) for name in ("q", "truth", "error")]
@@ -87,8 +87,9 @@ def pivot(s: State, i: int, row: int, h: int) -> float:
     g, z, known = s.g[i, h], s.z[i, h], s.known_z[i, h]
     f = 1.0 / (1.0 + g * s.U[i, i, h])
     for j in range(n):
+        s.r[j, h] = s.U[max(i, j), min(i, j), h]
         if j != i:
-            v = -(g * s.U[max(i, j), min(i, j), h]) * f
+            v = -(g * s.r[j, h]) * f
             s.v[j, h] = v
             s.a[row, i, j, h] = v
             s.z[j, h] += v * z
@@ -135,9 +136,9 @@ def step(s: State, samples: Any, K: int, k: int, row: int) -> float:
                 if j != i:
                     for m in range(j + 1):
                         if m != i:
-                            s.U[j, m, h] += s.v[j, h] * s.U[max(i, m), min(i, m), h]
+                            s.U[j, m, h] += s.v[j, h] * s.r[m, h]
             for j in range(n):
-                s.U[max(i, j), min(i, j), h] *= f
+                s.U[max(i, j), min(i, j), h] = f * s.r[j, h]
     for h in range(2):
         t = sample_of(T, K, h, k)
         if t < T:

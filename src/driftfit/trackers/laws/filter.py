@@ -99,10 +99,10 @@ def forward(law: Array, X: Array, dt: float) -> None:
             for c in range(X.shape[1]):
                 X[k, c] += dt * X[k + 1, c]
         elif kind == COSINE:
-            cos, sin = np.cos(dt * law[RATE, k]), np.sin(dt * law[RATE, k])
+            ahead, aside = np.cos(dt * law[RATE, k]), np.sin(dt * law[RATE, k])
             for c in range(X.shape[1]):
                 one, other = X[k, c], X[k + 1, c]
-                X[k, c], X[k + 1, c] = cos * one + sin * other, cos * other - sin * one
+                X[k, c], X[k + 1, c] = ahead * one + aside * other, ahead * other - aside * one
 
 
 @shared
