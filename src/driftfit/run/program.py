@@ -145,7 +145,7 @@ class Program:
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.states.layout`)."""
-        return self.layout.pack(words_of(tile)[self.layout.held, lane])
+        return self.layout.pack(words_of(tile)[self.layout.held_in(tile), lane])
 
     def unpack(self, data: bytes, tile: Array | None = None, lane: int = 0) -> Array:
         """A tile of one lane, or a lane of the given tile, with the state that `pack` wrote; microseconds.

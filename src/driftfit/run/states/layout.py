@@ -69,7 +69,18 @@ class Layout:
                 held.append(at // (8 * lanes) + np.arange(prod(shape)))
         self.shapes = shapes
         self.held = np.concatenate(held)
+        self._wide: dict[int, Array] = {}
         self.owner = dict(owner)
+
+    def held_in(self, tile: Array) -> Array:
+        """Where the words of a state are in a tile: the filling between fields depends on its number of lanes."""
+        L, fields = tile["theta"].shape[-1], tile.dtype.fields or {}
+        if L == 1:
+            return self.held
+        if L not in self._wide:
+            places = [fields[name][1] // (8 * L) + np.arange(prod(shape)) for name, (_, shape) in self.shapes.items()]
+            self._wide[L] = np.concatenate(places)
+        return self._wide[L]
 
     @property
     def size(self) -> int:
@@ -89,11 +100,11 @@ class Layout:
 
     def taken(self, tile: Array) -> Array:
         """The words (lanes, W) of the lanes of a tile."""
-        return np.ascontiguousarray(words_of(tile)[self.held].T)
+        return np.ascontiguousarray(words_of(tile)[self.held_in(tile)].T)
 
     def put(self, tile: Array, lanes: Any, words: Array) -> None:
         """Set lanes of a tile to states, (W,) or (lanes, W)."""
-        words_of(tile)[self.held[:, None], lanes] = words.reshape(-1, len(self.held)).T
+        words_of(tile)[self.held_in(tile)[:, None], lanes] = words.reshape(-1, len(self.held)).T
 
     def field(self, words: Array, name: str) -> Array:
         """A field of numbers of states (.., W), as (.., k)."""
