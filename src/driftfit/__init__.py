@@ -1,8 +1,8 @@
 """driftfit tracks the parameters of a system while they change."""
 
 from driftfit.checks import check_tracker
+from driftfit.engine import __version__
 from driftfit.engine.settings import DataWarning
-from driftfit.engine.version import __version__
 from driftfit.fleets import Fleet, Outputs
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection

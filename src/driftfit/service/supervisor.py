@@ -18,7 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from driftfit.engine.version import __version__
+from driftfit.engine import __version__
 from driftfit.service.control import Control
 from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import Config

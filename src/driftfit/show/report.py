@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.engine.version import __version__
+from driftfit.engine import __version__
 from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.verdict import Verdict, p_text, verdict
 from driftfit.models.arx import ARX

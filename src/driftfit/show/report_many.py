@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from driftfit.engine.version import __version__
+from driftfit.engine import __version__
 from driftfit.judge.fleet_verdict import Judgement, ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.verdict import p_text
 from driftfit.show.page_parts import document, picture, section, table

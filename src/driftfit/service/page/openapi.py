@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from driftfit.engine.version import __version__
+from driftfit.engine import __version__
 
 
 def _path(method: str, summary: str, query: dict[str, str] | None = None, body: Any = None) -> dict[str, Any]:
