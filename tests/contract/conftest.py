@@ -4,6 +4,7 @@ import pytest
 from contract_table import forms, model_of, ready
 
 from driftfit import ARX
+from driftfit.engine import disk_cache
 from driftfit.trackers import found
 
 EVERY = {
@@ -21,3 +22,13 @@ def tracker(request):
 @pytest.fixture
 def model(tracker):
     return model_of(tracker, ARX(2, 2).bind(1))
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """A folder for compiled code that is empty, and this test's alone."""
+    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "cache",))
+    disk_cache.folder.cache_clear()
+    yield tmp_path / "cache"
+    monkeypatch.undo()
+    disk_cache.folder.cache_clear()

@@ -114,15 +114,6 @@ def test_the_package_can_be_imported_where_no_folder_can_be_written(tmp_path, mo
         disk_cache.folder.cache_clear()
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "cache",))
-    disk_cache.folder.cache_clear()
-    yield tmp_path / "cache"
-    monkeypatch.undo()
-    disk_cache.folder.cache_clear()
-
-
 def test_a_cache_that_can_only_be_read_is_read(tmp_path, monkeypatch):
     filled = tmp_path / "image"
     try:

@@ -27,7 +27,7 @@ import numpy as np
 from numba import types
 
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel
-from driftfit.engine.tracker_part import EDGE, tracker_part
+from driftfit.engine.tracker_part import EDGE, tracker_part, whole_record
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
@@ -343,7 +343,7 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     for machine in tracker.machines:
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
-    part = whole if tracker.reads_model else tracker_part
+    part = whole_record if tracker.reads_model else tracker_part
     sample = _sample(regress, push, _advance(tracker), part)
     keep_more = covariance if keep == "cov" else nothing_more
     run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
@@ -356,12 +356,6 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
         run(as_compiled(tile), y, u, known, out)
 
     return Drivers(checked, *_updates(driver, sample))
-
-
-@kernel
-def whole(s: State) -> State:
-    """All fields of a record."""
-    return s
 
 
 def _stored(store: Any, keep_more: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 
 from numba import types
 
+from driftfit.engine.kernel import State, kernel
 from driftfit.engine.numba_internals import named_intrinsic
 
 EDGE = "edge"
@@ -41,3 +42,9 @@ def _typed(context: Any, record: Any) -> Any:
 
 tracker_part = named_intrinsic("tracker_part", _typed)
 """tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
+
+
+@kernel
+def whole_record(s: State) -> State:
+    """All of the record, for steps that read fields of the model."""
+    return s

@@ -34,7 +34,7 @@ def run(model, tracker, T=20):
     return tile, out
 
 
-def test_steps_serve_every_model_with_as_many_parameters():
+def test_steps_serve_every_model_with_as_many_parameters(own_cache):
     compiled, tracker = steps()
     for model in (Regression(1), ARX(0, 1), ARX(1, 0)):
         run(model, tracker)
