@@ -23,6 +23,7 @@ import secrets
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields as dataclass_fields
 from datetime import datetime, timedelta
 from importlib import import_module
 from io import BytesIO
@@ -46,8 +47,10 @@ CHECKED = 16
 
 
 def describe(settings: Settings) -> dict[str, Any]:
-    """A model or tracker as plain data."""
-    return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": settings.settings()}
+    """A model or tracker as plain data, without absent settings: one that a later version adds changes nothing."""
+    absent = {field.name for field in dataclass_fields(settings) if field.default is None}  # type: ignore[arg-type]
+    given = {name: one for name, one in settings.settings().items() if one is not None or name not in absent}
+    return {"class": f"{type(settings).__module__}:{type(settings).__qualname__}", "settings": given}
 
 
 def rebuild(description: Mapping[str, Any], kind: type) -> Any:

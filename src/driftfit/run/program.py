@@ -20,7 +20,6 @@ from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
 from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, held_in, make_tile, output_type, repeat_tile
 from driftfit.engine.kernel import Array, Driver
-from driftfit.engine.settings import Settings
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collecting
@@ -139,7 +138,11 @@ class Program:
     @cached_property
     def layout(self) -> Layout:
         """Where the fields of a lane are, and which of them a packed state holds."""
-        owner = {"model": _identified(self.model), "tracker": _identified(self.tracker), "output": self.output}
+        owner = {
+            "model": storage.describe(self.model),
+            "tracker": storage.describe(self.tracker),
+            "output": self.output,
+        }
         record = self.tile().dtype
         return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
 
@@ -230,12 +233,6 @@ class Program:
             results = block[: part.stop - a]
             run(tile, y[part], u[part], known if len(known) == 1 else known[part], results)
             _copy(results, out[part])
-
-
-def _identified(settings: Settings) -> dict[str, Any]:
-    """A model or tracker as plain data, without settings of None: one that a later version adds changes nothing."""
-    said = storage.describe(settings)
-    return said | {"settings": {name: value for name, value in said["settings"].items() if value is not None}}
 
 
 def _copy(results: Array, out: Array) -> None:
