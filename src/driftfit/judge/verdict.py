@@ -327,9 +327,11 @@ def _moved(run: Track, rows: Rows, test: Constancy, steps: Attribution | None, w
         if named:
             at, span = steps.first(i) or 0, steps.span(i) or (at, at)
             before, after, std, last = (float(one[i]) for one in (steps.before, steps.after, steps.std, steps.last))
-    sample, *span = (int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span))
+    sample, earliest, latest = (
+        int(rows.at[min(place, len(rows.at) - 1)]) if len(rows.at) else 0 for place in (at, *span)
+    )
     when = run.time_text(sample)
     L, p = float(test.L[i]), float(test.p[i])
     similar = steps.instead(i) if steps is not None and named else ()
     instead = tuple(run.model.names[k] for k in similar)
-    return Moved(name, L, p, own, named, sample, when, before, after, std, last, *span, instead)
+    return Moved(name, L, p, own, named, sample, when, before, after, std, last, earliest, latest, instead)
