@@ -51,7 +51,7 @@ def resident() -> float:
 
 
 def main(quick: bool) -> None:
-    count = 6 if quick else 12
+    count = 3 if quick else 12
     table = Table(box=SIMPLE_HEAD, show_edge=False)
     for head in ("MB for each of", *(str(n) for n in (count // 3, 2 * count // 3, count)), "configurations"):
         table.add_column(head, justify="right")

@@ -101,7 +101,7 @@ def by_candidates(count: int) -> Callable[[], Any]:
 
 
 def cases(quick: bool) -> Iterator[Case]:
-    few = slice(0, 3) if quick else slice(None)
+    few = slice(0, 2) if quick else slice(None)
     yield "T", "track, n = 4", 1.0, [1000, 10_000, 100_000, 1_000_000, 4_000_000][few], by_samples
     yield (
         "T",

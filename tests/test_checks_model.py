@@ -39,7 +39,8 @@ READY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(set(found()) - {"JointARX"}))  # which has several outputs
+# one has several outputs, the other is a model of the list in the record of a larger one (tests/test_padded.py)
+@pytest.mark.parametrize("name", sorted(set(found()) - {"JointARX", "AnyOrders"}))
 def test_models_that_keep_their_promises(name):
     assert name in READY, f"{name}: give it orders, and a stable system, in READY"
     assert check_model(*READY[name]) == []

@@ -102,6 +102,8 @@ def test_benchmarks_run_quickly(command, monkeypatch):
     assert "--quick" in said or "quick: Annotated" in said
     if "import statsmodels" in said:
         pytest.importorskip("statsmodels", reason="there is no statsmodels")
+    if "import JulierSigmaPoints" in said:
+        pytest.importorskip("filterpy", reason="there is no filterpy")
     if "bridges" in said and "spark" in script:
         pytest.importorskip("pyspark", reason="there is no pyspark")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

@@ -21,6 +21,7 @@ from driftfit.engine.settings import one_of
 from driftfit.models.hammerstein_wiener.model import HammersteinWiener
 from driftfit.models.hammerstein_wiener.results.run_blocks import blocks_of
 from driftfit.models.hammerstein_wiener.separation.paths import Blocks, split
+from driftfit.run.keyed_results import KeyedResults
 
 METHODS = ("svd", "svd-joint")
 
@@ -40,7 +41,7 @@ def shared_curves(run: Any, method: str = "svd-joint") -> dict[str, Blocks]:
         For a run of another model, a tracker of minimal parameters, whose curves are separate, or another method.
     """
     one_of("shared_curves", "method", method, METHODS)
-    runs = [run[name] for name in getattr(run, "outputs", ())]
+    runs = list(run.values()) if isinstance(run, KeyedResults) else []
     model = runs[0].model if len(runs) > 1 else None
     if not isinstance(model, HammersteinWiener) or any(one.names != one.model.names for one in runs):
         raise ValueError("shared_curves: takes a run of the products of a HammersteinWiener with several outputs.")
