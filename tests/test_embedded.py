@@ -58,6 +58,7 @@ OTHERS = {
     "second differences": (ARX(1, 1), FLS(100.0, differences=2)),
     "two inputs": (ARX(2, [2, 1], nk=[1, 0], intercept=True), Kalman(q=1e-4, r=0.1)),
     "no input": (ARX(2, 0), Kalman(q=1e-4, r=0.1)),
+    "one parameter": (Regression(1), Kalman(q=1e-4, r=0.1)),
     "polynomials": (HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), Kalman(q=1e-4, r=0.1, p0=1.0)),
 }
 
@@ -143,7 +144,7 @@ def test_other_models_and_settings_do_too(tmp_path, name):
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["blocks", "start", "directional", "two inputs", "polynomials"])
+@pytest.mark.parametrize("name", ["blocks", "start", "directional", "two inputs", "polynomials", "one parameter"])
 def test_a_fixed_rate_changes_no_bit(tmp_path, name):
     model, tracker = OTHERS.get(name, (ARX(2, 2), None))
     if tracker is None:
@@ -224,7 +225,7 @@ def test_the_self_test_passes_unoptimised_and_under_sanitizers(tmp_path, name, f
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["adaptive", "blocks", "start"])
+@pytest.mark.parametrize("name", ["adaptive", "blocks", "start", "one parameter"])
 def test_single_precision_is_close(tmp_path, name):
     said = selftest(tmp_path, name, ["gcc", "-O2", "-DTRACKER_SINGLE"], [])
     assert 0.0 < float(re.search(r"difference is (\S+)", said)[1]) < 1e-4
@@ -242,8 +243,12 @@ def test_the_self_test_passes_on_an_emulated_controller(tmp_path, name, flags):
 def selftest(folder, name, compiler, run):
     """Compile the self-test and run it; it must pass and print one line."""
     kinds = {"adaptive": AdaptiveKalman, "blocks": ExtendedKalman, "start": Kalman}
-    tracker = ready(kinds[name])
-    export_c(tracker.own_model(2, 2, 1) or ARX(2, 2), tracker, folder)
+    if name in OTHERS:
+        model, tracker = OTHERS[name]
+    else:
+        tracker = ready(kinds[name])
+        model = tracker.own_model(2, 2, 1) or ARX(2, 2)
+    export_c(model, tracker, folder)
     target = str(folder / "selftest")
     sources = [str(folder / "tracker.c"), str(folder / "selftest.c")]
     subprocess.run([*compiler, *STRICT, "-o", target, *sources, "-lm"], check=True)

@@ -51,7 +51,7 @@ int main(void) {{
         compare((double)step.variance, STEPS[t * 4 + 2], {s_scale});
         if (step.ok != (int)STEPS[t * 4 + 3]) wrong++;
     }}
-    for (int i = 0; i < TRACKER_PARAMETERS; i++) compare((double)state.theta[i], THETA[i], {theta_scale});
+    for (int i = 0; i < TRACKER_PARAMETERS; i++) compare((double){last}, THETA[i], {theta_scale});
     printf("%s: %d of %d results differ, the largest difference is %.3g of the largest result\\n",
            wrong ? "FAILED" : "passed", wrong, SAMPLES * 4 + TRACKER_PARAMETERS, worst);
     return wrong ? 1 : 0;
@@ -85,8 +85,9 @@ def selftest(model: Model, tracker: Tracker) -> str:
     steps = np.array([live.update(float(y[t]), u[t, : model.m]) for t in range(SAMPLES)], dtype=float)
     scales = [max(float(np.max(np.abs(_finite(part)), initial=0.0)), 1e-30) for part in
               (y, steps[:, 2], live.theta)]  # fmt: skip
+    last = "state.theta[i]" if len(live.theta) > 1 else "state.theta"
     return PROGRAM.format(
-        T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u), steps=_listed(steps),
+        T=SAMPLES, m=max(model.m, 1), bound=BOUND, y=_listed(y), u=_listed(u), steps=_listed(steps), last=last,
         theta=_listed(live.theta), y_scale=repr(scales[0]), s_scale=repr(scales[1]), theta_scale=repr(scales[2]),
     )  # fmt: skip
 

@@ -149,7 +149,8 @@ class Statements(Calls):
         start, stop = (lifted(0), bounds[0]) if len(bounds) == 1 else (bounds[0], bounds[1])
         step = int(bounds[2].constant) if len(bounds) == 3 else 1
         fixed = range(start.constant, stop.constant, step) if start.known and stop.known else None
-        if fixed is not None and len(fixed) <= 1:
+        left = any(isinstance(one, ast.Break | ast.Continue) for one in ast.walk(node))
+        if fixed is not None and len(fixed) <= (0 if left else 1):
             for turn in fixed:
                 self.locals[node.target.id] = lifted(turn)
                 self.block(node.body)
