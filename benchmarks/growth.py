@@ -102,23 +102,13 @@ def by_candidates(count: int) -> Callable[[], Any]:
 
 def cases(quick: bool) -> Iterator[Case]:
     few = slice(0, 2) if quick else slice(None)
-    yield "T", "track, n = 4", 1.0, [1000, 10_000, 100_000, 1_000_000, 4_000_000][few], by_samples
-    yield (
-        "T",
-        "its loop, into memory used before",
-        1.0,
-        [1000, 10_000, 100_000, 1_000_000, 4_000_000][few],
-        into_used_memory,
-    )
+    lengths = [1000, 10_000, 100_000, 1_000_000, 4_000_000][few]
+    yield "T", "track, n = 4", 1.0, lengths, by_samples
+    yield "T", "its loop, into memory used before", 1.0, lengths, into_used_memory
     yield "n", "one sample", 2.0, [2, 4, 12, 24, 48, 100][few], by_parameters
-    yield (
-        "series",
-        "fleet of 100 rows each, theta in float32",
-        1.0,
-        [100, 1000, 10_000, 100_000, 1_000_000][few],
-        by_series,
-    )
-    yield "series", "the same to Parquet", 1.0, [100, 1000, 10_000][few], to_parquet
+    counts = [100, 1000, 10_000, 100_000, 1_000_000][few]
+    yield "series", "fleet of 100 rows each, theta in float32", 1.0, counts, by_series
+    yield "series", "the same to Parquet", 1.0, counts[:3], to_parquet
     yield "leaves", "Bank with Beam, n = 4, T = 1000", 1.0, [8, 16, 32, 64, 128][few], by_leaves
     yield "outputs", "Regression(1), T = 20,000", 1.0, [2, 4, 8, 16, 32][few], by_outputs
     yield "candidates", "select among ARX models, T = 1000", 1.0, [3, 9, 18, 27][few], by_candidates

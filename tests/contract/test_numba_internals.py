@@ -19,7 +19,7 @@ from numba.core.compiler import Flags
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate
 
-from driftfit.engine import disk_cache, kernel
+from driftfit.engine import kernel
 from driftfit.engine import numba_internals as internals
 from driftfit.engine.kernel import Driver, cubes, floats, machine, part, shared, wholes
 from driftfit.engine.simd import fill, load, plus, store
@@ -28,13 +28,7 @@ SRC = Path(__file__).parents[2] / "src" / "driftfit"
 VECTOR = types.Array(types.float64, 1, "C")
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(disk_cache, "folders", lambda: (tmp_path / "cache",))
-    disk_cache.folder.cache_clear()
-    yield tmp_path / "cache"
-    monkeypatch.undo()
-    disk_cache.folder.cache_clear()
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def first(y):

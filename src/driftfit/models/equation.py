@@ -42,7 +42,7 @@ from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import input_names, numbers
 from driftfit.models.arx import GAP
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, compiled, parse
+from driftfit.models.formulas import Formula, check_inputs, compiled, parse
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -95,9 +95,7 @@ class Equation(Model):
             self._set("start", numbers("Equation", "start", given, ndim=0))
 
     def bind(self, inputs: int | Sequence[str]) -> Equation:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if count != self.m:
-            raise ValueError(f"Equation: {self.m} inputs ({', '.join(self.input_names)}), but u has {count} columns.")
+        check_inputs(self, inputs)
         return self
 
     @property

@@ -279,6 +279,14 @@ def _product(x: str, times: int) -> str:
     return " * ".join([x] * times) if times else "1.0"
 
 
+def check_inputs(model: Any, inputs: int | Sequence[str]) -> None:
+    """Raise ValueError unless there are as many inputs as the equations of a model name."""
+    count = inputs if isinstance(inputs, int) else len(inputs)
+    if count != model.m:
+        names = ", ".join(model.input_names)
+        raise ValueError(f"{type(model).__name__}: {model.m} inputs ({names}), but u has {count} columns.")
+
+
 @lru_cache(maxsize=256)
 def compiled(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
     """The kernel that writes s.value and s.phi at s.point, from s.y_lag and s.u_lag (a row for each input)."""

@@ -39,7 +39,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import input_names, numbers
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, Writer, parse, written
+from driftfit.models.formulas import Formula, Writer, check_inputs, parse, written
 
 TIME = "dt"
 
@@ -133,9 +133,7 @@ class StateSpace(Model):
             self._set("start", numbers("StateSpace", "start", self.start, ndim=0))
 
     def bind(self, inputs: int | Sequence[str]) -> StateSpace:
-        count = inputs if isinstance(inputs, int) else len(inputs)
-        if count != self.m:
-            raise ValueError(f"StateSpace: {self.m} inputs ({', '.join(self.input_names)}), but u has {count} columns.")
+        check_inputs(self, inputs)
         return self
 
     @property
