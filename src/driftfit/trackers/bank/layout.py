@@ -58,11 +58,12 @@ is another than that of one nominal interval, PARTED that leaves are continued a
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
-) = range(22)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, ENTERS, SIZE,
+) = range(23)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
 prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
-variance before the tree grows: the residuals until then; inf for a variance that is given.
+variance before the tree grows: the residuals until then; inf for a variance that is given. ENTERS is not 0 if the
+regressor is the first along a direction (`machine.late_direction`): the length of the regressor along it.
 """
 NEVER = 1e9
 """Levels since the last change of a leaf that has none, or more."""
