@@ -3,7 +3,8 @@
 theta is constant, the noise is 0.3, and readings are rounded to a quantum. An input keeps its value for ``held``
 samples; with one parameter the regressor is 1 + u / 2, or 1 where inputs are held for the whole record. A band is
 counted at samples 500 and 1000 where it is finite; it is NaN as long as no residual tells the noise. In brackets: the
-share of bands that are not finite, where there are any.
+share of bands that are not finite, where there are any. The second table has one parameter at the last sample, and the
+same bands with and without what readings share.
 Run: python benchmarks/coarse_coverage.py [records, 40 by default] [--quick]
 """
 
@@ -27,6 +28,28 @@ def record(seed: int, quantum: float, held: int, n: int) -> tuple[np.ndarray, np
     return X, quantum * np.round(y / quantum) if quantum else y, theta
 
 
+def shared(records: int) -> None:
+    print(
+        f"\n{'quantum':>7} {'held':>5} {'bands':>6}  "
+        + "  ".join(f"{name:>23}" for name in ("RLS(1)", "AdaptiveKalman()"))
+    )
+    for quantum in (1.0, 2.0, 5.0):
+        for held in (1, 200, T):
+            cells, told = [], 0
+            for name in ("RLS(1)", "AdaptiveKalman()"):
+                inside = []
+                for seed in range(2 * records):
+                    X, y, theta = record(seed, quantum, held, 1)
+                    run = track(Regression(1), TRACKERS[name], y, X)
+                    away, std = abs(run.theta[-1, 0] - theta[0]), run.std[-1, 0]
+                    if np.isfinite(std):
+                        inside.append([away <= 1.96 * std / np.sqrt(run.state["fold"]), away <= 1.96 * std])
+                told = len(inside)
+                without, given = np.mean(inside, axis=0) if inside else (np.nan, np.nan)
+                cells.append(f"{f'{without:.2f} without, {given:.2f}':>23}")
+            print(f"{quantum:>7} {held:>5} {told:>6}  " + "  ".join(cells), flush=True)
+
+
 def main(records: int = 40, quick: bool = False) -> None:
     warnings.simplefilter("ignore")  # the trackers say themselves which regressors do not move
     print(f"{'quantum':>7} {'held':>5} {'n':>2}  " + "  ".join(f"{name:>16}" for name in TRACKERS))
@@ -47,6 +70,7 @@ def main(records: int = 40, quick: bool = False) -> None:
                     share = f" ({np.mean(unknown):.0%})" if any(unknown) else ""
                     cells.append((f"{np.mean(inside):.2f}" if inside else "-") + share)
                 print(f"{quantum:>7} {held:>5} {n:>2}  " + "  ".join(f"{cell:>16}" for cell in cells), flush=True)
+    shared(records)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from contract_table import forms, model_of, ready
 from readings import AFTER, failures
 
-from driftfit import ARX, HammersteinWiener
+from driftfit import ARMAX, ARX, OE, BoxJenkins, Equation, HammersteinWiener, PolynomialModel
 from driftfit.models.hammerstein_wiener.curves.basis import BSpline, PiecewiseLinear, Polynomial
 from driftfit.run.program import Program
 from driftfit.trackers import found
@@ -30,6 +30,12 @@ MODELS = {
     "HammersteinWiener, pieces": HammersteinWiener(
         2, 2, 0, input=BSpline(2, (-3, 0, 3)), output=PiecewiseLinear((-1, 1))
     ),
+    "ARMAX": ARMAX(2, 2, 1, offset=True),
+    "OE": OE(nb=2, nf=2),
+    "BoxJenkins": BoxJenkins(nb=1),
+    "PolynomialModel": PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1),
+    "Equation, bounded": Equation("y = theta.a * y[-1] + theta.b * tanh(theta.s * u[-1])"),
+    "Equation, powers": Equation("y = theta.a * y[-1] + theta.b * u[-1] / (1 + (theta.s * u[-1]) ** 2) + theta.c"),
 }
 
 

@@ -2,7 +2,7 @@
 
     python benchmarks/service.py                 all parts at a small size, some two minutes
     python benchmarks/service.py mqtt            one part: journal, engine, mqtt, http, units, soak, fuzz
-    python benchmarks/service.py soak --seconds 3600
+    python benchmarks/service.py soak --seconds 900
     python benchmarks/service.py fuzz --count 100000
     python benchmarks/service.py --quick         the parts that need no broker, in seconds
 
@@ -30,25 +30,20 @@ from pathlib import Path
 
 import numpy as np
 
+from driftfit import track
+from driftfit.data.storage import describe
 from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
 from driftfit.service.threads import SinkThread, SourceThread
 
-UNIT = """
-[[unit]]
-match = "plant/{pump}"
-y = "y"
-u = ["u"]
-time = "t"
-dt = 1.0
-model = "ARX(1, 1)"
-tracker = "Kalman(q=1e-4, r=0.1)"
-rate = 1e6
-"""
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from service_support import HTTP
+from service_support import UNIT as TESTED
+
+UNIT = TESTED + "rate = 1e6\n"
 ODD = list(b'0123456789.,:[]{}"-eEtyu nulNa\\\x00\xff')
-HTTP = '[source.web]\nkind = "http"\n'
 
 
 def say(what, value):
@@ -98,33 +93,49 @@ def journal(options, folder):
 
 
 def engine(options, folder):
-    """The engine alone: decoded batches of 20 samples of each of 1,000 units, to stored results."""
-    rng, one = np.random.default_rng(0), Engine(parse(HTTP + UNIT), folder)
-    units, rounds = options.units, 10
+    """The engine alone: decoded batches of 20 samples of each of 1,000 units, to stored results; with alarms too."""
+    for kinds in ((), ("innovation", "band"), ("glr",)):
+        one = Engine(parse(HTTP + UNIT), folder / "-".join(("engine", *kinds)))
+        watched(one, options.units, kinds)
+        wall, cpu = fed(one, options.units, 10)
+        what = f"engine, {options.units} units, batches of 20{', alarms ' * bool(kinds)}{' and '.join(kinds)}"
+        say(f"{what} (samples/s, CPU us)", f"{wall:.0f} {cpu:.1f}")
+        one.close() if kinds else one.journal.close()
+    begun = time.perf_counter()
+    two = Engine(parse(HTTP + UNIT), folder / "engine")
+    say("recovery after a crash (samples/s)", f"{two.recovered / (time.perf_counter() - begun):.0f}")
+    two.close()
+
+
+def watched(one, units, kinds):
+    """Make the units, with the rules of a reference run."""
+    warm(one, units)
+    y, u = np.random.default_rng(0).normal(size=(2, 500))
+    settings = one.config.units[0]
+    run = track(settings.model, settings.tracker, y, u[:, None])
+    rules = [describe(run.detect(kind, every=1e6, reference=400).rule) for kind in kinds]
+    for name in one.units.names if kinds else ():
+        one.act(name, {"do": "calibrated", "rules": rules})
+    one.step(0.0)
+    assert all(len(unit.alarms) == len(kinds) for unit in one.units.resident)
+
+
+def fed(one, units, rounds):
+    """(samples/s, us of CPU of each) of some rounds of 20 samples of every unit, after the first."""
+    rng = np.random.default_rng(0)
     bodies = [[payload(20 * k, 20, rng) for _ in range(50)] for k in range(rounds)]
-    begun, cpu = None, None
     for k in range(rounds):
         if k == 1:
             begun, cpu = time.perf_counter(), time.process_time()
         for unit in range(units):
-            one.intake._batches.append(
-                ("web", Batch([decode(f"plant/{unit}", bodies[k][unit % 50])], arrived=time.monotonic()))
-            )
+            samples = decode(f"plant/{unit}", bodies[k][unit % 50])
+            one.intake._batches.append(("web", Batch([samples], arrived=time.monotonic())))
         while one.intake._batches:
             one.step(0.0)
     while one._pending:
         one.step(0.0)
-    wall, cpu = time.perf_counter() - begun, time.process_time() - cpu
     count = units * 20 * (rounds - 1)
-    say(
-        f"engine, {units} units, batches of 20 (samples/s, us of CPU each)",
-        f"{count / wall:.0f} {cpu / count * 1e6:.1f}",
-    )
-    begun = time.perf_counter()
-    one.close()
-    two = Engine(parse(HTTP + UNIT), folder)
-    say("recovery (samples/s)", f"{two.recovered / (time.perf_counter() - begun):.0f}")
-    two.close()
+    return count / (time.perf_counter() - begun), (time.process_time() - cpu) / count * 1e6
 
 
 class Broker:
@@ -171,31 +182,30 @@ def send(broker, messages, size, units, rate=1_000_000):
 
 
 def mqtt(options, folder):
-    """Over MQTT: the service, the floor, a consumer by hand; then the latency at a steady rate."""
-    for size, messages in ((1, 20_000), (20, 10_000)):
-        broker = Broker(folder)
-        floor = listened(broker, messages, size, options.units, lambda topic, body: None)
-        known = importlib.util.find_spec("filterpy") is not None
-        by_hand = listened(broker, messages, size, options.units, Peer().handle) if known else None
-        wall, cpu, _ = served(broker, folder / f"s{size}", messages, size, options.units)
+    """Over MQTT: the floor, a consumer by hand, the service without and with a sink; then latencies at a rate."""
+    known = importlib.util.find_spec("filterpy") is not None
+    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  client decode engine   sink")
+    for size, messages in ((1, 20_000), (20, 20_000)):
+        broker, count = Broker(folder), messages * size
+        line(f"{size}, empty (the floor)", count, listened(broker, messages, size, options.units, lambda *_: None))
+        if known:
+            line(f"{size}, filterpy by hand", count, listened(broker, messages, size, options.units, Peer().handle))
+        for what in ("none", "sqlite"):
+            found = served(broker, folder / f"{what}{size}", messages, size, options.units, sink=what)
+            line(f"{size}, the service, sink {what}", count, found[:2], found[3])
         broker.process.terminate()
-        for name, found in (("floor", floor), ("filterpy by hand", by_hand), ("service", (wall, cpu))):
-            if found is None:
-                continue
-            count, (seconds, used) = messages * size, found
-            say(
-                f"mqtt, {size} samples per message, {name} (samples/s, CPU us)",
-                f"{count / seconds:.0f} {used / count * 1e6:.1f}",
-            )
-        say(f"mqtt, {size} samples per message: CPU of the service / floor", f"{cpu / floor[1]:.2f}")
-    broker = Broker(folder)
-    rate = 20_000
-    _, cpu, found = served(broker, folder / "latency", 5_000, 20, options.units, rate // 20)
-    broker.process.terminate()
-    say(
-        f"mqtt at {rate} samples/s: p50, p99 from arrival to result (ms)",
-        f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}",
-    )
+    for rate in (5_000, 20_000):
+        broker = Broker(folder)
+        *_, found, _ = served(broker, folder / f"at{rate}", rate // 4, 20, options.units, rate // 20)
+        broker.process.terminate()
+        what = f"mqtt at {rate} samples/s in messages of 20: p50, p99 (ms)"
+        say(what, f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}")
+
+
+def line(what, count, found, stages=None):
+    seconds, used = found
+    each = [] if stages is None else [f"{stages.get(name, 0.0) / count * 1e6:7.2f}" for name in STAGES]
+    print(f"{what:<44}{count / seconds:>10.0f}{used / count * 1e6:>8.2f} {''.join(each)}", flush=True)
 
 
 class Peer:
@@ -253,25 +263,42 @@ def listened(broker, messages, size, units, handle):
     return found
 
 
-def served(broker, folder, messages, size, units, rate=1_000_000):
-    """(seconds, seconds of CPU, status) of the service, with a sink, for all messages."""
+STAGES = ("paho", "driftfit-source", "engine", "driftfit-sink")
+"""How the names of the threads begin."""
+
+
+def clocks():
+    """Seconds of CPU of every thread, by how its name begins."""
+    found = dict.fromkeys(STAGES, 0.0)
+    for thread in threading.enumerate():
+        for name in STAGES:
+            if thread.name.startswith(name):
+                found[name] += time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
+    return found
+
+
+def served(broker, folder, messages, size, units, rate=1_000_000, sink="sqlite"):
+    """(seconds, seconds of CPU, status, seconds of CPU by stage) of the service for all messages."""
     source = f'[source.plant]\nkind = "mqtt"\nurl = "mqtt://127.0.0.1:{broker.port}"\ntopic = "plant/+"\n'
-    sink = f'[[sink]]\nkind = "sqlite"\npath = "{folder}.db"\n'
-    config = parse(source + UNIT + sink)
+    more = "" if sink == "none" else f'[[sink]]\nkind = "{sink}"\npath = "{folder}.db"\n'
+    config = parse(source + UNIT + more)
     one = Engine(config, folder)
     warm(one, units)
-    runners = [SourceThread(one, config.sources[0]), SinkThread(one, config.sinks[0])]
-    worker = threading.Thread(target=one.run)
+    runners = [SourceThread(one, config.sources[0]), *(SinkThread(one, each) for each in config.sinks)]
+    worker = threading.Thread(target=one.run, name="engine")
     for thread in (*runners, worker):
         thread.start()
     time.sleep(1.0)
     sender, before = send(broker, messages, size, units, rate), one.samples
     while one.samples == before:
         time.sleep(0.01)
-    begun, cpu = time.perf_counter(), time.process_time()
+    begun, cpu, first = time.perf_counter(), time.process_time(), clocks()
     one.latencies.clear()
-    while one.samples - before < messages * size and time.perf_counter() - begun < 300:
+    while time.perf_counter() - begun < 300 and (
+        one.samples - before < messages * size or any(sink.count < messages * size for sink in runners[1:])
+    ):
         time.sleep(0.01)
+    last = clocks()
     found = time.perf_counter() - begun, time.process_time() - cpu, one.status()
     for runner in runners:
         runner.stop()
@@ -280,7 +307,7 @@ def served(broker, folder, messages, size, units, rate=1_000_000):
         thread.join(30)
     one.close()
     sender.wait()
-    return found
+    return *found, {name: last[name] - first[name] for name in STAGES}
 
 
 def warm(one, units):
@@ -295,7 +322,7 @@ def http(options, folder):
     rng, config = np.random.default_rng(0), parse(HTTP + UNIT)
     one = Engine(config, folder)
     warm(one, options.units)
-    runner, worker = SourceThread(one, config.sources[0]), threading.Thread(target=one.run)
+    runner, worker = SourceThread(one, config.sources[0]), threading.Thread(target=one.run, name="engine")
     runner.start()
     worker.start()
     bodies = []
@@ -341,23 +368,29 @@ def units(options, folder):
 
 
 def soak(options, folder):
-    """A steady rate of 2,000 samples a second: memory at the beginning and at the end."""
-    config, rng = parse(HTTP + UNIT), np.random.default_rng(0)
+    """A steady rate of 2,000 samples a second, with a sink: memory, and samples, in ten parts of the time."""
+    sink = f'[[sink]]\nkind = "sqlite"\npath = "{folder / "sink.db"}"\n'
+    config, rng = parse(HTTP + UNIT + sink), np.random.default_rng(0)
     one = Engine(config, folder)
-    worker = threading.Thread(target=one.run)
+    runner, worker = SinkThread(one, config.sinks[0]), threading.Thread(target=one.run, name="engine")
+    runner.start()
     worker.start()
-    begun, clock, seen = time.monotonic(), 0, []
-    while time.monotonic() - begun < options.seconds:
+    begun, clock, part = time.monotonic(), 0, 0
+    print(f"{'soak: seconds':>14} {'samples':>9} {'in the sink':>12} {'MB':>7} {'CPU us':>7}", flush=True)
+    while part < 10:
         for unit in range(100):
             one.intake.put("web", Batch([decode(f"plant/{unit}", payload(clock, 20, rng))], arrived=time.monotonic()))
         clock += 20
-        seen.append(memory())
         time.sleep(max(0.0, begun + clock / 20 - time.monotonic()))
-    say(f"soak of {options.seconds} s: samples", f"{one.samples}")
-    tenth = max(1, len(seen) // 10)
-    say("soak: MB after a tenth, half, all of it", f"{seen[tenth]:.0f} {seen[len(seen) // 2]:.0f} {seen[-1]:.0f}")
+        passed = time.monotonic() - begun
+        if passed >= (part + 1) * options.seconds / 10:
+            part += 1
+            each = time.process_time() / max(one.samples, 1) * 1e6
+            print(f"{passed:>14.0f} {one.samples:>9} {runner.count:>12} {memory():>7.1f} {each:>7.1f}", flush=True)
+    runner.stop()
     one.stop()
-    worker.join(30)
+    for thread in (worker, runner):
+        thread.join(30)
     one.close()
 
 

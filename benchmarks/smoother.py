@@ -15,6 +15,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ[f"{_library}_NUM_THREADS"] = "1"
 
 import argparse
+import tracemalloc
 from statistics import median
 from time import perf_counter
 
@@ -75,6 +76,33 @@ def seconds(function, *arguments):
     return perf_counter() - start, result
 
 
+def peak(function, *arguments):
+    """(largest, remaining) bytes that a call allocates."""
+    tracemalloc.start()
+    result = function(*arguments)
+    held, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return most, held, result
+
+
+def memory(T=10_000):
+    """Peak memory in bytes a sample."""
+    phi, y = record(T)
+    run = track(Regression(N), FLS(MU), y, phi)
+    smoothed = {}
+
+    def kept():
+        smoothed["result"] = run.smooth()
+        return smoothed["result"].theta, smoothed["result"].std
+
+    most, held, _ = peak(kept)
+    other = peak(statsmodels, phi, y, run)[0]
+    print(
+        f"Memory in bytes per sample at {T:,} samples: means and standard deviations {16 * N}; driftfit at most "
+        f"{most / T:.0f}, held {held / T:.0f}; statsmodels at most {other / T:,.0f}"
+    )
+
+
 def main(quick: bool) -> None:
     sizes = (10_000, 30_000, 100_000) if quick else (10_000, 100_000, 1_000_000)
     methods = {"driftfit": ours, "statsmodels": statsmodels, "banded solve, means only": banded}
@@ -86,20 +114,27 @@ def main(quick: bool) -> None:
     table.add_column("largest difference", justify="right")
     track(Regression(N), FLS(MU), *record(100)[::-1]).smooth()
     for T in sizes:
-        phi, y = record(T)
-        run = track(Regression(N), FLS(MU), y, phi)
-        times = {name: [] for name in methods}
-        found = {}
-        for _ in range(1 if T == 1_000_000 else 5):
-            for name, method in methods.items():
-                taken, found[name] = seconds(method, phi, y, run)
-                times[name].append(taken)
+        times, gap = compare(methods, T, 1 if T == 1_000_000 else 9)
         cells = [f"{median(t):.3f} ({median(t) / T * 1e6:.2f})" for t in times.values()]
-        theta, std = found["driftfit"]
-        other, other_std = found["statsmodels"]
-        gap = max(np.abs(theta - other).max() / np.abs(theta).max(), np.abs(std / other_std - 1.0).max())
-        table.add_row(f"{T:,}", *cells, f"{median(times['statsmodels']) / median(times['driftfit']):.1f}", f"{gap:.0e}")
+        ratio = median(b / a for a, b in zip(times["driftfit"], times["statsmodels"], strict=True))
+        table.add_row(f"{T:,}", *cells, f"{ratio:.1f}", f"{gap:.0e}")
     Console(width=120).print(table)
+    memory()
+
+
+def compare(methods, T, turns):
+    """Seconds of each method, and the largest difference from statsmodels."""
+    phi, y = record(T)
+    run = track(Regression(N), FLS(MU), y, phi)
+    times = {name: [] for name in methods}
+    found = {}
+    for _ in range(turns):
+        for name, method in methods.items():
+            taken, found[name] = seconds(method, phi, y, run)
+            times[name].append(taken)
+    theta, std = found["driftfit"]
+    other, other_std = found["statsmodels"]
+    return times, max(np.abs(theta - other).max() / np.abs(theta).max(), np.abs(std / other_std - 1.0).max())
 
 
 if __name__ == "__main__":

@@ -7,10 +7,12 @@ measured is Spark's shuffle, the passage to Python and back, and the step:
     spark.track    a row of results per sample
     summary        a row per unit
     applyInPandas  one `track` per unit, and statsmodels' recursive least squares per unit
-    spark.follow   a stream with one or twenty rows per unit and batch: seconds per batch and state in bytes
+    spark.follow   a stream with one or twenty rows per unit and batch: seconds and CPU per batch, beside a stream whose
+                   rows are shuffled, passed to Python and written; and the state in bytes
 
-    python -m benchmarks.spark            1,000 to 50,000 units
-    python -m benchmarks.spark --quick    200 and 1,000 units
+    python -m benchmarks.spark             1,000 to 50,000 units
+    python -m benchmarks.spark streams     a part: step, batch, streams, equal
+    python -m benchmarks.spark --quick     200 and 1,000 units
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -145,45 +148,134 @@ def obvious(session: Any, folder: Path, units: int) -> None:
         print(f"{name:<28} {units // 5 * EACH / wall:>11,.0f} rows per second")
 
 
+def used() -> tuple[float, float]:
+    """Seconds of CPU of Java and of the Python workers that it started."""
+    parents, cpu, java = {}, {}, set()
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                name, _, rest = (entry / "stat").read_text().partition("(")[2].rpartition(")")
+            except OSError:  # it has ended
+                continue
+            fields = rest.split()
+            pid, ticks = int(entry.name), sum(map(int, fields[11:15]))
+            parents[pid], cpu[pid] = int(fields[1]), ticks / os.sysconf("SC_CLK_TCK")
+            if name == "java":
+                java.add(pid)
+    own = {pid for pid in java if os.getpid() in ancestors(pid, parents)}
+    workers = [pid for pid in cpu if pid not in own and own & set(ancestors(pid, parents))]
+    return sum(cpu[pid] for pid in own), sum(cpu[pid] for pid in workers)
+
+
+def ancestors(pid: int, parents: dict[int, int]) -> list[int]:
+    found = []
+    while (pid := parents.get(pid, 0)) > 1:
+        found.append(pid)
+    return found
+
+
+def flowing(session: Any, where: Path, begin: Callable[[Any, Callable[..., None]], Any]) -> tuple[float, float, float]:
+    """(seconds, seconds of CPU of Java, of Python) of the quickest batch but the first."""
+    marks = [used()]
+    stream = session.readStream.schema(SCHEMA).option("maxFilesPerTrigger", 1).parquet(str(where / "in"))
+    query = begin(stream, lambda *_: marks.append(used()))
+    query.awaitTermination()
+    batches = [one["durationMs"]["triggerExecution"] / 1e3 for one in query.recentProgress if one["numInputRows"]]
+    java, python = (min(b[k] - a[k] for a, b in pairwise(marks[1:])) for k in range(2))
+    return min(batches[1:]), java, python
+
+
+def passed_on(where: Path) -> Callable[[Any, Callable[..., None]], Any]:
+    """The floor of a stream: the shuffle, the passage and the writing of as many bytes, without states and steps."""
+
+    def begin(stream: Any, done: Callable[..., None]) -> Any:
+        def batch(rows: Any, number: int) -> None:
+            floor(rows).write.mode("overwrite").parquet(str(where / "floor" / f"batch={number}"))
+            done()
+
+        writer = stream.writeStream.foreachBatch(batch).option("checkpointLocation", str(where / "floor" / "check"))
+        return writer.trigger(availableNow=True).start()
+
+    return begin
+
+
+def followed(path: str) -> Callable[[Any, Callable[..., None]], Any]:
+    """The stream itself."""
+
+    def begin(stream: Any, done: Callable[..., None]) -> Any:
+        more: Any = {"trigger": {"availableNow": True}, **COLUMNS}
+        return bridge.follow(stream, MODEL, TRACKER, path=path, sink=done, **more)
+
+    return begin
+
+
 def streams(session: Any, folder: Path, sizes: list[int]) -> None:
-    """Seconds per batch of a stream in which every unit has some rows, after the first batch."""
-    heads = f"{'s per batch':>12} {'rows per s':>11} {'ms per unit':>12} {'state, bytes':>13} {'on disk':>8}"
-    print(f"{'units':>8} {'rows each':>9} {heads}")
+    """Seconds and CPU per batch of a stream in which every unit has some rows, after the first batch."""
+    print(f"{'':>18} {'s per batch':>15} {'rows per s':>17} {'us of CPU per row':>33} {'bytes of a state':>17}")
+    heads = f"{'floor':>7} {'follow':>7} {'floor':>8} {'follow':>8}"
+    print(f"{'units':>8} {'rows each':>9} {heads} {'Java: floor':>11} {'follow':>6} {'Python':>6} {'follow':>6}"
+          f" {'packed':>8} {'on disk':>8}")  # fmt: skip
     for units in sizes:
         for each in (1, 20):
             where = folder / f"stream{units}x{each}"
             (where / "in").mkdir(parents=True)
-            for i in range(4):
+            for i in range(6):
                 path = where / "in" / f"{i}.parquet"
                 rows_of(units, each, float(i * each), i).write_parquet(path)
                 os.utime(path, (1e9 + i, 1e9 + i))
-            stream = session.readStream.schema(SCHEMA).option("maxFilesPerTrigger", 1).parquet(str(where / "in"))
             out = str(where / "out")
-            query = bridge.follow(stream, MODEL, TRACKER, path=out, trigger={"availableNow": True}, **COLUMNS)
-            query.awaitTermination()
-            batches = [one for one in query.recentProgress if one["numInputRows"]]
+            base = flowing(session, where, passed_on(where))
+            own = flowing(session, where, followed(out))
             state = bridge.Store(session, out).states().selectExpr("avg(octet_length(state))").first()[0]
-            disk = sum(one.stat().st_size for one in Path(out).glob("batch=3/kind=state/*.parquet")) / units
-            s = min(one["durationMs"]["triggerExecution"] for one in batches[1:]) / 1e3
-            rates = f"{s:>12.2f} {units * each / s:>11,.0f} {1e3 * s / units:>12.2f} {state:>13.0f} {disk:>8.0f}"
-            print(f"{units:>8} {each:>9} {rates}")
+            disk = sum(one.stat().st_size for one in Path(out).glob("batch=5/kind=state/*.parquet")) / units
+            rows = units * each
+            rates = f"{base[0]:>7.2f} {own[0]:>7.2f} {rows / base[0]:>8,.0f} {rows / own[0]:>8,.0f}"
+            cpu = " ".join(f"{1e6 * one[k] / rows:>{wide}.1f}" for k, one, wide in
+                           ((1, base, 11), (1, own, 6), (2, base, 6), (2, own, 6)))  # fmt: skip
+            print(f"{units:>8} {each:>9} {rates} {cpu} {state:>8.0f} {disk:>8.0f}", flush=True)
 
 
-def main(quick: bool = False) -> None:
+def equal(session: Any, folder: Path, units: int) -> None:
+    """Whether a fleet of unequal units with gaps, missing values and repeated rows has the bits of one machine."""
+    rng = np.random.default_rng(5)
+    length = rng.integers(1, 60, units)
+    unit = np.repeat(np.arange(units), length)
+    t = np.concatenate([np.cumsum(rng.choice([0.0, 1.0, 1.0, 1.0, 1.0, 3.0], size)) for size in length])
+    y, u = np.where(rng.random(len(t)) < 0.03, np.nan, rng.normal(size=len(t))), rng.normal(size=len(t))
+    table = pl.DataFrame({"unit": [f"meter {k:07d}" for k in unit], "t": t, "y": y, "u": u})
+    table = table.sort("unit", "t", "y", "u")  # which row stands at a repeated time
+    path = folder / "equal.parquet"
+    table.sample(fraction=1.0, shuffle=True, seed=1).write_parquet(path)
+    found = bridge.track(session.read.parquet(str(path)), MODEL, TRACKER, **COLUMNS)
+    there = pl.from_arrow(found.where("failed is null").toArrow()).sort("unit", "t")
+    fleet = track(MODEL, TRACKER, "y", "u", data=table, by="unit", time="t")
+    here = pl.DataFrame(fleet.to_table()).sort("unit", "t")
+    names = [name for name in here.columns if name.startswith(("theta", "std", "prediction", "innovation"))]
+    differ = sum(not np.array_equal(there[name].to_numpy(), here[name].to_numpy(), equal_nan=True) for name in names)
+    print(f"{units} units, {len(table)} rows, {len(there)} samples: {differ} of {len(names)} columns differ in any bit")
+
+
+def main(quick: bool = False, part: str = "") -> None:
     sizes = [200, 1_000] if quick else [1_000, 10_000, 50_000]
     session = bridge.session("local[2]", spark__ui__enabled="false", spark__driver__memory="3g",
                              spark__sql__shuffle__partitions="4")  # fmt: skip
     session.sparkContext.setLogLevel("OFF")
-    step()
+    if part in ("", "step"):
+        step()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rows_of(100, EACH).write_parquet(folder / "warm.parquet")
         nowhere(bridge.track(session.read.parquet(str(folder / "warm.parquet")), MODEL, TRACKER, **COLUMNS))
-        batch(session, folder, sizes)
-        obvious(session, folder, sizes[0])
-        streams(session, folder, sizes[:1] if quick else sizes[:2])
+        if part in ("", "batch"):
+            batch(session, folder, sizes)
+            obvious(session, folder, sizes[0])
+        if part in ("", "equal"):
+            equal(session, folder, 500 if quick else 20_000)
+        if part in ("", "streams"):
+            streams(session, folder, sizes)
     session.stop()
 
 
 if __name__ == "__main__":
-    main("--quick" in sys.argv)
+    given = [one for one in sys.argv[1:] if not one.startswith("--")]
+    main("--quick" in sys.argv, *given[:1])

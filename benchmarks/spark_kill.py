@@ -5,6 +5,9 @@ Rows of 500 units lie in files, two per cent of them out of order and one per ce
 of a batch; three times a Python worker alone is killed, whose task Spark runs again. Afterwards the table is compared
 with `track` on one machine, which was not interrupted: rows, results and final states.
 
+With --cluster Spark starts a cluster on this machine, local-cluster[2,1,1024]: two executors, Java processes of
+their own; three of them are killed too, with the Python workers that they have.
+
     python -m benchmarks.spark_kill             200,000 rows
     python -m benchmarks.spark_kill --quick     6,000 rows, one kill of each kind
 """
@@ -55,7 +58,10 @@ def drive(folder: Path) -> None:
     from driftfit.bridges import spark as bridge
 
     # a task may fail four times, as on a cluster
-    session = bridge.session("local[2,4]", spark__sql__shuffle__partitions="2", spark__ui__enabled="false")
+    master = "local-cluster[2,1,1024]" if "--cluster" in sys.argv else "local[2,4]"
+    path = os.environ.get("PYTHONPATH", "")
+    session = bridge.session(master, spark__sql__shuffle__partitions="2", spark__ui__enabled="false",
+                             spark__executorEnv__PYTHONPATH=path)  # fmt: skip
     session.sparkContext.setLogLevel("OFF")
     rows = session.readStream.schema(SCHEMA).option("maxFilesPerTrigger", 1).parquet(str(folder / "in"))
     columns = {"y": "y", "u": "u", "by": "unit", "time": "t"}
@@ -67,7 +73,7 @@ def drive(folder: Path) -> None:
 
 def start(folder: Path) -> subprocess.Popen[bytes]:
     """A driver in a group of processes of its own."""
-    command = [sys.executable, __file__, "--drive", str(folder)]
+    command = [sys.executable, __file__, "--drive", *(one for one in sys.argv if one == "--cluster"), str(folder)]
     with open(folder / "driver.log", "ab") as log:
         return subprocess.Popen(command, start_new_session=True, stdout=log, stderr=log)
 
@@ -77,8 +83,8 @@ def done(folder: Path) -> int:
     return len(list((folder / "out").glob("batch=*/_SUCCESS")))
 
 
-def workers(group: int) -> list[int]:
-    """The Python workers of a driver: what the daemon of PySpark has forked."""
+def processes(driver: int, what: str) -> list[int]:
+    """The Python workers of a driver (what the daemon of PySpark has forked), or its executors."""
     parents: dict[int, tuple[int, str]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -87,16 +93,9 @@ def workers(group: int) -> list[int]:
                 parents[int(entry.name)] = (int(fields[1]), (entry / "cmdline").read_text())
             except (OSError, ValueError):
                 continue
-    daemons = {pid for pid, (_, command) in parents.items() if "pyspark.daemon" in command}
-    ours = {pid for pid in daemons if _group(pid) == group or _session(pid) == group}
-    return [pid for pid, (parent, _) in parents.items() if parent in ours and pid in daemons]
-
-
-def _group(pid: int) -> int:
-    try:
-        return os.getpgid(pid)
-    except OSError:
-        return -1
+    mark = "pyspark.daemon" if what == "worker" else "CoarseGrainedExecutorBackend"
+    found = {pid for pid, (_, command) in parents.items() if mark in command and _session(pid) == driver}
+    return [pid for pid in found if what != "worker" or parents[pid][0] in found]
 
 
 def _session(pid: int) -> int:
@@ -124,16 +123,16 @@ def disturb(folder: Path, kills: list[str], files: int, patience: float) -> list
     for what, mark in zip(kills, marks, strict=True):
         while done(folder) < mark and driver.poll() is None and time.monotonic() - began < patience:
             time.sleep(0.05)
-        while what == "worker" and not workers(driver.pid) and driver.poll() is None:
+        while what != "driver" and not processes(driver.pid, what) and driver.poll() is None:
             time.sleep(0.02)
         time.sleep(random.random() * 0.5)  # somewhere in the next batch
         if driver.poll() is not None:
             break
-        if what == "worker":
-            found = workers(driver.pid)
+        if what != "driver":
+            found = processes(driver.pid, what)
             if found:
                 os.kill(found[0], signal.SIGKILL)
-                said.append(f"worker after {done(folder)} batches")
+                said.append(f"{what} after {done(folder)} batches")
         else:
             end(driver.pid)
             driver.wait()
@@ -182,7 +181,8 @@ def different(one: pl.DataFrame, other: pl.DataFrame) -> int:
 
 def main(quick: bool = False) -> None:
     units, T, files = (50, 120, 6) if quick else (500, 400, 20)
-    kills = ["driver", "worker"] if quick else ["driver", "worker"] * 3
+    kinds = ["driver", "worker", "executor"] if "--cluster" in sys.argv else ["driver", "worker"]
+    kills = kinds if quick else kinds * 3
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "in").mkdir()

@@ -1,4 +1,4 @@
-"""The command line of the laboratory: ``python -m lab bench``, ``reproduce``, ``same-numbers``, ``structure``."""
+"""The command line of the laboratory: ``python -m lab bench``, ``bounds``, ``reproduce``, ``same-numbers``, .."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from driftfit.cli.parts.program import helpful
 from driftfit.engine.settings import near
 from lab import same_numbers, structure
 from lab.bench import commands as bench
+from lab.bounds.commands import bounds
 from lab.reproduce import found as reproductions
 
 app = typer.Typer(
@@ -25,6 +26,7 @@ app.add_typer(
     same_numbers.app, name="same-numbers", help="Compare random configurations bit for bit, before and after."
 )
 app.command(name="structure")(structure.show)
+app.command(name="bounds")(bounds)
 out = Console(highlight=False)
 
 

@@ -2,10 +2,10 @@
 
 from dataclasses import fields
 
-VALUES = {"q": 1e-3, "r": 0.1, "forgetting": 0.98, "mu": 1.0}
+VALUES = {"q": 1e-3, "r": 0.1, "p0": 10.0, "forgetting": 0.98, "mu": 1.0}
 """By the name of the setting, not of the tracker; 1 / (1 - forgetting) is 50 samples."""
 
-SLOW = {"q": 1e-6, "r": 0.01, "forgetting": 0.995, "mu": 1500.0}
+SLOW = {"q": 1e-6, "r": 0.01, "p0": 10.0, "forgetting": 0.995, "mu": 1500.0}
 """For long runs of systems with noise of standard deviation 0.1 that drift slowly."""
 
 
@@ -15,6 +15,8 @@ def ready(kind, values=VALUES, **settings):
         return kind.from_fls_mu(values["mu"], n=4, s=8.0)
     if values is SLOW and kind.output_error:  # the noise of an ARX record drives the system, it is none of the sensor
         settings = {"q_w": values["r"]} | settings
+    if any(field.name == "r" and field.default == 1.0 for field in fields(kind)):  # a dispersion: here the noise
+        settings = {"r": values["r"]} | settings
     unknown = set(kind.required) - values.keys() - settings.keys()
     assert not unknown, f"{kind.__name__}: give the required settings {sorted(unknown)} a value in contract_table.py"
     return kind(**{name: values[name] for name in kind.required if name not in settings} | settings)

@@ -1,6 +1,7 @@
 """Small services for tests: one model and tracker, which other tests compile too."""
 
 import json
+import struct
 import time
 
 import numpy as np
@@ -58,7 +59,7 @@ def settled(engine):
 def results_of(engine):
     """All stored results, as rows."""
     settled(engine)
-    return [row for _, rows, _ in engine.journal.outcomes(0, 10**6) for row in rows]
+    return [row for _, parts, _ in engine.journal.outcomes(0, 10**6) for one in parts for row in one.rows()]
 
 
 def events(engine, kind=None):
@@ -69,3 +70,31 @@ def events(engine, kind=None):
 
 def opened(config, folder):
     return Engine(config, folder)
+
+
+def varint(value):
+    found = bytearray()
+    while True:
+        value, low = value >> 7, value & 0x7F
+        found.append(low | (0x80 if value else 0))
+        if not value:
+            return bytes(found)
+
+
+def field(number, value):
+    """A field of a protobuf message, from a whole number, a text or bytes; floats as double."""
+    if isinstance(value, float):
+        return varint(number << 3 | 1) + struct.pack("<d", value)
+    if isinstance(value, int):
+        return varint(number << 3) + varint(value)
+    value = value.encode() if isinstance(value, str) else value
+    return varint(number << 3 | 2) + varint(len(value)) + value
+
+
+def metric(value, name=None, alias=None, when=None, kind=10, **more):
+    """A metric of Sparkplug B; fields by their names in its definition."""
+    numbers = {"historical": 5, "null": 7}
+    parts = [(1, name), (2, alias), (3, when), (4, kind), *((numbers[key], one) for key, one in more.items())]
+    which = 13 if isinstance(value, float) else 14 if isinstance(value, bool) else 10 if isinstance(value, int) else 15
+    data = b"".join(field(number, one) for number, one in (*parts, (which, value)) if one is not None)
+    return field(2, data)

@@ -8,18 +8,33 @@ import numpy as np
 import pytest
 
 import driftfit
-from driftfit import ARMAX, ARX, OE, BoxJenkins, Equation, HammersteinWiener, PolynomialModel, Regression
+from driftfit import (
+    ARMAX,
+    ARX,
+    OE,
+    BoxJenkins,
+    Equation,
+    HammersteinWiener,
+    JointKalman,
+    PolynomialModel,
+    Regression,
+    StateSpace,
+    track,
+)
 from driftfit.checks import check_model
+from driftfit.checks.model import _shown, signals
 from driftfit.models import found
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
 
 CURVED = HammersteinWiener(1, 2, input=Polynomial(2), output=Polynomial(3), intercept=True, output_noise=0.1)
 SYSTEM = (-0.3, 0.5, 0.2, 0.1, 0.2, 0.1, 0.04, -0.03, -0.06, 0.1)
+SPACE = "x = x[-1] + dt * (theta.a * tanh(u) - theta.b * x[-1]) \n y = sqrt(1 + x * x) + 0.1 * u[-1]"
 READY = {
     "ARX": (ARX(1, [2, 1], nk=[1, 2], intercept=True), None), "Regression": (Regression(2, intercept=True), None),
     "HammersteinWiener": (CURVED, SYSTEM), "ARMAX": (ARMAX(1, 1, 1), (0.5, 1.0, 0.3)), "OE": (OE(1, 1), (1.0, 0.5)),
     "BoxJenkins": (BoxJenkins(2, 1, 1, 2, offset=True), (1.0, 0.5, 0.5, 0.9, 1.5, -0.7, 3.0)),
     "PolynomialModel": (PolynomialModel(1, [1, 1], nf=[1, 0], nk=[1, 2]), (0.5, 1.0, 0.5, 0.3)),
+    "StateSpace": (StateSpace(SPACE), (0.5, 0.3, 0.2)),
     "Equation": (Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1]"), (1.0, 0.5, 0.4)),
 }  # fmt: skip
 
@@ -96,3 +111,11 @@ def test_the_package_knows_of_hammerstein_wiener_models_only_what_models_declare
     asks = re.compile(rf"isinstance\([^)]*HammersteinWiener|(has|get)attr\([^,]*(model, \"|, \"({own})\")")
     outside = [path for path in home.rglob("*.py") if "hammerstein_wiener" not in path.parts]
     assert [str(path) for path in outside if asks.search(path.read_text())] == []
+
+
+def test_a_parameter_that_the_output_does_not_show_is_named():
+    lost = StateSpace("x = 0.5 * x[-1] + theta.b * u \n other = theta.c * u \n y = x")
+    run = track(lost, JointKalman(q=0.0, r=1.0, p0=1e-20, theta0=(0.3, 0.2, 0.0, 0.0)), *signals(1))
+    assert list(_shown(lost, run.tracker, run)) == [
+        "The output says nothing of c: no line leads from it to the output, or its effect vanishes here."
+    ]

@@ -6,7 +6,7 @@ from decimal import Decimal, localcontext
 import numpy as np
 import pytest
 
-from driftfit import FLS, RLS, Kalman, Regression, track
+from driftfit import FLS, RLS, Bank, Change, Kalman, Regression, Sensor, track
 
 T, N, ALIVE = 45, 2, 25
 LARGE = Decimal(10) ** 20
@@ -70,3 +70,31 @@ def drift(tracker, unit):
     """The setting of the same drift where the second column is in another unit."""
     factors = np.array([1.0, unit])
     return {"q": tuple(0.01 / factors**2)} if isinstance(tracker, Kalman) else {"mu": tuple(20.0 * factors**2)}
+
+
+def alive_late(unit):
+    """Three columns, of which the last is 0 for 120 samples; the first gain doubles before and after that."""
+    rng = np.random.default_rng(1)
+    u, gain = rng.standard_normal((240, 3)), np.repeat([1.0, 2.0, 4.0], 80)
+    u[:120, 2] = 0.0
+    return gain * u[:, 0] + u[:, 1:] @ [0.5, -1.5] + 0.1 * rng.standard_normal(240), u * [1.0, 1.0, unit]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_a_bank_that_forgets_takes_late_columns_as_least_squares_does(unit):
+    y, u = alive_late(unit)
+    bank = Bank(changes=[Change(forget=0.97)], sensors=[Sensor.nominal()])
+    run, twin = track(Regression(3), bank, y, u), track(Regression(3), RLS(0.97), y, u)
+    np.testing.assert_allclose(run.theta[20:], twin.theta[20:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(np.isinf(run.std), np.isinf(twin.std))
+
+
+@pytest.mark.parametrize(("kind", "forget", "near"), [("exponential", 0.001, 0.1), ("directional", 0.1, 0.4)])
+def test_a_bank_whose_jumps_forget_runs_while_a_column_is_idle(kind, forget, near):
+    y, u = alive_late(1.0)
+    changes = [Change(q=0.0), Change(forget=forget, kind=kind, prob=0.02)]
+    run = track(Regression(3), Bank(changes=changes, sensors=[Sensor.nominal()]), y, u)
+    np.testing.assert_allclose(run.theta[118, :2], [2.0, 0.5], atol=near)  # found while the last column is idle
+    np.testing.assert_allclose(run.theta[-1], [4.0, 0.5, -1.5], atol=near)
+    assert np.isinf(run.std[:120, 2]).all()
+    assert np.isfinite(run.std[121:]).all()

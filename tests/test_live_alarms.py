@@ -12,7 +12,8 @@ from test_bank import record as jumping
 from driftfit import ARX, AdaptiveKalman, AugmentedFLS, Bank, Beam, Kalman, Live, Regression, Sensor, track
 from driftfit.judge.alarms.calibration import null_records
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.rule import AlarmRule
+from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.program import lanes_of
 
 K = Kalman(q=1e-4, r=0.01)
 T, CUT, FAULT = 900, 500, 700
@@ -73,6 +74,22 @@ def test_a_stream_says_what_the_record_says(record, tracker, kind, settings):
     assert all(onset.statistic > onset.limit and onset.limit in rule.limits for onset in told)
     assert [onset.cause for onset in told] == [said.cause(t) for t in begun]
     assert alarm.onsets() == []
+    many, causes = in_parts(before, whole, rule), []
+    for found in many[1]:
+        causes += found
+    assert causes == [said.cause(t) if said.active[t] else None for t in range(CUT, T)]
+    assert many[0].onsets() == [onset._replace(time=None) for onset in told]
+    assert same(many[0].statistic, alarm.statistic)
+
+
+def in_parts(before, whole, rule):
+    """(an alarm that judges many samples at a time, what it says of them)."""
+    program, tile = whole.program, whole.program.tile(before.end().states[0])
+    run, out = program.loop(tile, T - CUT, "std", float, rule.kind in FROZEN)
+    run(tile, *lanes_of(whole.record.part(slice(CUT, T))), out)
+    alarm = LiveAlarm(rule, program.tracker, program.names)
+    cuts = np.sort(np.random.default_rng(2).integers(0, T - CUT, 12))
+    return alarm, [alarm.take_many(part, 0, np.ones(len(part))) for part in np.split(out, cuts)]
 
 
 def test_the_probability_of_a_bank():

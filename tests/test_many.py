@@ -178,6 +178,24 @@ def test_alarms_of_a_fleet_share_one_rate(fleet):
         said["<6>"]
 
 
+def test_clear_series_are_judged_by_a_few_simulated_records_and_the_others_by_all():
+    rng = np.random.default_rng(8)
+    u = rng.normal(size=(5, 700))
+    y = u + 0.1 * rng.normal(size=u.shape)
+    y[2, 500:] += 0.2 * u[2, 500:]
+    fleet = track(Regression(1), Kalman(q=0.0, r=0.01), y, u, by="row")
+    said, full = fleet.detect("glr", every=1000.0), fleet.detect("glr", every=1000.0, records=64)
+    assert said.faulty == full.faulty == (2,)
+    assert said.alarmed == full.alarmed == (2,)
+    assert said[2].rule == full[2].rule
+    clear = [k for k in fleet if said[k].rule != full[k].rule]
+    assert len(clear) >= 3
+    for k in clear:
+        assert said[k].p > 0.1
+        assert full[k].p > 0.02
+        np.testing.assert_allclose(said[k].limits, full[k].limits, rtol=0.3)
+
+
 def test_every_series_may_have_a_reference_of_its_own(fleet):
     bands = {key: {"b1[u]": (0.5, 1.5)} for key in fleet} | {"<4>": {"b1[u]": (0.5, 2.5)}}
     said = fleet.detect("band", every=1000.0, reference=bands)

@@ -25,10 +25,9 @@ from driftfit import (
     track,
     tune,
 )
-from driftfit.fleets import Outputs, Shared
+from driftfit.fleets import Outputs
 from driftfit.judge.compare import persistence
 from driftfit.judge.structures.candidates import price, unscored
-from driftfit.streams import LiveOutputs
 from driftfit.tune.frontier import Frontier
 
 JOINT = ARX(1, 1, ny=NAMES)
@@ -42,7 +41,7 @@ def records():
     z, phi = measured(80)
     y[[10, 30], [0, 1]] = np.nan
     z[10, 1] = np.nan
-    return [(JOINT, y, u, Outputs), (SHARED, z, phi, Shared)]
+    return [(JOINT, y, u, Outputs), (SHARED, z, phi, Track)]
 
 
 def same(a, b, part=slice(None)):
@@ -64,7 +63,7 @@ def test_files_and_warm_starts_of_records_and_streams(case, tmp_path):
     same(rest, whole, slice(40, None))
     rest.save(tmp_path / "rest")
     same(kind.load(tmp_path / "rest"), rest)
-    live = Live(model if kind is Shared else ARX(1, 1, inputs=1, ny=NAMES), TRACKER, warm_start=half)
+    live = Live(model if kind is Track else ARX(1, 1, inputs=1, ny=NAMES), TRACKER, warm_start=half)
     for t in range(40, 60):
         live.update(y[t], u[t], time=time[t])
         np.testing.assert_array_equal(live.theta, whole.theta[t])
@@ -179,17 +178,17 @@ def test_windows_of_a_stream_are_the_smoother_of_the_record_so_far(case, tmp_pat
     model, y, u, kind = case
     drift = np.random.default_rng(1).uniform(0.2, 2.0, (80, 3 if kind is Outputs else 2))
     w = np.random.default_rng(2).uniform(0.2, 2.0, (80, 2))
-    live = Live(model if kind is Shared else ARX(1, 1, inputs=1, ny=NAMES), TRACKER, lag=4)
+    live = Live(model if kind is Track else ARX(1, 1, inputs=1, ny=NAMES), TRACKER, lag=4)
     for t in range(40):
         live.update(y[t], u[t], weight=w[t], drift=drift[t])
         if t == 20:
             live.save(tmp_path / "state")
-            live = LiveOutputs.load(tmp_path / "state")
+            live = Live.load(tmp_path / "state")
         if t in (15, 19, 21, 39):
             run = track(model, TRACKER, y[: t + 1], u[: t + 1], weights=w[: t + 1], drift=drift[: t + 1])
             window = live.smooth()
             np.testing.assert_array_equal(live.theta, run.theta[-1])
-            if kind is Shared:
+            if kind is Track:
                 np.testing.assert_allclose(window.theta, run.smooth().theta[-5:], rtol=1e-8)
                 np.testing.assert_allclose(window.std, run.smooth().std[-5:], rtol=1e-8)
             else:
@@ -262,8 +261,11 @@ def test_what_is_of_one_output_says_so():
         _ = run.polynomials
     with pytest.raises(AttributeError, match="did you mean prediction"):
         _ = run.predictions
-    with pytest.raises(AttributeError, match=r"run.rows.crossing"):
-        _ = track(shared, TRACKER, z, phi).crossing
+    with pytest.raises(ValueError, match=r"a sample of this run holds 2 outputs; run.rows.crossing"):
+        track(shared, TRACKER, z, phi).crossing("theta1", above=1.0)
+    live = Live(ARX(1, 1, inputs=1, ny=NAMES), TRACKER)
+    with pytest.raises(ValueError, match="this needs a stream of one output; this one has level, flow"):
+        _ = live.system
     assert "FLS(mu=1000.0)" in repr(run)
     with pytest.raises(ValueError, match="takes drift of shape"):
         track(joint, RLS(0.9), y, u, drift=np.ones((80, 3)))
@@ -288,14 +290,64 @@ def test_live_loads_a_stream_with_several_outputs(tmp_path):
             live.update(out[t], given[t])
         live.save(tmp_path / "state")
         for again in (Live.load(tmp_path / "state"), Live.from_bytes(live.to_bytes())):
-            assert isinstance(again, LiveOutputs)
+            assert type(again) is type(never)
             for a, b in zip(again.update(out[20], given[20]), never.update(out[20], given[20]), strict=True):
                 np.testing.assert_array_equal(a, b)
             np.testing.assert_array_equal(again.theta, never.theta)
             never = copy(live)
-    Live(ARX(1, 1, inputs=1), TRACKER).save(tmp_path / "one")
-    with pytest.raises(ValueError, match="holds a state"):
-        LiveOutputs.load(tmp_path / "one")
+
+
+@pytest.mark.parametrize("case", records(), ids=["joint", "shared"])
+def test_an_operator_holds_and_resets_a_stream_of_several_outputs(case):
+    """Held samples enter the lags and are not used, one by one or at once; what is reset is found by its name."""
+    model, y, u, kind = case
+    model = model if kind is Track else ARX(1, 1, inputs=1, ny=NAMES)
+    one, many = Live(model, Kalman(q=1e-3, r=0.1)), Live(model, Kalman(q=1e-3, r=0.1))
+    for t in range(20):
+        one.update(y[t], u[t])
+    many.update_many(y[:20], u[:20])
+    before = one.theta, one.cov
+    for live in (one, many):
+        live.hold()
+    for t in range(20, 25):
+        assert not one.update(y[t], u[t], weight=2.0)[3].any()
+        assert one.held
+    assert not many.update_many(y[20:25], u[20:25]).ok.any()
+    np.testing.assert_array_equal(one.theta, before[0])
+    np.testing.assert_array_equal(one.cov, before[1])
+    for live in (one, many):
+        live.hold(False)
+        live.update(y[25], u[25], weight=0.0)
+        assert not live.held
+    for t in range(26, 30):
+        for a, b in zip(one.update(y[t], u[t]), many.update(y[t], u[t]), strict=True):
+            np.testing.assert_array_equal(a, b)
+    place, name = ((1, 1), "a1[flow<-flow]") if kind is Outputs else ((1,), one.names[1])
+    theta, cov = one.theta, one.cov
+    one.reset(name, p=2.0, theta=7.0)
+    theta[place] = 7.0
+    cov[(*place, place[-1])] += 2.0
+    np.testing.assert_array_equal(one.theta, theta)
+    np.testing.assert_allclose(one.cov, cov, rtol=1e-12)
+    np.testing.assert_allclose(one.std[place] ** 2, cov[(*place, place[-1])], rtol=1e-12)
+    with pytest.raises(ValueError, match="no parameter 'b9'"):
+        one.reset("b9", p=1.0)
+
+
+def test_outputs_that_share_one_theta_are_a_track_of_instants():
+    _, (model, z, phi, _) = records()
+    run = track(model, Kalman(q=1e-3, r=0.1), z, phi, keep="cov")
+    assert isinstance(run, Track)
+    assert (len(run), len(run.rows), run.rows.rows, run.rows_per_instant) == (80, 160, run.rows, 2)
+    assert run.theta.shape == (80, 2)
+    assert run.prediction.shape == run.ok.shape == run.log_density.shape == run.y.shape == (80, 2)
+    assert run.loglik == run.rows.loglik
+    for t in (0, 7, -1):
+        np.testing.assert_array_equal(run.cov(t), run.rows.cov(2 * (t % 80) + 1))
+        np.testing.assert_array_equal(run.covariances()[t], run.cov(t))
+    np.testing.assert_array_equal(run.output_band(0.9, conformal=True)[0].ravel(), run.rows.output_band(0.9, True)[0])
+    np.testing.assert_array_equal(run.band(0.9, conformal=True)[1], run.rows.band(0.9, True)[1][1::2])
+    assert str(run.verdict()) == str(run.rows.verdict())
 
 
 def test_summaries_are_objects():

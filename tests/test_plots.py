@@ -2,45 +2,29 @@
 
 import inspect
 
-import numpy as np
 import pytest
+from every_result import U, Y, every_result
 from matplotlib.figure import Figure
-from support import arx_record
 
 import driftfit
 from driftfit import (
-    ARX,
     RLS,
     Bank,
     Decide,
-    HammersteinWiener,
-    Kalman,
     Live,
-    Polynomial,
     Regression,
     Sensor,
-    frontier,
     piecewise,
     plot_tree,
-    select,
-    track,
-    tune,
 )
 from driftfit.show.parts.axes import panels
-
-Y, U = arx_record(200, 1)
-TWO = np.column_stack([Y, 0.5 * Y[::-1]])
-K = Kalman(q=1e-3, r=0.01)
 
 
 @pytest.fixture(scope="module")
 def pictures():
     """Every function that draws a result, by name, with the number of its panels."""
-    run = track(ARX(2, 2), K, Y, U)
-    fleet = track(ARX(2, 2), K, np.stack([Y] * 3), np.stack([U] * 3), by="row")
-    shared = track(Regression(1, ny=2, shared=True), K, TWO, np.stack([U, U], axis=1)[..., None])
-    bank = track(ARX(2, 2), Bank(sensors=[Sensor.nominal(r=0.01)]), Y, U)
-    curved = track(HammersteinWiener(1, 1, input=Polynomial(2), output=Polynomial(2)), RLS(1.0), Y, U)
+    one = every_result()
+    run = one["Track"]
     deciding = Live(Regression(1), Bank(sensors=[Sensor.nominal(r=0.01)], reduce=Decide()))
     for t in range(20):
         deciding.update(Y[t], [U[t]])
@@ -48,19 +32,19 @@ def pictures():
         "Track.plot": (run.plot, 6),
         "Track.plot_system": (run.plot_system, 4),
         "Track.plot_validation": (lambda ax=None: run.plot_validation(Y, U, ax=ax), 2),
-        "Track.plot_blocks": (curved.plot_blocks, 6),
-        "Fleet.plot": (fleet.plot, 3),
-        "Outputs.plot": (track(ARX(1, 1, ny=2), K, TWO, U).plot, 6),
-        "Shared.plot": (shared.plot, 3),
-        "Smoothed.plot": (run.smooth().plot, 4),
+        "Track.plot_blocks": (one["HammersteinWiener"].plot_blocks, 6),
+        "Fleet.plot": (one["Fleet"].plot, 3),
+        "Outputs.plot": (one["Outputs"].plot, 6),
+        "Instants.plot": (one["Instants"].plot, 3),
+        "Smoothed.plot": (one["Track.smooth"].plot, 4),
         "Segments.plot": (piecewise(run, [100]).plot, 4),
-        "Segmentation.plot": (run.segment().plot, 5),
-        "Diagnosis.plot": (run.diagnose().plot, 6),
-        "Alarms.plot": (run.detect("innovation").plot, 3),
-        "Selection.plot": (select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0)).plot, 2),
-        "Tuned.plot": (tune(ARX(2, 2), Kalman(), Y, U).plot, 1),
-        "Frontier.plot": (frontier(ARX(2, 2), Y, U).plot, 2),
-        "Hypotheses.plot": (bank.hypotheses.plot, 5),
+        "Segmentation.plot": (one["Segmentation"].plot, 5),
+        "Diagnosis.plot": (one["Track.diagnose"].plot, 6),
+        "Alarms.plot": (one["detect"].plot, 3),
+        "Selection.plot": (one["Selection"].plot, 2),
+        "Tuned.plot": (one["Tuned"].plot, 1),
+        "Frontier.plot": (one["Frontier"].plot, 2),
+        "Hypotheses.plot": (one["Bank.hypotheses"].plot, 5),
         "plot_tree": (lambda ax=None: plot_tree(deciding, ax=ax), 1),
     }
 

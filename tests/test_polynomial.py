@@ -5,6 +5,7 @@ import pytest
 from scipy import signal
 
 from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
+from driftfit.models.polynomial import FORGOTTEN
 from driftfit.models.polynomial_steps import SETTLING
 from driftfit.run.program import Program
 from driftfit.smooth.problem import replay
@@ -61,7 +62,8 @@ def twin(y, u, p0, forgetting):
         psi = np.array([old["yf"], old["uf"], old["ef"]]) if usable >= SETTLING * n else phi
         if t > 0:
             e = y[t] - phi @ theta
-            P = P / forgetting
+            early = 1.0 - 1.0 / max(0.1 * FORGOTTEN * n, 0.25 * usable) if usable < FORGOTTEN * n else 1.0
+            P = P / min(forgetting, early)
             k = P @ psi / (1.0 + psi @ P @ psi)
             theta, P = theta + k * e, P - np.outer(k, psi @ P)
         c = theta[2]
@@ -84,7 +86,7 @@ def armax_record(T, seed, c=0.7):
 
 def test_recursive_maximum_likelihood_is_its_slow_twin():
     """While C is stable, which it is here, the prediction is linear at theta itself."""
-    y, u = armax_record(600, 2)
+    y, u = armax_record(600, 6)
     run = track(ARMAX(1), RLS(0.995, p0=100.0), y, u)
     np.testing.assert_allclose(run.theta[1:], twin(y, u, 100.0, 0.995)[1:], rtol=1e-6, atol=1e-8)
 
@@ -175,3 +177,38 @@ def test_a_field_of_two_owners_is_refused():
 
     with pytest.raises(ValueError, match="both have a field signals"):
         Program(ARMAX(1).bind(1), Careless(0.99)).tile()
+
+
+def test_least_squares_forgets_its_start():
+    """With an offset and two inputs the first regressors are poor, and RLS(1.0) used to keep what they said."""
+    truth, inside, off = np.array([1.0, 0.5, 0.3, 0.5, 0.8, 1.5, -0.7, 0.9, 2.0]), [], []
+    model = BoxJenkins([2, 1], 1, 1, [2, 1], nk=[1, 2], offset=True)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u = rng.normal(size=(1500, 2))
+        y = signal.lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], u[:, 0]) + signal.lfilter([0, 0, 0.3], [1, -0.9], u[:, 1])
+        y += signal.lfilter([1.0, 0.5], [1.0, -0.8], 0.3 * rng.normal(size=1500)) + 2.0
+        run = track(model, RLS(1.0), y, u)
+        miss = run.theta[-1] - truth
+        inside.append(np.abs(miss) < 1.96 * run.std[-1])
+        off.append(miss[-1])
+    assert np.mean(inside) > 0.9  # it was .57
+    assert np.sqrt(np.mean(np.square(off))) < 0.15  # it was 1.1
+
+
+def test_gains_and_responses_of_transfer_functions():
+    y, u, _ = plant(THETA, 1500, 3)
+    run = track(BJ, RLS(1.0), y, u)
+    parts = BJ.bind(1).parts(run.theta[-1])
+    B, F = parts["B"][0], parts["F"][0]
+    step = signal.lfilter(B, F, np.ones(30))
+    np.testing.assert_allclose(run.step_response(30).value[0], step, rtol=1e-9)
+    np.testing.assert_allclose(run.dc_gain(-1).value[0, 0], B.sum() / F.sum(), rtol=1e-12)
+    np.testing.assert_allclose(np.sort_complex(run.poles(-1)[0]), np.sort_complex(np.roots(F)), rtol=1e-9)
+    played = run.simulate(u[:40])
+    np.testing.assert_allclose(played.y_hat - run.theta[-1, -1], signal.lfilter(B, F, u[:40]), rtol=1e-8, atol=1e-10)
+    assert (played.y_std > played.theta_std).all()
+    assert run.largest_pole(-1).value[0] == pytest.approx(np.abs(np.roots(F)).max())
+    for verb in (lambda: run.simulate(u[:5], y=y[:2]), run.long_run):
+        with pytest.raises(ValueError, match=r"from rest|is for ARX"):
+            verb()

@@ -12,31 +12,13 @@ from multiprocessing import get_context
 import joblib
 import numpy as np
 import pytest
-from support import arx_record, same
+from every_result import every_result
+from support import same
 
 import driftfit
 from driftfit import *  # noqa: F403
-from driftfit import (
-    ARX,
-    RLS,
-    Bank,
-    HammersteinWiener,
-    Kalman,
-    Live,
-    LiveSelection,
-    Regression,
-    Sensor,
-    frontier,
-    select,
-    track,
-    tune,
-)
 from driftfit.engine.settings import Settings
 from driftfit.systems import *  # noqa: F403
-
-Y, U = arx_record(200, 1)
-TWO = np.column_stack([Y, 0.5 * Y[::-1]])
-K = Kalman(q=1e-3, r=0.01)
 
 
 def values(x, p, out):
@@ -57,6 +39,8 @@ OE(2, 2)
 BoxJenkins(2, 1, 1, 2)
 PolynomialModel(1, 1, 1, 1, 1)
 Equation("flow = theta.k * sqrt(p1 - p2) - theta.c")
+StateSpace("x = x[-1] + theta.a * u\\n y = x", start={"a": 2.0})
+JointKalman(q={"x": 1e-4}, r=0.1, p0=1.0)
 Regression(3)
 Regression(["income", "rate"], intercept=True)
 Regression(2, ny=2, shared=True)
@@ -77,8 +61,11 @@ Kalman(q=1e-4, r=0.1)
 Kalman(q=np.array([1e-4, 0.0]), r=0.1, theta0=[1, 2], p0=np.eye(2), form="sqrt")
 RLS(0.98)
 RLS(0.9, p0=1.0, theta0=[1.0, np.pi])
+Kalman(q=1e-4, r=0.1, laws={"theta1": Law.returns(50, 0.2), "theta2": Law.season(24, harmonics=2)})
+Law.trend(1e-6)
 FLS(mu=100.0)
 AugmentedFLS(10.0)
+DynamicGLM("poisson", q=1e-4, p0=1.0)
 AdaptiveKalman()
 ExtendedKalman(q=1e-4, r=0.1)
 OutputError()
@@ -138,35 +125,9 @@ def test_settings_are_values(expression):
     assert joblib.hash(one) == joblib.hash(two)
 
 
-def objects():
-    """Every kind of result and stream, by name."""
-    run = track(ARX(2, 2), K, Y, U)
-    fleet = track(ARX(2, 2), K, np.stack([Y] * 3), np.stack([U] * 3), by="row")
-    outputs = track(ARX(1, 1, ny=2), K, TWO, U)
-    shared = track(Regression(1, ny=2, shared=True), K, TWO, np.stack([U, U], axis=1)[..., None])
-    bank = track(ARX(2, 2), Bank(sensors=[Sensor.nominal(r=0.01)]), Y, U)
-    found = {"Track": run, "Fleet": fleet, "Outputs": outputs, "Shared": shared, "Bank": bank}
-    found |= {"Live": Live(ARX(2, 2), K), "LiveOutputs": Live(ARX(1, 1, ny=2), K)}
-    found |= {"LiveSelection": LiveSelection([ARX(2, 2), ARX(1, 1)], tracker=RLS(1.0))}
-    for t in range(30):
-        found["Live"].update(Y[t], U[t])
-        found["LiveSelection"].update(Y[t], U[t])
-        found["LiveOutputs"].update(TWO[t], U[t])
-    for name in ("Track", "Fleet", "Outputs", "Shared"):
-        for verb in ("summary", "verdict", "diagnose"):
-            found[f"{name}.{verb}"] = getattr(found[name], verb)()
-    found |= {"Track.smooth": run.smooth(), "Bank.hypotheses": bank.hypotheses, "Bank.smooth": bank.smooth()}
-    found |= {"Tuned": tune(ARX(2, 2), Kalman(), Y, U), "TunedOutputs": tune(ARX(1, 1, ny=2), Kalman(), TWO, U)}
-    found |= {"Selection": select([ARX(2, 2), ARX(1, 1)], Y, U, tracker=RLS(1.0)), "Segmentation": run.segment()}
-    found |= {"Frontier": frontier(ARX(2, 2), Y, U), "detect": run.detect("innovation")}
-    found |= {"Forecast": run.forecast(2, U[:2]), "Prediction": run.ahead(2), "Response": run.step_response(5)}
-    found["Blocks"] = track(HammersteinWiener(1, 1), RLS(1.0), Y, U).blocks()
-    return found
-
-
 @pytest.fixture(scope="module")
 def everything():
-    return objects()
+    return every_result()
 
 
 @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
@@ -179,15 +140,15 @@ def test_results_and_streams_are_copied(everything, way):
             assert same(other.theta, one.theta), name
 
 
-def told(things):
-    """What another process says of them."""
+def described(things):
+    """The text and theta of each, as another process finds them."""
     return {name: (str(one), np.asarray(getattr(one, "theta", 0.0))) for name, one in things.items()}
 
 
 def test_everything_goes_to_another_process_and_back(everything):
     settings = {text: made(text) for text in SETTINGS}
     with get_context("spawn").Pool(1) as pool:
-        elsewhere = pool.apply(told, (everything | settings,))
+        elsewhere = pool.apply(described, (everything | settings,))
     for name, one in (everything | settings).items():
         assert elsewhere[name][0] == str(one), name
         assert same(elsewhere[name][1], np.asarray(getattr(one, "theta", 0.0))), name
@@ -200,7 +161,7 @@ def test_a_notebook_shows_what_a_result_is(everything):
             html = one._repr_html_()
             assert html.startswith("<pre"), name
             assert html.count("<span") == html.count("</span>"), name
-    for name in ("Track", "Fleet", "Outputs", "Shared", "Tuned", "TunedOutputs", "Track.verdict", "Fleet.verdict"):
+    for name in ("Track", "Fleet", "Outputs", "Instants", "Tuned", "TunedOutputs", "Track.verdict", "Fleet.verdict"):
         assert hasattr(everything[name], "_repr_html_"), name
     html = everything["Fleet"]._repr_html_()
     for word in ("Fleet of 3 series", "a1", "b2", f"{everything['Fleet'][2].theta[-1, 3]:.4g}"):

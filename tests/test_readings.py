@@ -15,6 +15,7 @@ from driftfit import (
     HammersteinWiener,
     Kalman,
     OutputError,
+    PolynomialModel,
     Sensor,
 )
 from driftfit.models.hammerstein_wiener.curves.basis import Polynomial
@@ -47,4 +48,13 @@ def test_no_power_of_a_reading_leaves_one_either(tracker):
     values = (-1e-320, 1e-100, 1e-20, 3e4, -3e6, 1e7, 1e8, -1e10, 1e13, 1e37, -1e80, 1e308, float("nan"), float("inf"))
     found, count = failures(CUBIC, tracker, [0, 1, 2, 3, 4, 5, 7, 11, 20], 130, values)
     assert count == 252
+    assert not found
+
+
+def test_no_computed_signal_leaves_one_either():
+    """A model with a memory of its own: theta that one reading spoiled computes signals, which are later regressors."""
+    model = PolynomialModel(na=1, nb=1, nc=1, nd=1, nf=1).bind(1)
+    values = (1e-37, 1e-20, -3e4, -1e5, 1e7, 1e10, 1e20, -1e30, 1e37, 1e101, float("nan"))
+    found, count = failures(model, RLS(0.98), [0, 1, 3, 9, 14, 20, 27, 33, 45, 57], 170, values)
+    assert count == 220
     assert not found

@@ -269,6 +269,21 @@ def test_a_smoothed_path_is_about_as_good_as_with_the_true_drift():
     assert np.mean(inside) > 0.91
 
 
+def test_bands_hold_where_the_walk_is_too_slow_to_be_seen():
+    inside = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        u, theta = rng.normal(size=(500, 3)), 1.0 + np.cumsum(0.003 * rng.normal(size=(500, 3)), axis=0)
+        run = track(MODEL, AdaptiveKalman(), np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=500), u)
+        path = run.smooth()
+        inside.append(np.mean(np.abs(path.theta - theta)[100:] < 1.96 * path.std[100:]))
+    assert 0.93 < np.mean(inside) < 0.97  # with the variances of the average drift alone: 0.91
+    whole = run.smooth(keep="cov")
+    np.testing.assert_allclose(whole.theta, path.theta, rtol=1e-6)
+    spread = np.sqrt([np.diag(whole.cov(t)) for t in range(0, 500, 50)])
+    np.testing.assert_allclose(spread, path.std[::50], rtol=1e-6)
+
+
 def test_drift_is_pooled_over_time_except_at_jumps():
     rate = np.append(0.0, np.tile([1.0, 3.0], 20))[:, None]
     rate[7] = 200.0
@@ -427,20 +442,48 @@ def test_resumed_runs_and_structures_are_judged_by_the_density_of_the_mixture(tr
         assert abs(gaussian - total) > 1.0
 
 
-@pytest.mark.parametrize("tracker", [RLS(1.0), RLS(0.98), FLS(300.0)], ids=repr)
-@pytest.mark.parametrize(("quantum", "held"), [(1.0, 400), (1.0, 20), (2.0, 20), (2.0, 1)])
-def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(tracker, quantum, held):
-    """The variance of what readings share does not shrink with their number; without it 0.3 to 0.9 of them cover."""
+def coarse_record(seed, quantum, held):
+    """One parameter, the exact value of a constant, and readings of a coarse meter in noise of 0.3."""
+    rng = np.random.default_rng(seed)
+    x = np.ones(400) if held == 400 else 1.0 + 0.5 * np.repeat(rng.normal(size=400 // held), held)
+    theta = 5.0 * rng.random()
+    return quantum * np.round((theta * x + 0.3 * rng.normal(size=400)) / quantum), x, theta
+
+
+COARSE = [RLS(1.0), RLS(0.98), FLS(300.0), AdaptiveKalman()]
+
+
+@pytest.mark.parametrize("tracker", COARSE, ids=repr)
+@pytest.mark.parametrize(
+    ("quantum", "held", "told"),
+    [(1.0, 400, 38), (1.0, 20, 38), (2.0, 20, 38), (2.0, 1, 38), (3.0, 400, 20), (5.0, 1, 20)],
+)
+def test_bands_of_coarse_meters_do_not_count_one_error_of_rounding_as_many(tracker, quantum, held, told):
+    """The variance of what readings share does not shrink with their number; without it 0.3 to 0.9 of them cover.
+
+    With the last two quanta readings alternate between two values, and their variance says nothing about the noise.
+    """
     inside = []
     for seed in range(40):
-        rng = np.random.default_rng(seed)
-        x = np.ones(400) if held == 400 else 1.0 + 0.5 * np.repeat(rng.normal(size=400 // held), held)
-        theta = 5.0 * rng.random()
-        run = track(Regression(1), tracker, quantum * np.round((theta * x + 0.3 * rng.normal(size=400)) / quantum), x)
+        y, x, theta = coarse_record(seed, quantum, held)
+        run = track(Regression(1), tracker, y, x)
         if np.isfinite(run.std[-1, 0]):
             inside.append(abs(run.theta[-1, 0] - theta) <= 1.96 * run.std[-1, 0])
-    assert len(inside) >= 38
-    assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 40)
+    assert len(inside) >= told
+    assert np.mean(inside) >= 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / len(inside))
+
+
+@pytest.mark.parametrize("tracker", [FLS(1e6), AdaptiveKalman()], ids=repr)
+def test_smoothed_bands_of_coarse_meters_share_errors_of_rounding_too(tracker):
+    inside = []
+    for seed in range(20):
+        y, x, theta = coarse_record(seed, 2.0, 400)
+        run = track(Regression(1), tracker, y, x)
+        path = run.smooth()
+        if run.state["coarse"] > 0.0:  # readings that are all the same have no bands
+            inside.append(np.mean(np.abs(path.theta - theta) <= 1.96 * path.std))
+    assert len(inside) >= 15
+    assert np.mean(inside) > 0.9  # without: 0 and 0.9
 
 
 def test_a_fine_meter_shares_no_error_of_rounding():

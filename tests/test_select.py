@@ -196,5 +196,8 @@ def test_orders_and_basis_of_a_hammerstein_wiener_model():
     said = select(candidates, w, u, tracker=Kalman(q=1e-8, r=4e-4))
     assert said.model().input == Polynomial(2)
     run = track(said.model(), Kalman(q=1e-8, r=4e-4), w, u)
+    shared = said.predictions[candidates.index(said.model())]  # in a driver that all candidates share
+    np.testing.assert_array_equal(shared.y_hat, run.prediction)
+    np.testing.assert_array_equal(shared.loglik, run.log_density)
     assert not run.verdict().drifts
     assert run.verdict().rms == pytest.approx(0.02, rel=0.15)

@@ -18,13 +18,29 @@ import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import HTTP, MODEL, TRACKER, UNIT, configured, feed, message, opened, record, settled
+from service_support import (
+    HTTP,
+    MODEL,
+    TRACKER,
+    UNIT,
+    configured,
+    feed,
+    field,
+    message,
+    metric,
+    opened,
+    record,
+    settled,
+)  # fmt: skip
 
 from driftfit import track
 from driftfit.service.core.journal import Names
-from driftfit.service.sinks.contract import Event, Outcome, Result
+from driftfit.service.core.results import OK, Results
+from driftfit.service.sinks.contract import Event, Outcome
 from driftfit.service.sinks.webhook import Webhook
+from driftfit.service.sources.mqtt import Mqtt
 from driftfit.service.sources.replay import Replay
+from driftfit.service.sources.sparkplug import REBIRTH
 from driftfit.service.sources.tail import Tail
 from driftfit.service.threads import SinkThread, SourceThread
 
@@ -49,16 +65,14 @@ def until(what, seconds=30.0):
     raise TimeoutError
 
 
-def outcome(count=3, first=1):
+def outcome(count=3, first=1, theta=0.5):
     """A small batch of one unit."""
-    results = [
-        Result(
-            first + k, "pump 1", 1.7e9 + k, 1.0, float("nan"), 0.1, 0.2, True, [0.5, 0.1], [0.1, float("inf")], False
-        )
-        for k in range(count)
-    ]
+    values = np.tile([0.0, 1.0, np.nan, 0.1, 0.2, theta, 0.1, 0.1, np.inf], (count, 1))
+    values[:, 0] = 1.7e9 + np.arange(count)
+    number, unit = first + np.arange(count), np.ones(count, np.int32)
+    parts = [Results(number, unit, np.full(count, OK, np.uint8), values)]
     events = [Event(first, "pump 1", 1.7e9, "alarm", {"kind": "band", "cause": "a1", "statistic": 4.0, "limit": 3.0})]
-    return Outcome(first, results, events, {"pump 1": {"names": ["a1", "b1"], "parts": {"pump": "1"}}})
+    return Outcome(first, parts, events, {1: "pump 1"}, {"pump 1": {"names": ["a1", "b1"], "parts": {"pump": "1"}}})
 
 
 @contextlib.contextmanager
@@ -144,6 +158,38 @@ def test_mqtt_through_an_absence_of_the_broker(tmp_path):
     assert sorted(one["time"] for one in told.values()) == list(range(300))
     assert next(one for one in told.values() if one["time"] == 299.0)["theta"]["a1"] == run.theta[-1, 0]
     engine.close()
+
+
+@needs("paho")
+@pytest.mark.skipif(not HAS_BROKER, reason="needs mosquitto")
+def test_a_node_of_sparkplug_is_asked_for_its_birth(tmp_path):
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    broker = Broker(tmp_path)
+    node, asked = Client(CallbackAPIVersion.VERSION2, "node"), []
+
+    def commanded(client, user, message):
+        asked.append(message.payload)
+        client.publish("spBv1.0/plant/DBIRTH/edge/7", field(1, 1000) + metric(31.5, "flow", 1), qos=1)
+
+    node.on_message = commanded
+    node.on_connect = lambda client, *_: client.subscribe("spBv1.0/plant/NCMD/edge")
+    node.connect("127.0.0.1", broker.port)
+    node.loop_start()
+    url = f"mqtt://127.0.0.1:{broker.port}"
+    reader = Mqtt("plant", url=url, topic="spBv1.0/plant/+/#", payload="sparkplug").open(None)
+    until(lambda: reader.client.is_connected() and node.is_connected())
+    time.sleep(0.3)  # both have subscribed
+    node.publish("spBv1.0/plant/DDATA/edge/7", field(1, 900) + metric(30.0, alias=1), qos=1)
+    found = []
+    until(lambda: found.append(reader.read(0.2)) or any(one is not None and one.samples for one in found))
+    assert asked == [REBIRTH]
+    assert sum(one.refused for one in found if one is not None) == 1
+    assert [one for one in found if one is not None][-1].samples[0].columns["flow"] == [31.5]
+    reader.close()
+    node.loop_stop()
+    broker.stop()
 
 
 def _subscribed(sender, engine):
@@ -287,8 +333,7 @@ def test_opcua_from_our_own_server():
     reader = Opcua("in", url, nodes, trigger="a1", period=0.02).open(None)
     begun = until(lambda: reader.read(0.5))
     assert begun.samples[0].columns["a1"][-1] == 0.5
-    batch = outcome(1, 2)
-    writer.write(batch._replace(results=[batch.results[0]._replace(theta=[0.75, 0.2])]))
+    writer.write(outcome(1, 2, theta=0.75))
     found = until(lambda: (one := reader.read(0.5)) and one.samples[0].columns["a1"][-1] == 0.75 and one)
     assert found.samples[0].topic == "plant/1"
     assert found.samples[0].columns["flow"][-1] == 1.0

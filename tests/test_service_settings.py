@@ -1,24 +1,30 @@
 """The configuration of the service, and what comes from outside: every wrong thing is named or counted."""
 
+import contextlib
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("msgspec", reason="the service needs driftfit[serve]")
 
-from service_support import HTTP, UNIT, configured
+import click
+from service_support import HTTP, UNIT, configured, field, metric
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from driftfit import ARX, AdaptiveKalman, Bank, Change, Kalman, Sensor
 from driftfit.cli import app
 from driftfit.cli.parts.arguments import parse_model
-from driftfit.service.settings.config import ProblemsError, parse
+from driftfit.service.settings.config import ProblemsError, parse, read
 from driftfit.service.settings.matching import Pattern
 from driftfit.service.settings.options import Secret
 from driftfit.service.settings.trackers import tracker_of
 from driftfit.service.sources.incoming import decoded
 from driftfit.service.sources.samples import decode, number, seconds
+from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 
 def test_the_example_of_the_issue():
@@ -196,3 +202,63 @@ def test_secrets_are_never_shown(tmp_path, monkeypatch):
             configured(source=source + wrong)
         assert "topsecret" not in str(caught.value)
     assert isinstance(one.password, Secret)
+
+
+def test_sparkplug():
+    """The payloads of the specification; a birth, data by aliases and by exception, history, restarts."""
+    reader, topic = Sparkplug(), "spBv1.0/plant/{}/edge 1/pump 7"
+    born = field(1, 1000) + metric(31.5, "flow", 1) + metric(4.25, "pressure", 2) + metric(2**32 - 5, "t", 3, kind=3)
+    found = reader.decode(topic.format("DBIRTH"), born + field(3, 0))
+    assert found == (
+        "spBv1.0/plant/edge 1/pump 7", 1,
+        {"flow": [31.5], "pressure": [4.25], "t": [-5], "timestamp": [1000]},
+    )  # fmt: skip
+    changed = reader.decode(topic.format("DDATA"), field(1, 2000) + metric(32.0, alias=1))
+    assert changed.columns == {"flow": [32.0], "pressure": [4.25], "t": [-5], "timestamp": [2000]}
+    more = metric(33.0, alias=1, when=2500) + metric(5.0, alias=2, when=2600) + metric(0.0, alias=3, when=2600, null=1)
+    two = reader.decode(topic.format("DDATA"), field(1, 3000) + more)
+    assert two.columns == {
+        "flow": [33.0, 33.0], "pressure": [4.25, 5.0], "t": [-5, None], "timestamp": [2500, 2600]}  # fmt: skip
+    reader.decode(topic.format("DDATA"), field(1, 3000) + metric(9.0, alias=1, when=10, historical=1))
+    assert reader.decode(topic.format("DDATA"), field(1, 4000) + metric(5.5, alias=2)).columns["flow"] == [33.0]
+    assert reader.decode(topic.format("DDATA"), field(1, 5000) + metric(True, "on") + metric("x", "text")).columns["on"]
+    assert reader.decode("spBv1.0/plant/NDEATH/edge 1", field(1, 1)) is None
+    assert reader.decode("spBv1.0/STATE/host", b"{}") is None
+    with pytest.raises(UnknownAliasError, match="alias 1 was declared by no birth of plant/edge 1"):
+        Sparkplug().decode(topic.format("DDATA"), field(1, 2000) + metric(32.0, alias=1))
+    assert metric(True, "Node Control/Rebirth", kind=11) == REBIRTH
+    assert rebirth_topic(topic.format("DDATA")) == "spBv1.0/plant/NCMD/edge 1"
+    rng = np.random.default_rng(0)
+    for _ in range(3000):
+        data = bytearray(born)
+        for place in rng.integers(0, len(data), 3):
+            data[place] = rng.integers(256)
+        with contextlib.suppress(ValueError):
+            reader.decode(topic.format("DBIRTH"), bytes(data[: rng.integers(len(data))]))
+
+
+def test_the_files_of_the_docs_fit_the_service(monkeypatch):
+    """What systemd and the image run, and what the containers mount, is there and is accepted."""
+    folder = Path(__file__).parent.parent / "docs" / "service"
+    monkeypatch.setenv("POSTGRES_PASSWORD", "x")
+    config = read(folder / "plant.toml")
+    assert [type(one).__name__ for one in config.sinks] == ["Webhook", "Postgres"]
+    assert {type(one).__name__ for one in config.sources} == {"Mqtt", "Http"}
+    (start,) = re.findall(
+        r"^ExecStart=/opt/driftfit/bin/driftfit (.*)$", (folder / "driftfit.service").read_text(), re.M
+    )
+    image = (folder / "Containerfile").read_text()
+    (warm,) = re.findall(r"^RUN driftfit (.*)$", image, re.M)
+    run = [*json.loads(re.findall(r"^ENTRYPOINT (.*)$", image, re.M)[0])[1:],
+           *json.loads(re.findall(r"^CMD (.*)$", image, re.M)[0])]  # fmt: skip
+    for words in (start.split(), warm.split(), run):
+        command = get_command(app).commands[words[0]]
+        command.parse_args(click.Context(command), words[1:])
+    compose = (folder / "compose.yaml").read_text()
+    for mounted in re.findall(r"- (\./[^:]+):", compose) + re.findall(r'"(\./[^:]+):', compose):
+        assert (folder / mounted).exists(), mounted
+    assert set(re.findall(r"\$\{(\w+)", compose)) == {"POSTGRES_PASSWORD", "GRAFANA_PASSWORD"}
+    assert (folder.parent.parent / re.findall(r"dockerfile: (\S+) ", compose)[0]).exists()
+    (source,) = set(re.findall(r"uid: (\w+)", (folder / "grafana" / "datasource.yaml").read_text()))
+    panels = json.loads((folder / "grafana" / "dashboard.json").read_text())["panels"]
+    assert {one["datasource"]["uid"] for one in panels} == {source}

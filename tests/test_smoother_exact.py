@@ -1,5 +1,6 @@
 """The exact smoother against dense solutions, and its invariances. Tolerances are relative to the largest value."""
 
+import tracemalloc
 from fractions import Fraction
 
 import naive_smoother as naive
@@ -141,6 +142,50 @@ def test_the_path_is_chosen_by_a_test_of_the_result(n):
     if n > 1:
         phi[:, 0] = phi[:, 1] + 1e-7 * phi[:, 0]
         assert exact.smooth(walk(phi, y, 1.0)).method == "safe"
+
+
+@pytest.mark.parametrize("columns", ["plain", "collinear", "collinear at first", "offset", "units"])
+def test_the_fast_path_knows_its_own_error(columns):
+    """What it accepts agrees with the safe path, and what is far from it is rejected."""
+    rng = np.random.default_rng(7)
+    accepted = 0
+    for mu in 10.0 ** np.arange(-4.0, 9.0, 2.0):
+        phi, y = record(150, 2, 5)
+        close_to = {"collinear": slice(None), "collinear at first": slice(75)}.get(columns, slice(0))
+        phi[close_to, 0] = phi[close_to, 1] + 10.0 ** rng.uniform(-5.0, -1.0) * phi[close_to, 0]
+        phi = (phi + (30.0 if columns == "offset" else 0.0)) * ([1e-6, 1e5] if columns == "units" else 1.0)
+        size = np.sqrt(np.mean(phi**2, axis=0))
+        quick, safe = (exact.smooth(walk(phi, 1e3 * y, mu * size**2), keep) for keep in ("std", "cov"))
+        accepted += quick.method == "fast"
+        close(quick.theta, safe.theta, 1e-9)
+        np.testing.assert_allclose(quick.var, safe.var, rtol=1e-9)
+    assert accepted >= (1 if "collinear" in columns else 3)
+
+
+@pytest.mark.parametrize("L", [1, 2, 3, 63, 64, 65, 126, 127, 128, 129, 130, 257])
+def test_records_of_every_length_are_eliminated_from_both_ends(L):
+    """Blocks that are full, begun or empty, and a middle sample on either side."""
+    phi, y = record(L, 1, 8)
+    w, drift = np.random.default_rng(3).uniform(0.5, 2.0, (2, L))
+    quick, safe = (exact.smooth(walk(phi, y, 3.0, w, drift), keep) for keep in ("std", "cov"))
+    if L > 3:
+        assert quick.method == "fast"
+    close(quick.theta, safe.theta, 1e-11)
+    close(quick.var, safe.var, 1e-11)
+    close(quick.rho, safe.rho, 1e-9)
+    assert quick.cost == pytest.approx(safe.cost, rel=1e-10, abs=1e-20)
+
+
+def test_memory_beside_the_result_is_a_small_part_of_it():
+    phi, y = record(20_000, 4)
+    run = track(Regression(4), FLS(30.0), y, phi)
+    run.smooth()
+    tracemalloc.start()
+    smoothed = run.smooth()
+    held, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert smoothed.method == "fast"
+    assert most < 1.2 * held < 1.2 * 20_000 * 150
 
 
 def test_leverage_and_leave_one_out_are_those_of_the_record_without_the_sample():

@@ -12,7 +12,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Records
 from driftfit.run.program import Program
 from driftfit.run.states.advance import advance
-from driftfit.run.states.late import HoldBack
+from driftfit.run.states.late import LATE, RELEASED, REPEATED, UNTIMED, WAITING, HoldBack, sort_out
 from driftfit.run.states.layout import MANY, packed, unpacked
 from driftfit.run.warm_start import End
 
@@ -129,40 +129,60 @@ def rows_in_batches(rng, T=400, hold=7.0):
     return time, which[np.argsort(arrival, kind="stable")]
 
 
-@pytest.mark.parametrize("dates", [False, True])
-def test_rows_that_wait_come_out_as_the_sorted_record(dates):
+def test_rows_that_wait_come_out_as_the_sorted_record():
+    """Two series that arrive in turn, each in parts."""
     rng = np.random.default_rng(3)
-    time, arriving = rows_in_batches(rng)
-    hold = 7.0
-    if dates:
-        time, hold = np.datetime64("2024-01-01", "us") + (time * 1e6).astype("m8[us]"), np.timedelta64(7, "s")
-    waiting, came, kept = HoldBack(hold), [], []
-    for part in np.split(arriving, np.sort(rng.choice(len(arriving), 40))):
-        times, rows = waiting.take(time[part], part.tolist())
-        came += rows
-        kept.append(times)
-        assert len(waiting) < 30
-    times, rows = waiting.rest()
-    assert [*came, *rows] == list(range(len(time)))
-    assert same(np.concatenate([*kept, times]), time)
-    assert waiting.counts["at a repeated time"] + waiting.counts["late"] == len(arriving) - len(time)
-    assert waiting.counts["at a repeated time"] > 20
+    given = [rows_in_batches(rng) for _ in range(2)]
+    waiting, newest, out = HoldBack(7.0, 1), np.full(2, np.nan), [[], []]
+    refused = 0
+    parts = [np.split(arriving, np.sort(rng.choice(len(arriving), 40))) for _, arriving in given]
+    for some in zip(*parts, strict=True):
+        series = np.repeat([0, 1], [len(part) for part in some])
+        time, which = (np.concatenate(one) for one in ([given[k][0][some[k]] for k in range(2)], some))
+        taken, fate = waiting.judge(series, time, newest)
+        refused += int((fate != RELEASED).sum() - (fate == WAITING).sum())
+        if rng.random() < 0.5:  # what is refused may be left out before, or not
+            series, time, which = series[taken], time[taken], which[taken]
+        series, time, rows = waiting.take(series, time, which[:, None].astype(float), newest)
+        assert len(waiting) < 60
+        for k in range(2):
+            out[k] += rows[series == k, 0].tolist()
+            assert same(given[k][0][rows[series == k, 0].astype(int)], time[series == k])
+    for k, (time, _) in enumerate(given):
+        assert [*out[k], *waiting.of(k)[1][:, 0]] == list(range(len(time)))
+    assert refused == sum(len(arriving) - len(time) for time, arriving in given) > 40
+
+
+def test_fates_of_dates_are_those_of_numbers():
+    rng = np.random.default_rng(4)
+    series, time, waited = rng.integers(0, 3, 60), rng.integers(0, 30, 60).astype(float), rng.random(60) < 0.2
+    time[::17] = np.nan
+    newest = np.array([12.0, np.nan, 5.0])
+    dated = [np.datetime64("2024-01-01", "us") + (one * 1e6).astype("m8[us]") for one in (time, newest)]
+    plain = sort_out(series, time, waited & np.isfinite(time), newest, 4.0)
+    found = sort_out(series, dated[0], waited & np.isfinite(time), dated[1], np.timedelta64(4, "s"))
+    assert same(found.order, plain.order)
+    assert same(found.fate, plain.fate)
+    assert set(plain.fate.tolist()) == set(range(5))
 
 
 def test_rows_that_are_too_late_are_counted():
-    waiting = HoldBack(2.0)
-    assert waiting.take([5.0, 1.0, np.nan, 1.0], "abcd")[1] == ["b"]
-    assert waiting.take([3.0, 5.0, 4.0], "efg")[1] == []
-    assert waiting.take([9.0], "h")[1] == ["g", "a"]
-    assert {name: count for name, count in waiting.counts.items() if count} == {
-        "without a time": 1, "at a repeated time": 2, "late": 1}  # fmt: skip
-    assert waiting.rest()[1] == ["h"]
+    def given(waiting, times, names, newest=None):
+        newest = np.full(1, np.nan) if newest is None else newest
+        series, rows = np.zeros(len(times), int), np.array([[ord(name)] for name in names], float)
+        _, fate = waiting.judge(series, np.array(times), newest)
+        return [chr(int(row[0])) for row in waiting.take(series, np.array(times), rows, newest)[2]], fate.tolist()
+
+    waiting, newest = HoldBack(2.0, 1), np.full(1, np.nan)
+    assert given(waiting, [5.0, 1.0, np.nan, 1.0], "abcd", newest) == (["b"], [WAITING, RELEASED, UNTIMED, REPEATED])
+    assert given(waiting, [3.0, 5.0, 4.0], "efg", newest) == ([], [LATE, REPEATED, WAITING])
+    assert given(waiting, [9.0], "h", newest) == (["g", "a"], [WAITING])
+    assert waiting.of(0)[0].tolist() == [9.0]
     with pytest.raises(ValueError, match="must not be negative"):
-        HoldBack(-1.0)
-    at_once = HoldBack(0)
-    assert at_once.take([1.0, 2.0], "ab")[1] == ["a", "b"]
-    assert at_once.take([2.0, 1.5, 3.0], "cde")[1] == ["e"]
-    assert dict(at_once.counts) == {"late": 1, "at a repeated time": 1, "without a time": 0}
+        HoldBack(-1.0, 1)
+    at_once = HoldBack(0.0, 1)
+    assert given(at_once, [1.0, 2.0], "ab", newest := np.full(1, np.nan))[0] == ["a", "b"]
+    assert given(at_once, [2.0, 1.5, 3.0], "cde", newest) == (["e"], [REPEATED, LATE, RELEASED])
 
 
 @pytest.mark.parametrize("count", [3, 40])
@@ -181,7 +201,9 @@ def test_series_continue_in_lanes_from_their_states(count):
         length = np.array([len(found[k][0]) for k in some])
         y, u = (np.concatenate([found[k][j] for k in some]) for j in range(2))
         whole = Records(tuple(some), np.cumsum(length) - length, length, y, u[:, None], Known.of())
-        got = advance([programs[k] for k in some], whole, {j: states[k] for j, k in enumerate(some) if k in states}, 1)
+        begun = np.array([k in states for k in some])
+        words = np.stack([states.get(k, np.zeros(programs[k].layout.size, np.int64)) for k in some])
+        got = advance([programs[k] for k in some], whole, words, begun, 1)
         after = got.states()
         states |= {k: programs[k].layout.unpack(programs[k].layout.pack(after[j])) for j, k in enumerate(some)}
         theta, e = got.column("theta"), got.column("e")

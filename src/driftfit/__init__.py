@@ -3,7 +3,7 @@
 from driftfit.checks import check_tracker
 from driftfit.engine.settings import DataWarning
 from driftfit.engine.version import __version__
-from driftfit.fleets import Fleet, Outputs, Shared
+from driftfit.fleets import Fleet, Outputs
 from driftfit.judge.segment import segment
 from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
@@ -30,14 +30,16 @@ from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curv
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
+from driftfit.models.process import process_model
 from driftfit.models.regression import Regression
+from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
 from driftfit.run.live.conformal import ConformalFactor
 from driftfit.smooth.augmented import augmented
 from driftfit.smooth.huber import huber
 from driftfit.smooth.piecewise import piecewise
 from driftfit.smooth.total_variation import total_variation
-from driftfit.streams import Live, LiveOutputs
+from driftfit.streams import Live
 from driftfit.trackers.adaptive_kalman import AdaptiveKalman
 from driftfit.trackers.augmented_fls import AugmentedFLS
 from driftfit.trackers.bank.bank import Bank
@@ -46,12 +48,16 @@ from driftfit.trackers.bank.reduction import GPB, IMM, Beam, Decide, FirstFloor,
 from driftfit.trackers.bank.results.pictures import plot_tree
 from driftfit.trackers.bank.sensor import Sensor
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.dynamic_glm import DynamicGLM
 from driftfit.trackers.fls import FLS
 from driftfit.trackers.instrumental import InstrumentalVariables
+from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
+from driftfit.trackers.laws.law import Law
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
+from driftfit.tune.pool import pool
 from driftfit.tune.tune import tune
 from driftfit.use import prepare
 from driftfit.use.rational import rational_model
@@ -77,6 +83,7 @@ __all__ = [
     "DataWarning",
     "DeadZone",
     "Decide",
+    "DynamicGLM",
     "Equation",
     "ExtendedKalman",
     "FirstFloor",
@@ -85,10 +92,11 @@ __all__ = [
     "HammersteinWiener",
     "Hybrid",
     "InstrumentalVariables",
+    "JointKalman",
     "Kalman",
+    "Law",
     "Legendre",
     "Live",
-    "LiveOutputs",
     "LiveSelection",
     "Model",
     "OutputError",
@@ -99,8 +107,8 @@ __all__ = [
     "Regression",
     "Saturation",
     "Sensor",
-    "Shared",
     "Sigmoid",
+    "StateSpace",
     "Track",
     "Tracker",
     "__version__",
@@ -114,7 +122,9 @@ __all__ = [
     "huber",
     "piecewise",
     "plot_tree",
+    "pool",
     "prepare",
+    "process_model",
     "rational_model",
     "segment",
     "select",

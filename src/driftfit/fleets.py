@@ -7,23 +7,18 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from driftfit.engine.kernel import Array
-from driftfit.judge.alarms.detect import Alarms, detect
 from driftfit.judge.alarms.fleet_alarms import ManyAlarms, alarms
-from driftfit.judge.diagnose import Diagnosis, diagnose
 from driftfit.judge.fleet_verdict import ManyDiagnoses, ManyVerdicts, diagnoses, verdicts
 from driftfit.judge.joint_noise import JointNoise
-from driftfit.judge.verdict import Verdict, verdict
 from driftfit.results import Track
-from driftfit.run import fleet, keyed_results, outputs, result, shared_outputs
-from driftfit.run.live.rule import AlarmRule
+from driftfit.run import fleet, keyed_results, outputs, result
 from driftfit.show.cells import cell_of
 from driftfit.show.fleet_summary import FleetSummary, summarise
 from driftfit.show.parts.by_output import ByOutput
-from driftfit.show.plots import plot_fleet, plot_outputs, plot_track
-from driftfit.show.report import check_path, report
+from driftfit.show.plots import plot_fleet, plot_outputs
+from driftfit.show.report import check_path
 from driftfit.show.report_many import page_of_many
-from driftfit.show.summary import Summary, summarise_outputs, summarise_shared
-from driftfit.smooth.shared_theta import SmoothedShared
+from driftfit.show.summary import Summary, summarise_outputs
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.use.crossing import crossings
 from driftfit.use.forecast import Forecast, forecast_outputs
@@ -45,16 +40,20 @@ class Judged(keyed_results.KeyedResults):
         """Keys and results."""
         return ((key, _public(run)) for key, run in super().items())
 
+    def _rows(self) -> dict[Hashable, result.Track]:
+        """The results sample by sample: of outputs that share one theta their rows."""
+        return {key: run.rows for key, run in self.items()}
+
     def _repr_html_(self) -> str:
         return cell_of(self)
 
     def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> ManyVerdicts:
         """Which runs have parameters that move, at a false discovery rate of ``level``, and where does tracking pay?"""
-        return verdicts(dict(self.items()), level, lags, burn)
+        return verdicts(self._rows(), level, lags, burn)
 
     def diagnose(self) -> ManyDiagnoses:
         """Diagnose every run, and count how often each diagnostic is out of bounds."""
-        return diagnoses(dict(self.items()))
+        return diagnoses(self._rows())
 
     def detect(
         self, kind: str = "glr", *, every: float = 10_000.0, level: float = 0.05, reference: Any = None,
@@ -65,7 +64,7 @@ class Judged(keyed_results.KeyedResults):
         ``level`` is a false discovery rate; ``reference`` is one for all runs or a mapping from every key to its own.
         Kinds and other settings are those of `driftfit.judge.alarms.detect`.
         """
-        return alarms(dict(self.items()), kind, every=every, level=level, reference=reference, **settings)
+        return alarms(self._rows(), kind, every=every, level=level, reference=reference, **settings)
 
     def report(
         self, path: str | PathLike[str], title: str | None = None, *, alarms: ManyAlarms | None = None,
@@ -75,7 +74,7 @@ class Judged(keyed_results.KeyedResults):
 
         ``alarms`` of `detect`, and ``labels`` by key, true where something was wrong, have a separate section.
         """
-        text = page_of_many(dict(self.items()), title, self.failed, alarms, labels)
+        text = page_of_many(self._rows(), title, self.failed, alarms, labels)
         check_path(path).write_text(text, encoding="utf-8")
 
     def crossing(
@@ -88,7 +87,7 @@ class Judged(keyed_results.KeyedResults):
         within the horizon, ``median``, ``low`` and ``high`` in samples after the end, with their times if the
         record has them. See `driftfit.use.crossing`.
         """
-        return crossings(dict(self.items()), self.by, what, below, above, horizon, u, level)
+        return crossings(self._rows(), self.by, what, below, above, horizon, u, level)
 
     def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
         """All results as one table of "polars", "pandas" or "pyarrow", the keys first; see `driftfit.show.export`.
@@ -168,60 +167,6 @@ class Outputs(outputs.Outputs, Judged, public=True):
     def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
         """Parameters with bands: one row of panels for each output. ``ax`` as for `Track.plot`."""
         return plot_outputs(self, level, ax)
-
-
-class Shared(shared_outputs.Shared, public=True):
-    __doc__ = shared_outputs.Shared.__doc__
-
-    def _repr_html_(self) -> str:
-        return cell_of(self)
-
-    def smooth(self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> SmoothedShared:
-        """The smoothed path: theta (T, n), and residuals of every output (T, ny)."""
-        return SmoothedShared.of_shared(self, keep, order_by, undetermined)
-
-    def forecast(self, h: int, u: Any = None) -> Forecast:
-        """The h nominal samples after the record, u (h, ny, m): theta, std (h, n), y_hat, y_std (h, ny)."""
-        return forecast_outputs(self, h, u)
-
-    def verdict(self, level: float = 0.05, lags: int | None = None, burn: int | None = None) -> Verdict:
-        """Do the shared parameters move? The verdict of the rows; see `driftfit.judge.verdict`."""
-        return verdict(self.rows, level, lags, burn)
-
-    def diagnose(self) -> Diagnosis:
-        """Diagnose the rows; see `Track.diagnose`."""
-        return diagnose(self.rows)
-
-    def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
-        """Alarms of the rows; see `Track.detect`, whose numbers of samples are numbers of rows here."""
-        return detect(self.rows, kind, **settings)
-
-    def report(self, path: str | PathLike[str], title: str | None = None, *, alarms: Alarms | None = None) -> None:
-        """The report on the rows; see `driftfit.show.report`. ``alarms`` of `detect` have a separate section."""
-        report(self.rows, path, title, alarms)
-
-    def summary(self) -> Summary:
-        """The summary of the rows, with the one-step error of each output; print it."""
-        return summarise_shared(self)
-
-    def plot(self, level: float = 0.95, ax: Any = None) -> Figure:
-        """Parameters with bands, predictions and innovations of the rows. ``ax`` as for `Track.plot`."""
-        return plot_track(self.rows, level, ax)
-
-    def to_xarray(self) -> xarray.Dataset:
-        """The results as an xarray dataset, predictions by time and output; see `driftfit.show.datasets`."""
-        from driftfit.show.datasets import to_xarray
-
-        return to_xarray(self)
-
-    def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
-        """The results as one table, one row per sample; see `driftfit.show.export`.
-
-        With ``arrays`` the columns ``theta`` and ``std`` hold all parameters of a sample.
-        """
-        from driftfit.show.export import to_table
-
-        return to_table(self, kind, arrays)
 
 
 def _public(run: result.Track) -> Track:

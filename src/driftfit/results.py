@@ -20,10 +20,13 @@ from driftfit.show.cells import cell_of
 from driftfit.show.plots import plot_track
 from driftfit.show.report import report
 from driftfit.show.summary import Summary, summarise
+from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.bank.results.decided_path import EventSmoothed
 from driftfit.trackers.bank.results.results import Hypotheses
 from driftfit.use import simulate, system
+from driftfit.use.constraints.constrained import Constrained, constrain
+from driftfit.use.continuous.conversion import Transfer, transfer
 from driftfit.use.crossing import Crossing, crossing
 from driftfit.use.forecast import Forecast, forecast
 from driftfit.use.prediction import Prediction
@@ -41,7 +44,7 @@ class Track(result.Track, public=True):
     @property
     def hypotheses(self) -> Hypotheses:
         """The events of a `Bank`: probabilities, evidence, alarms, events, the mixture."""
-        return Hypotheses(self)
+        return Hypotheses(self.rows)
 
     def smooth(
         self, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm"
@@ -54,14 +57,17 @@ class Track(result.Track, public=True):
         value of parameters that the record does not determine, whose std is inf: "min_norm", the solution nearest to
         theta0; "nan"; or "raise". A `Bank` is smoothed given its events
         (`driftfit.trackers.bank.results.decided_path.EventSmoothed`). ValueError for other trackers that do not
-        describe a random walk in Gaussian noise.
+        describe a random walk in Gaussian noise. Of outputs that share one theta, theta is (T, n) and residuals are
+        (T, ny).
         """
         if self.tracker.weighs and self.start is None:
-            return Hypotheses(self).smooth()
+            return Hypotheses(self.rows).smooth()
+        if self.rows_per_instant > 1:
+            return SmoothedShared.of_shared(self, keep, order_by, undetermined)
         return Smoothed.of(self, keep, order_by, undetermined)
 
     def forecast(self, h: int, u: Any = None) -> Forecast:
-        """theta and y at the h nominal samples after the record, with future inputs u (h,) or (h, m)."""
+        """theta and y at the h nominal samples after the record, with future inputs u (h,), (h, m) or (h, ny, m)."""
         return forecast(self, h, u)
 
     def summary(self) -> Summary:
@@ -78,7 +84,7 @@ class Track(result.Track, public=True):
         drawn in it); or as many axes as the picture has panels, here n + 2. The figure of the axes is returned.
         ValueError for another number.
         """
-        return plot_track(self, level, ax)
+        return plot_track(self.rows, level, ax)
 
     def to_table(self, kind: str = "polars", arrays: bool = False) -> Any:
         """The result as a table of "polars", "pandas" or "pyarrow", one row per sample; see `driftfit.show.export`.
@@ -125,23 +131,23 @@ class Track(result.Track, public=True):
         """Is the time variation real, which parameters move, and does tracking them pay? See
         `driftfit.judge.verdict`.
         """
-        return verdict(self, level, lags, burn)
+        return verdict(self.rows, level, lags, burn)
 
     def segment(self, **settings: Any) -> Segmentation:
         """Segments of the record with constant parameters, with dates and their intervals; `driftfit.segment`."""
-        return segmented(self, **settings)
+        return segmented(self.rows, **settings)
 
     def diagnose(self) -> Diagnosis:
         """Whiteness, noise level, distribution, excitation, constancy, with limits; see `driftfit.judge.diagnose`."""
-        return diagnose(self)
+        return diagnose(self.rows)
 
     def ahead(self, k: int) -> Prediction:
         """Every output predicted from k samples before it, given the inputs; see `driftfit.use.simulate`."""
-        return simulate.ahead(self, k)
+        return simulate.ahead(self._single("ahead"), k)
 
     def simulate(self, u: Any, at: int = -1, y: Any = None) -> Prediction:
         """Outputs that inputs u would cause in the system of a sample, with bands; see `driftfit.use.simulate`."""
-        return simulate.simulate(self, u, at, y)
+        return simulate.simulate(self._single("simulate"), u, at, y)
 
     def crossing(
         self,
@@ -154,7 +160,15 @@ class Track(result.Track, public=True):
         level: float = 0.9,
     ) -> Crossing:
         """When a parameter or the output crosses a limit, with an interval; see `driftfit.use.crossing`."""
-        return crossing(self, what, below=below, above=above, horizon=horizon, u=u, level=level)
+        return crossing(self._single("crossing"), what, below=below, above=above, horizon=horizon, u=u, level=level)
+
+    def constrain(self, *constraints: str) -> Constrained:
+        """theta known to be within bounds or on planes, as "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1".
+
+        The result has ``theta``, ``std``, ``band()``, ``cov(t)`` and ``prob``; see
+        `driftfit.use.constraints.constrained`.
+        """
+        return constrain(self, *constraints)
 
     def poles(self, at: Any = None) -> Array:
         """Poles of the ARX system at every sample, (T, na), the largest first; see `driftfit.use.system`."""
@@ -184,6 +198,13 @@ class Track(result.Track, public=True):
         """The system at a sample as `scipy.signal.dlti`, from one input to y."""
         return system.to_scipy(self, at, dt, input)
 
+    def transfer(self, dt: float = 1.0, input: int | str = 0, at: int = -1) -> Transfer:
+        """The transfer function of one sample from an input, with bands, which converts itself to continuous time.
+
+        ``run.transfer(dt=0.1).continuous()`` has coefficients in the unit of dt, `time_constants` and the way back.
+        """
+        return transfer(self, dt, input, at)
+
     def long_run(self, at: int = -1, level: float = 0.95) -> tuple[LongRun, ...]:
         """Long-run effect b / (1 - a) of every input, with standard error and Fieller's interval."""
         return system.long_run(self, at, level)
@@ -191,9 +212,10 @@ class Track(result.Track, public=True):
     def detect(self, kind: str | AlarmRule = "glr", **settings: Any) -> Alarms:
         """Alarms at a set rate of false alarms, one in ``every`` samples; see `driftfit.judge.alarms.detect`.
 
-        ``kind`` may also be the rule of another run, ``alarms.rule``.
+        ``kind`` may also be the rule of another run, ``alarms.rule``. Of outputs that share one theta the rows are
+        judged, and samples are numbered as in ``run.rows``.
         """
-        return detect(self, kind, **settings)
+        return detect(self.rows, kind, **settings)
 
     def plot_system(self, input: int | str = 0, at: Any = None, ax: Any = None, **settings: Any) -> Figure:
         """Step and frequency response over time with bands, poles in the plane, gain; see
@@ -203,7 +225,7 @@ class Track(result.Track, public=True):
 
     def plot_validation(self, y: Any, u: Any = None, at: int = -1, level: float = 0.95, ax: Any = None) -> Figure:
         """Simulated and measured outputs of a record that was not used, with bands and the fit in per cent."""
-        return plot_validation(self, y, u, at, level, ax)
+        return plot_validation(self._single("plot_validation"), y, u, at, level, ax)
 
     def report(
         self,
@@ -217,4 +239,13 @@ class Track(result.Track, public=True):
 
         ``alarms`` of `detect` and ``labels`` (T,), true where something was wrong, have a separate section.
         """
-        report(self, path, title, alarms, labels)
+        report(self.rows, path, title, alarms, labels)
+
+    def _single(self, verb: str) -> result.Track:
+        """The run; ValueError if its samples are instants of several rows."""
+        if self.rows_per_instant > 1:
+            raise ValueError(
+                f"{verb}: a sample of this run holds {self.rows_per_instant} outputs; run.rows.{verb}(...) takes them "
+                "one after the other."
+            )
+        return self

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from copy import copy
 from functools import cached_property
 from typing import Any
 
 from driftfit.models.hammerstein_wiener.separation.paths import Groups, Separator
-from driftfit.run.live import live, outputs
+from driftfit.run.live import live
 from driftfit.trackers.bank.results.live_results import LiveHypotheses
-from driftfit.use.forecast import Forecast, drive_on, forecast_stream
+from driftfit.use.constraints.constrained import Constrained, constrain_stream
+from driftfit.use.forecast import Forecast, forecast_stream
 from driftfit.use.live_system import LiveSystem
 
 
@@ -33,22 +33,16 @@ class Live(live.Live, public=True):
     def forecast(self, h: int, u: Any = None) -> Forecast:
         """theta and y at the next h nominal samples, as `Track.forecast`; u (h,) or (h, m) are the future inputs.
 
-        While `apply` is outstanding the first row of u is the input that it would receive.
+        Of several outputs theta and std are (h, ny, n), y_hat and y_std (h, ny). While `apply` is
+        outstanding the first row of u is the input that it would receive.
         """
         return forecast_stream(self, h, u)
+
+    def constrain(self, *constraints: str) -> Constrained:
+        """The present theta within constraints, as `Track.constrain`, with T = 1."""
+        return constrain_stream(self, *constraints)
 
     @property
     def system(self) -> LiveSystem:
         """The present `ARX` system: poles, gains, responses with bands; see `driftfit.use.live_system`."""
         return LiveSystem(self)
-
-
-class LiveOutputs(outputs.LiveOutputs, public=True):
-    __doc__ = outputs.LiveOutputs.__doc__
-
-    def forecast(self, h: int, u: Any = None) -> Forecast:
-        """The next h nominal samples, u (h,) or (h, m): theta, std (h, ny, n), y_hat, y_std (h, ny).
-
-        While `apply` is outstanding, the first row of u is the input that it would receive.
-        """
-        return drive_on(copy(self), h, u)

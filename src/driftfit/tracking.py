@@ -155,17 +155,14 @@ def track(
         For a `Bank`: prior probabilities at every sample, NaN in rows where its own prior applies.
     to : path or None
         A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
-        columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start``.
-    to : path or None
-        A new folder, for fleets whose results exceed the memory: they are written there as Parquet files with the
         columns of `Fleet.to_table`, some series at a time, and not kept. Not with ``warm_start`` and ``prob``.
 
     Returns
     -------
     Track, or a Fleet (from key to Track) for several series or several trackers; with ``to`` the numbers of series and
-    rows written. A model with several outputs (``ny``)
-    takes y (T, ny), or as many names, and returns `driftfit.fleets.Outputs`, or `driftfit.fleets.Shared` if the outputs
-    share one theta; ``tracker`` may then map the name of each output to its tracker, and weights may be (T, ny).
+    rows written. A model with several outputs (``ny``) takes y (T, ny), or as many names, and returns
+    `driftfit.Outputs` (from output to Track), or one Track if the outputs share one theta; ``tracker`` may then map the
+    name of each output to its tracker, and weights may be (T, ny).
 
     Raises
     ------

@@ -149,6 +149,19 @@ def test_operations_are_typed_once(monkeypatch):
     assert plus._impl_keys[pair] == implementation, "Functions with other options decide what our operations call."
 
 
+def test_one_copy_of_a_part_serves_all_constants():
+    @part
+    def scaled(y, factor, place):
+        return y[place] * factor
+
+    @Driver
+    def use(y, place):
+        return scaled(y, 2.0, 0) + scaled(y, 2.0, place) + scaled(y, 3.0, 1)
+
+    assert use(np.array([1.0, 10.0]), 1) == 52.0
+    assert len(scaled.overloads) == 1, "Dispatcher.get_call_template is no longer what decides the types of a call."
+
+
 def test_functions_with_other_options_are_typed_by_themselves():
     strict, loose, again = Flags(), Flags(), Flags()
     loose.fastmath = True

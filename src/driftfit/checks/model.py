@@ -18,6 +18,8 @@ from driftfit.results import Track
 from driftfit.run.parallel_lanes import FEWEST
 from driftfit.smooth.problem import replay
 from driftfit.streams import Live
+from driftfit.trackers.base import Tracker
+from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.tracking import track
 
@@ -41,14 +43,15 @@ def check_model(model: Model, theta: Any = None) -> list[str]:
     if broken:
         return broken
     value = np.full(bound.n, 0.1) if theta is None else np.asarray(theta, dtype=float)
-    still = Kalman(q=0.0, r=1.0, p0=1e-20, theta0=tuple(value.tolist()))
+    kind = Kalman if bound.hidden is None else JointKalman
+    still = kind(q=0.0, r=1.0, p0=1e-20, theta0=tuple(value.tolist()))
     y, u = signals(bound.m)
     try:
         run = track(bound, still, y, u)
     except Exception as error:  # whatever the error is, the author of the tracker wants to read it
         first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
         return [f"It does not run: {type(error).__name__}: {first.strip()}"]
-    for check in (_live, _lanes, _reach, _touched, _regressors, _density, _forward, _late_input, _follows):
+    for check in (_live, _lanes, _reach, _touched, _regressors, _density, _forward, _late_input, _follows, _shown):
         broken += check(bound, still, run)
     return broken
 
@@ -87,7 +90,7 @@ def _named(model: Model) -> Iterator[str]:
         yield f"output_lags must be at most n = {model.n}; got {model.output_lags}."
 
 
-def _live(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _live(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     y, u = run.y.copy(), run.u.copy()
     y[AT], u[AT + 8] = np.nan, np.nan
     record, live = track(model, still, y, u), Live(model, still)
@@ -98,7 +101,7 @@ def _live(model: Model, still: Kalman, run: Track) -> Iterator[str]:
             return
 
 
-def _lanes(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _lanes(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     count = max(FEWEST, still.width) + 1
     y, u = (np.stack(part) for part in zip(*(signals(model.m, seed) for seed in range(count)), strict=True))
     fleet = track(model, still, y, u, by="row")
@@ -111,7 +114,7 @@ def _lanes(model: Model, still: Kalman, run: Track) -> Iterator[str]:
             return
 
 
-def _reach(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _reach(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     y, u = run.y.copy(), run.u.copy()
     y[AT] += 0.01
     u[AT] += 0.01
@@ -122,7 +125,7 @@ def _reach(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         yield f"reach is {model.reach}, but signals of sample {AT} are in the regressors of sample {changed[-1]}."
 
 
-def _touched(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _touched(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     for name in ("y", *(("u",) if model.m else ())):
         y, u = run.y.copy(), run.u.copy()
         (y if name == "y" else u)[AT] = np.nan
@@ -133,7 +136,7 @@ def _touched(model: Model, still: Kalman, run: Track) -> Iterator[str]:
             yield f"A missing {name} at sample {AT} makes samples {lost.tolist()} unusable; declared: {expected}."
 
 
-def _regressors(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _regressors(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     phi = replay(run)["phi"][..., 0]
     for i in range(model.output_lags or 0):
         if not _same(phi[AT, i], run.y[AT - 1 - i]):
@@ -142,7 +145,7 @@ def _regressors(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         yield "intercept is declared, but the last regressor is not 1."
 
 
-def _density(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _density(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     y, ok = run.y.copy(), run.ok
     error = (run.y - run.prediction)[ok]
     if not model.implicit:
@@ -156,7 +159,7 @@ def _density(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         yield f"log_jacobian is not the logarithm of the slope of the innovation against y, which is {slope:.6g}."
 
 
-def _forward(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _forward(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     h = 3
     past = slice(AT - model.reach, AT)
     try:
@@ -176,7 +179,7 @@ def _forward(model: Model, still: Kalman, run: Track) -> Iterator[str]:
         live.update(played[0, k], run.u[AT + k])
 
 
-def _late_input(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _late_input(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     if model.apply is None or not model.m:
         return
     live = Live(model, still)
@@ -188,10 +191,20 @@ def _late_input(model: Model, still: Kalman, run: Track) -> Iterator[str]:
             return
 
 
-def _follows(model: Model, still: Kalman, run: Track) -> Iterator[str]:
+def _follows(model: Model, still: Tracker, run: Track) -> Iterator[str]:
     if not model.follows(model):
         yield "follows returns False for the model itself, so no run could be continued."
         return
     first = track(model, still, run.y[:AT], run.u[:AT])
     if not _same(track(model, still, run.y[AT:], run.u[AT:], warm_start=first).prediction, run.prediction[AT:]):
         yield "A run continued with warm_start differs from an uninterrupted one: memory must hold the whole state."
+
+
+def _shown(model: Model, still: Tracker, run: Track) -> Iterator[str]:
+    if model.hidden is None:
+        return
+    wide = JointKalman(q=0.0, r=1.0, p0=1e-6, theta0=tuple(run.theta[0].tolist()))
+    var = track(model, wide, run.y, run.u).var[-1]
+    parameters = model.names[: model.n - len(model.hidden)]
+    for name in [name for name, one in zip(parameters, var.tolist(), strict=False) if one > 1e-6 * (1.0 - 1e-9)]:
+        yield f"The output says nothing of {name}: no line leads from it to the output, or its effect vanishes here."

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
 
-import numpy as np
-
 from driftfit.engine.settings import Settings
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
@@ -61,7 +59,7 @@ def _shown(value: Any) -> str:
     """A short description of what was passed."""
     if value is None:
         return "None"
-    if isinstance(value, np.ndarray) or hasattr(value, "shape"):
+    if isinstance(getattr(value, "shape", None), tuple):
         return f"an array of shape {tuple(value.shape)}"
     text = repr(value)
     return f"{text if len(text) < 60 else f'{text[:57]}...'}, a {type(value).__name__}"

@@ -30,8 +30,8 @@ class Known:
     def of(cls, interval: Any = 1.0, noise: Any = 1.0, drift: Any = 1.0) -> Known:
         """From numbers or arrays (T,)."""
         parts = (interval, noise, drift)
-        if not any(map(np.ndim, parts)):
-            return cls(np.array([parts], float))  # a row for all samples
+        if not (np.ndim(interval) or np.ndim(noise) or np.ndim(drift)):  # a row for all samples
+            return cls(np.array([[float(interval), float(noise), float(drift)]]))
         return cls(np.stack(np.broadcast_arrays(*(np.atleast_1d(np.asarray(part, float)) for part in parts)), axis=1))
 
     def __len__(self) -> int:

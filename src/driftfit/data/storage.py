@@ -32,6 +32,7 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
+from driftfit.engine.drivers import held_in
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import Settings
 
@@ -231,4 +232,4 @@ def restore(
 
 def fields(tile: Array) -> list[str]:
     """Names of the fields that contain state."""
-    return [name for name in tile.dtype.names or () if name != "pad"]
+    return held_in(tile.dtype)

@@ -11,6 +11,7 @@ import numpy as np
 from driftfit.embedded.expressions import Expressions
 from driftfit.embedded.values import RANK, Value, joined, number, plain, view
 from driftfit.engine import kernel, simd
+from driftfit.engine.tracker_part import tracker_part, whole_record
 
 FOUR = {simd.fill_four: "four_of", simd.load_four: "four_at", simd.plus: "four_plus", simd.times: "four_times"}
 
@@ -27,6 +28,8 @@ class Calls(Expressions):
             return self._reinterpreted(node)
         function = self.value(node.func).constant
         arguments = [plain(self.value(one)) for one in node.args]
+        if function in (tracker_part, whole_record):
+            return arguments[0]  # in C there is one record
         if function is kernel.packed or (function is kernel.wholes and arguments[0].kind == "items"):
             return arguments[0]  # C passes addresses one by one
         if function in (kernel.floats, kernel.wholes, kernel.cubes):

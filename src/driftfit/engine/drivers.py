@@ -18,7 +18,7 @@ elsewhere); and ``used_noise``, which only the replay for a smoother writes. Mod
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ import numpy as np
 from numba import types
 
 from driftfit.engine.kernel import Array, Driver, State, Step, kernel
+from driftfit.engine.tracker_part import EDGE, tracker_part, whole_record
 
 WIDTH = 32
 """Lanes of a fleet's tile. It must be a constant of the type: a run-time lane count is not vectorised."""
@@ -123,6 +124,9 @@ class TrackerSteps(NamedTuple):
     ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
+    With ``doubts`` the model weighs lags that the tracker doubts. Steps see the fields of the tracker and those that
+    every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
+    with ``reads_model`` they see those of the model too.
     """
 
     predict: Step
@@ -135,16 +139,25 @@ class TrackerSteps(NamedTuple):
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
+    reads_model: bool = False
 
 
-def _common(n: int, m: int) -> dict[str, Any]:
-    """Fields that every record has, with their values before the first sample."""
+def _common(n: int) -> dict[str, Any]:
+    """Fields that every record has besides u, with their values before the first sample."""
     zero = 0.0
     return {
-        "phi": np.zeros(n), "y": zero, "u": np.zeros(max(m, 1)), "dt": 1.0, "noise": 1.0, "drift": 1.0, "interval": 1.0,
+        "phi": np.zeros(n), "y": zero, "dt": 1.0, "noise": 1.0, "drift": 1.0, "interval": 1.0,
         "valid": zero, "seen": zero, "ok": zero, "y_hat": zero, "e": zero, "s": zero, "var": np.zeros(n), "scale": 1.0,
         "used_noise": 1.0,
     }  # fmt: skip
+
+
+def held_in(record: np.dtype[Any], own: Collection[str] = ()) -> list[str]:
+    """The fields of a record that hold something: a tracker's ``own``, the model's, the common and the open ones."""
+    first, second, *rest = _common(0)
+    behind = [first, second, "u", *rest, *OPEN]
+    names = [name for name in record.names or () if name not in (EDGE, "pad")]
+    return sorted(names, key=lambda name: 0 if name in own or name not in behind else 1 + behind.index(name))
 
 
 def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mapping[str, Any]]) -> Array:
@@ -153,23 +166,29 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     ``model`` and each entry of ``trackers`` map field names to start values without the lane axis; the shapes of the
     values are the shapes of the fields. All trackers must have the same fields.
     """
-    L = len(trackers)
-    # Common fields come last, so that no record is the beginning of another: it would be taken for its subtype.
-    starts = [{**start, **model, **_common(n, m), **model, **start} for start in trackers]
+    L, inputs = len(trackers), {"u": np.zeros(max(m, 1))}
+    starts = [{**start, **_common(n), **model, **inputs, **start} for start in trackers]
     fields: list[Any] = []
     for name, value in starts[0].items():
         kind = np.int64 if np.asarray(value).dtype.kind in "iub" else np.float64
         fields.append((name, kind, (*np.shape(value), L)))
     opened = [field for name in OPEN for field in fields if field[0] == name]
     fields = [field for field in fields if field not in opened]
-    size = np.dtype(fields).itemsize
-    # whole cache lines, so that no vector load of a lane block straddles two
-    fields.append(("pad", np.float64, (-size // 8 % 8 or 8,)))
-    tile = _aligned(_followed_by(np.dtype(fields, align=True), opened), 1)
+    own = trackers[0].keys() | _common(n).keys()
+    seen = [field for field in fields if field[0] in own]
+    others = [field for field in fields if field[0] not in own]
+    fields = [*seen, _filling(EDGE, seen, L), *others]
+    tile = _aligned(_followed_by(np.dtype([*fields, _filling("pad", fields, L)], align=True), opened), 1)
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
     return tile
+
+
+def _filling(name: str, fields: Sequence[Any], L: int) -> tuple[str, type, tuple[int, int]]:
+    """A field behind others that ends with a cache line, so that no vector load of a lane block straddles two."""
+    words = np.dtype(list(fields)).itemsize // 8
+    return name, np.float64, (next(rows for rows in range(1, 9) if (words + rows * L) % 8 == 0), L)
 
 
 def _followed_by(dtype: np.dtype[Any], fields: Sequence[Any]) -> np.dtype[Any]:
@@ -324,8 +343,10 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     for machine in tracker.machines:
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
-    sample = _sample(regress, push, _advance(tracker))
-    run = _run(driver, sample, tracker.read_extra, tracker.store, covariance if keep == "cov" else nothing_more)
+    part = whole_record if tracker.reads_model else tracker_part
+    sample = _sample(regress, push, _advance(tracker), part)
+    keep_more = covariance if keep == "cov" else nothing_more
+    run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
 
     def checked(tile: Array, y: Array, u: Array, known: Array, out: Array) -> None:
         # nothing looks at types and bounds after this; contiguous, because every layout would be compiled separately
@@ -337,7 +358,19 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     return Drivers(checked, *_updates(driver, sample))
 
 
-def _sample(regress: Step, push: Step, advance: Any) -> Any:
+def _stored(store: Any, keep_more: Any) -> Any:
+    """What a tracker and the caller want to keep of a sample."""
+
+    @kernel
+    def stored(o: State, s: State) -> None:
+        for l in range(s.theta.shape[1]):
+            store(o, s, l)
+            keep_more(o, s, l)
+
+    return stored
+
+
+def _sample(regress: Step, push: Step, advance: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record."""
 
     @kernel
@@ -346,7 +379,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
         for l in range(L):
             regress(s, l)
             clean(s, l)
-        advance(s)
+        advance(part(s))
         for l in range(L):
             push(s, l)
         for l in range(L):
@@ -358,7 +391,7 @@ def _sample(regress: Step, push: Step, advance: Any) -> Any:
     return sample
 
 
-def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: Any, keep_more: Any) -> Driver:
+def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, stored: Any, part: Any) -> Driver:
     """The loop over the samples of a record."""
 
     @driver
@@ -376,7 +409,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: A
                 s.drift[l] = known[t * changing, 2, l]
             if known.shape[1] > 3:
                 for l in range(L):
-                    read_extra(s, known, t, l)
+                    read_extra(part(s), known, t, l)
             if given:
                 for j in range(s.u.shape[0]):  # a constant, unlike u.shape[1]
                     for l in range(L):
@@ -394,9 +427,7 @@ def _run(driver: Callable[[Any], Driver], sample: Any, read_extra: Any, store: A
                 o.e[l] = s.e[l]
                 o.s[l] = s.s[l]
                 o.ok[l] = s.ok[l]
-            for l in range(L):
-                store(o, s, l)
-                keep_more(o, s, l)
+            stored(o, part(s))
 
     return run
 

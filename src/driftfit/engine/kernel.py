@@ -114,6 +114,7 @@ def _for_sizes(work: Any, sizes: tuple[int, ...]) -> Any:
     if not sizes:
         return work
     size, others = sizes[0], _for_sizes(work, sizes[1:])
+    work.for_constants = True
 
     @part
     def chosen(n: int, *rest: Any) -> Any:
@@ -230,8 +231,14 @@ class Driver:
         if code is None:
             twin = FunctionType(source.__code__, source.__globals__, source.__name__, None, source.__closure__)
             twin.__qualname__ = name.removesuffix(disk_cache.ENDING).replace("-", "_")
-            with compiling():
-                code = internals.emit(twin, arguments)
+            try:
+                with compiling():
+                    code = internals.emit(twin, arguments)
+            except KeyError as missing:
+                raise TypeError(
+                    f"a compiled step names the field {missing}, which its record does not have. The steps of a "
+                    "tracker see fields of the model only with TrackerSteps(..., reads_model=True)."
+                ) from None
             if code.lasting:
                 disk_cache.write(name, tuple(code))
             internals.forget(KEPT)

@@ -7,8 +7,9 @@ for each, which names in one sentence what broke. Tried with the versions in `TR
     identity       Dispatcher._set_uuid             other processes find closures over compiled functions
     stored         numba.core.caching._Cache,       one file for each function and signature, without Numba's index
                    CompileResult._reduce, _rebuild
-    code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted
-                   codegen's factories
+    code to link   JITCodeLibrary, CPUDispatcher,   a part is typed and turned into LLVM's language only, not emitted;
+                   get_call_template, codegen's     one copy serves all constants
+                   factories
     typing         Function.get_call_type, _impl_keys,  the types of Numba's own operations are found once
                    Flags._values, Record.__repr__
     memory         _reset_overloads,                what the compiler made of a part is let go
@@ -90,8 +91,7 @@ STEP = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
 """Options of code that only compiled code calls."""
 
 LINKED = {**STEP, "_nrt": False}
-"""The same for code that neither allocates nor returns arrays: wrappers and the reference counts of slices took nine
-tenths of the time of compiling a bank."""
+"""The same without reference counts, which took nine tenths of the time of compiling a bank: no array is made."""
 
 
 UNUSED = {
@@ -148,13 +148,9 @@ class Stored(_Cache):
             self._write(sig, data._reduce())
 
     def enable(self) -> None:
-        """Always."""
+        """Nothing: it is always on, and nothing waits to be written."""
 
-    def disable(self) -> None:
-        """Never."""
-
-    def flush(self) -> None:
-        """Nothing is held back."""
+    disable = flush = enable
 
 
 def store_by(dispatcher: Any, read: Callable[[Any], Any], write: Callable[[Any, Any], None]) -> None:
@@ -178,16 +174,13 @@ class Fragment(JITCodeLibrary):
         """There is no pointer: nothing was emitted."""
         return 0
 
-    def serialize_using_object_code(self) -> Any:
-        """What is kept on disk: there is no object code."""
-        return self.serialize_using_bitcode()
+    serialize_using_object_code = JITCodeLibrary.serialize_using_bitcode  # on disk: there is no object code
 
 
 class WholeFragment(Fragment):
     """Code that is optimised together with everything that it inlines."""
 
-    def _optimize_final_module(self) -> None:
-        JITCodeLibrary._optimize_final_module(self)
+    _optimize_final_module = JITCodeLibrary._optimize_final_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """None yet; asking for it is how Numba says that nothing more will be added."""
@@ -196,10 +189,8 @@ class WholeFragment(Fragment):
 
 
 class StepFragment(WholeFragment):
-    """A step that inlines no other step is optimised: the speed of a loop over lanes depends on it (5 %).
-
-    A step that inlines others contains optimised code, and is optimised with the driver that inlines it. Doing
-    it at every level took a quarter of the time of compiling an `AdaptiveKalman`, and gave no faster code.
+    """A step that inlines no other step is optimised: the speed of a loop over lanes depends on it (5 %). One that
+    inlines others is optimised with the driver: at every level it took a quarter of the time, for no faster code.
     """
 
     def _optimize_final_module(self) -> None:
@@ -211,6 +202,14 @@ class PartDispatcher(CPUDispatcher):
     """A function that Numba compiles so that others inline it."""
 
     library: type[Fragment] = Fragment
+
+    for_constants = False
+    """Whether constants are part of the types of a call. Numba would compile a copy for 0 and one for other numbers."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        if not self.for_constants:
+            args = [one.literal_type if isinstance(one, types.Literal) else one for one in args]
+        return super().get_call_template(args, kws)
 
     def __call__(self, *arguments: Any) -> Any:
         raise TypeError(
@@ -230,6 +229,7 @@ class StepDispatcher(PartDispatcher):
     """A step: inlined by drivers; for Python it is compiled again, into code that can be called."""
 
     library = StepFragment
+    for_constants = True
 
     def __call__(self, *arguments: Any) -> Any:
         if "callable" not in vars(self):
@@ -295,8 +295,8 @@ _builders: dict[Any, Any] = {}
 
 # ---- typing ---------------------------------------------------------------------------------------------------------
 
-# Numba tries dozens of templates for every sum, product and index of every function, and compares compile options one
-# by one for each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
+# Numba tries dozens of templates for every operation of every function, and compares compile options one by one for
+# each: a fifth of the time of compiling. What it found for an operation, types and options is remembered.
 
 
 def _remembered(find: Callable[..., Any]) -> Callable[..., Any]:

@@ -25,7 +25,6 @@ from driftfit.run.fleet import Fleet
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import lanes_of
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.run.track import track
 from driftfit.trackers.kalman import Kalman
 
@@ -131,11 +130,9 @@ def constant_outputs(
     Their predictions fill missing lags. Outputs that share one theta are one regression, on all rows.
     """
     run = track(model, STILL, y, u, reading, data=data, by=by)
-    if isinstance(run, Shared):
-        return {"rows": [run.rows]}
-    assert isinstance(run, Outputs | Fleet)
-    lanes = list(run.values())
+    lanes = [run.rows] if isinstance(run, Track) else [one.rows for one in run.values()]
     if model.shared:
         return {"rows": lanes}
+    assert isinstance(run, Outputs | Fleet)
     names = run.outputs if isinstance(run, Outputs) else run.records.outputs
     return {name: lanes[k :: len(names)] for k, name in enumerate(names)}

@@ -46,12 +46,22 @@ GAP = 1.5
 class ARX(Model):
     """ARX(na, nb, nk) with one output and any number of inputs.
 
-    Parameters ---------- na : int Lags of the output. nb, nk : int, or one per input Lags of each input, and its delay
-    in samples (0 uses the present input). inputs : int, names, or None How many inputs, or their names. None: as many
-    as ``nb`` or ``nk`` have entries, else as many as u has columns (`Live`: one). intercept : bool Add a constant as
-    the last parameter. start : "drop" or "zero" "drop": nothing is used until the lags are filled. "zero": the unknown
-    past is zero. ny : int or names Outputs, columns of y. With several, each has a separate regression on the lags of
-    all of them and on the inputs (`JointARX`).
+    Parameters
+    ----------
+    na : int
+        Lags of the output.
+    nb, nk : int, or one per input
+        Lags of each input, and its delay in samples (0 uses the present input).
+    inputs : int, names, or None
+        How many inputs, or their names. None: as many as ``nb`` or ``nk`` have entries, else as many as u has columns
+        (`Live`: one).
+    intercept : bool
+        Add a constant as the last parameter.
+    start : "drop" or "zero"
+        "drop": nothing is used until the lags are filled. "zero": the unknown past is zero.
+    ny : int or names
+        Outputs, columns of y. With several, each has a separate regression on the lags of all of them and on the inputs
+        (`JointARX`).
     """
 
     na: int
@@ -225,6 +235,12 @@ class ARX(Model):
             B.append(np.concatenate([delay, theta[..., at : at + nb]], axis=-1))
             at += nb
         return A, B
+
+    def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        if len(self.outputs) > 1:
+            return super().transfers(theta)
+        A, B = self.polynomials(theta)
+        return A, [(b, A) for b in B]
 
 
 @kernel

@@ -81,6 +81,11 @@ class Model(Settings, ABC):
         """The model of one of several outputs, if its regression needs none of the others; otherwise None."""
         return None
 
+    @property
+    def hidden(self) -> tuple[str, ...] | None:
+        """States among its parameters, which only a tracker that `follows_states` moves; None if it has none."""
+        return None
+
     @abstractmethod
     def memory(self) -> Mapping[str, Any]:
         """Fields of the record that hold the model's memory, with their values before the first sample."""
@@ -150,6 +155,28 @@ class Model(Settings, ABC):
         """A(z) and B(z) at theta (.., n) in powers of z^-1; ValueError for a model that has none."""
         raise ValueError(f"polynomials: {type(self).__name__} has no polynomials; use ARX.")
 
+    def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        """The poles' polynomial at theta (.., n), and numerator and denominator from each input, in powers of z^-1.
+
+        ValueError for a model whose inputs do not act through transfer functions.
+        """
+        raise ValueError(
+            "poles, gains and responses belong to runs of ARX, ARMAX, OE and BoxJenkins with one output; this run has "
+            f"{self!r}."
+        )
+
+    @property
+    def family(self) -> Any:
+        """Models with the same family, unless it is None, can share a compiled driver: see `as_large_as`."""
+        return None
+
+    def as_large_as(self, family: Sequence[Model]) -> Model:
+        """This model with as many parameters, and as much memory, as the largest of its family.
+
+        Its regressors after its own ones are 0. All models of the family then have the same steps and fields.
+        """
+        return self
+
     @property
     def noise_varies(self) -> bool:
         """Whether `noise_factor` is anything but 1."""
@@ -159,6 +186,11 @@ class Model(Settings, ABC):
     def reach(self) -> int:
         """Number of past samples in the regressors of a sample; a model that can be run forward declares it."""
         return 0
+
+    @property
+    def settling(self) -> float:
+        """Number of first samples whose regressors are poor, because they depend on theta, and should be forgotten."""
+        return 0.0
 
     @property
     def recursive(self) -> bool:

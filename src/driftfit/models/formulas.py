@@ -8,9 +8,11 @@ same line for the derivative with respect to every parameter on which it depends
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Mapping
+import linecache
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -98,8 +100,11 @@ def _lag(node: ast.Subscript) -> int:
 
 
 @lru_cache(maxsize=256)
-def parse(text: str) -> Formula:
-    """The parts of a formula; ValueError says what in it is not understood."""
+def parse(text: str, known: bool = False) -> Formula:
+    """The parts of a formula; ValueError says what in it is not understood.
+
+    A formula without parameters is an error unless it may be ``known``.
+    """
     if not isinstance(text, str) or len(text) > LONGEST:
         raise ValueError(
             f"Equation: give a text of at most {LONGEST} characters, as 'y = theta.k * sqrt(u) - theta.c'."
@@ -117,7 +122,7 @@ def parse(text: str) -> Formula:
     _check(tree, parameters, lags)
     if (output, 0) in lags:
         raise ValueError(f"Equation: {output} on the right must have a lag, as {output}[-1].")
-    if not parameters:
+    if not parameters and not known:
         raise ValueError(f"Equation: {text!r} has no parameter; write the unknown numbers as theta.NAME.")
     inputs = dict.fromkeys(name for name, _ in lags if name != output)
     return Formula(text, output, tree, tuple(parameters), tuple(inputs), tuple(lags))
@@ -159,7 +164,7 @@ def _check(node: ast.expr, parameters: dict[str, None], lags: dict[tuple[str, in
         _check(one, parameters, lags)
 
 
-class _Writer:
+class Writer:
     """Lines of code for a tree, and the names of their results: value, and derivatives by parameter."""
 
     def __init__(self, formula: Formula, inputs: tuple[str, ...]) -> None:
@@ -179,9 +184,9 @@ class _Writer:
                 i = self.formula.parameters.index(node.attr)
                 return self.let(f"s.point[{i}, l]"), {i: "1.0"}
             case ast.Name():
-                return (repr(float(np.pi)) if node.id == "pi" else self._signal(node.id, 0)), {}
+                return (repr(float(np.pi)), {}) if node.id == "pi" else self.signal(node.id, 0)
             case ast.Subscript():
-                return self._signal(node.value.id, _lag(node)), {}  # type: ignore[attr-defined]
+                return self.signal(node.value.id, _lag(node))  # type: ignore[attr-defined]
             case ast.UnaryOp():
                 x, dx = self.write(node.operand)
                 return (self._scaled("-1.0", x, dx)) if isinstance(node.op, ast.USub) else (x, dx)
@@ -197,10 +202,10 @@ class _Writer:
                 return self._call(node.func.id, [self.write(one) for one in node.args])  # type: ignore[attr-defined]
         raise AssertionError(node)
 
-    def _signal(self, name: str, lag: int) -> str:
+    def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
         if name == self.formula.output:
-            return self.let(f"s.y_lag[{lag}, l]")
-        return self.let(f"s.u_lag[{self.inputs.index(name)}, {lag}, l]")
+            return self.let(f"s.y_lag[{lag}, l]"), {}
+        return self.let(f"s.u_lag[{self.inputs.index(name)}, {lag}, l]"), {}
 
     def _scaled(self, factor: str, x: str, dx: dict[int, str]) -> tuple[str, dict[int, str]]:
         return self.let(f"{factor} * {x}"), {i: self.let(f"{factor} * {d}") for i, d in dx.items()}
@@ -278,12 +283,22 @@ def _product(x: str, times: int) -> str:
 def compiled(text: str, inputs: tuple[str, ...]) -> Callable[..., Any]:
     """The kernel that writes s.value and s.phi at s.point, from s.y_lag and s.u_lag (a row for each input)."""
     formula = parse(text)
-    writer = _Writer(formula, inputs)
+    writer = Writer(formula, inputs)
     value, derivatives = writer.write(formula.tree)
     lines = [*writer.lines, f"s.value[l] = {value}"]
     lines += [f"s.phi[{i}, l] = {derivatives.get(i, '0.0')}" for i in range(len(formula.parameters))]
-    code = "def evaluate(s, l):\n" + "\n".join(f"    {line}" for line in lines)
+    return written("evaluate", lines)
+
+
+def written(name: str, lines: Sequence[str]) -> Callable[..., Any]:
+    """The kernel ``name(s, l)`` of these lines, which hold nothing but arithmetic.
+
+    Its source is known to `inspect`, from which exported trackers are translated.
+    """
+    code = f"def {name}(s, l):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
+    place = f"<{name} {sha256(code.encode()).hexdigest()[:16]}>"
+    linecache.cache[place] = len(code), None, code.splitlines(True), place
     known: dict[str, Any] = {"np": np, "exp": exp, "log": log, "__name__": __name__}
-    exec(code, known)  # written above, from a tree in which nothing but arithmetic is left
-    made: Callable[..., Any] = kernel(known["evaluate"])
+    exec(compile(code, place, "exec"), known)
+    made: Callable[..., Any] = kernel(known[name])
     return made

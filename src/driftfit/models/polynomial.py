@@ -23,12 +23,14 @@ Every tracker of linear regressions follows theta by the linearisation of y_hat 
 parameters that drift. In contrast to least squares in an `ARX` model they are not biased by coloured noise, and their
 covariance is that of the prediction error estimate.
 
-theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. The start needs care, because
+theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
+beside the readings (`driftfit.models.polynomial_steps.BEYOND`), which a theta that one reading spoiled computes, are
+not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
 autoregressive part; C and D enter after 2 n samples), and after N samples the filters of psi have zeros and poles at
-1 - 4 n / N of their distance from 0. The bias of the start fades with the memory of the tracker: with `RLS(1.0)` the
-bands of C cover less than stated for a few hundred samples.
+1 - 4 n / N of their distance from 0. The bias of the start fades with the memory of the tracker; `RLS`, also with
+lambda = 1, has a short one during the first 40 n samples (`Model.settling`).
 
 A missing output is replaced by its prediction, for at most na outputs in a row if there are lags of it, and its e is
 0. A missing input makes the samples unusable that have it in psi directly; in w its last value is held. A gap in time
@@ -53,6 +55,9 @@ from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import input_names, whole
 from driftfit.models.base import Model
 from driftfit.models.polynomial_steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
+
+FORGOTTEN = 40.0
+"""Samples for each parameter that a tracker without drift should forget again: those of the start, ten times over."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +167,10 @@ class PolynomialModel(Model):
         return (*((0, None),) * self.na, *gains, *((0, None),) * rest, *([(1, None)] if self.offset else []))
 
     @property
+    def settling(self) -> float:
+        return FORGOTTEN * self.n if self.nc or self.nd or any(nf for _, nf, _ in self.orders) else 0.0
+
+    @property
     def recursive(self) -> bool:
         return True
 
@@ -188,6 +197,7 @@ class PolynomialModel(Model):
             "damped": np.zeros(self.n),
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
+            "extent": np.zeros(1 + self.m),
             "shift": 0.0,
             "measured": np.nan,
             "without": 0.0,
@@ -212,6 +222,19 @@ class PolynomialModel(Model):
         response: Array = signal.lfilter(parts["C"], np.convolve(parts["A"], parts["D"]), np.eye(1, h)[0])
         return response
 
+    def transfers(self, theta: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+        theta = np.asarray(theta, dtype=float)
+        p, one = self._places, np.ones((*theta.shape[:-1], 1))
+        A = whole = np.concatenate([one, -theta[..., : self.na]], axis=-1)
+        found = []
+        for j, (nb, nf, nk) in enumerate(self.orders):
+            delay = np.zeros((*theta.shape[:-1], nk))
+            B = np.concatenate([delay, theta[..., p.at_b[j] : p.at_b[j] + nb]], axis=-1)
+            F = np.concatenate([one, -theta[..., p.at_f[j] : p.at_f[j] + nf]], axis=-1)
+            whole = _product(whole, F)
+            found.append((B, _product(A, F)))
+        return whole, found
+
     def parts(self, theta: Array) -> dict[str, Any]:
         """The polynomials of one theta (n,) in powers of z^-1: A, C, D, and lists B and F with an entry per input.
 
@@ -228,6 +251,14 @@ class PolynomialModel(Model):
             "D": np.append(1.0, -d),
             "F": [np.append(1.0, -one) for one in f],
         }
+
+
+def _product(one: Array, other: Array) -> Array:
+    """The products of polynomials, whose coefficients are on the last axis."""
+    found = np.zeros((*one.shape[:-1], one.shape[-1] + other.shape[-1] - 1))
+    for i in range(one.shape[-1]):
+        found[..., i : i + other.shape[-1]] += one[..., i : i + 1] * other
+    return found
 
 
 def _named(letter: str, i: int, u: str) -> str:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.drivers import LARGEST, SMALLEST, ModelSteps
 from driftfit.engine.kernel import State, Step, kernel
 from driftfit.models.arx import GAP
 
@@ -25,6 +25,18 @@ CONTRACTION, CONTRACTIONS = 0.9, 20
 
 ROUNDING = 1e-10
 """A residual below this share of its output is 0."""
+
+BEYOND = 1e6
+"""A signal that the model computes is at most so many times the largest reading of its unit. Parameters that one absurd
+reading left behind would otherwise compute absurd signals, which are the regressors of the next samples. An offset that
+cancels the response to a large mean of the input is within it.
+"""
+NOISE = 1e3
+"""The same for noise and innovation, which nothing cancels."""
+FIRST, RISE, FALL = 10.0, 10.0, 0.1
+"""After the first samples, the factor by which the largest reading grows at most at one (before, by BEYOND); and the
+factor by which it falls at a reading that it is BEYOND times."""
+
 
 Y, YF, V, VF, E, EF, ONE, OWN = range(8)
 """Rows of the past: the output and D/C of it, v and 1/C v, e and 1/C e, D/C 1; then EACH rows for every input."""
@@ -65,6 +77,37 @@ def places(na: int, nc: int, nd: int, orders: tuple[tuple[int, int, int], ...], 
 
 
 @kernel
+def credible(s: State, x: float, signal: int, l: int) -> bool:
+    """Whether the readings of a signal (0 the output, 1 + j an input) make x possible."""
+    largest = s.extent[signal, l]
+    return abs(x) < (min(BEYOND * largest, LARGEST) if largest > SMALLEST else LARGEST)
+
+
+@kernel
+def within(s: State, x: float, l: int) -> float:
+    """x, or the largest noise of its sign that is credible."""
+    top = min(NOISE * s.extent[0, l], LARGEST) if s.extent[0, l] > SMALLEST else LARGEST
+    return min(max(x, -top), top) if abs(x) < np.inf else 0.0
+
+
+@kernel
+def filtered(s: State, x: float, raw: float, signal: int, l: int) -> float:
+    """What a filter of the gradient gives, or the signal itself where that is not credible."""
+    return x if credible(s, x, signal, l) else raw
+
+
+@kernel
+def enlarge(s: State, x: float, signal: int, l: int) -> None:
+    """Remember the size of the largest readings of a signal, but for a single absurd one, also if it is the first."""
+    largest, size = s.extent[signal, l], abs(x)
+    most = largest * (RISE if s.usable[l] >= FIRST else BEYOND)
+    near = min(size, most) if size > largest else largest
+    near = FALL * largest if BEYOND * size < largest else near
+    near = near if largest > 0.0 else size
+    s.extent[signal, l] = near if (size > SMALLEST) & (size < LARGEST) else largest
+
+
+@kernel
 def stable(s: State, first: int, order: int, sign: float, l: int) -> bool:
     """Whether 1 + sum_i sign x_i z^-i is, x from s.point[first]: all reflection coefficients are inside (-1, 1)."""
     inside = True
@@ -99,26 +142,26 @@ def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
 
 @lru_cache
 def _filters(p: Places) -> tuple[Any, Any]:
-    """D/C and 1/C of the present sample of a row: ``colour(s, raw, filtered, l)`` returns it, ``whiten`` stores it."""
+    """``colour(s, raw, into, l)`` and ``whitened(..)``: D/C and 1/C of the present sample of a row."""
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
     @kernel
-    def colour(s: State, raw: int, filtered: int, l: int) -> float:
+    def colour(s: State, raw: int, into: int, l: int) -> float:
         x = s.signals[raw, 0, l]
         for i in range(nd):
             x -= s.point[at_d + i, l] * s.signals[raw, i + 1, l]
         for i in range(nc):
-            x -= s.damped[at_c + i, l] * s.signals[filtered, i + 1, l]
+            x -= s.damped[at_c + i, l] * s.signals[into, i + 1, l]
         return x  # type: ignore[no-any-return]
 
     @kernel
-    def whiten(s: State, raw: int, filtered: int, l: int) -> None:
+    def whitened(s: State, raw: int, into: int, l: int) -> float:
         x = s.signals[raw, 0, l]
         for i in range(nc):
-            x -= s.damped[at_c + i, l] * s.signals[filtered, i + 1, l]
-        s.signals[filtered, 0, l] = x
+            x -= s.damped[at_c + i, l] * s.signals[into, i + 1, l]
+        return filtered(s, x, s.signals[raw, 0, l], 0, l)  # type: ignore[no-any-return]
 
-    return colour, whiten
+    return colour, whitened
 
 
 @lru_cache
@@ -166,12 +209,14 @@ def taking_inputs(p: Places) -> Step:
             known = abs(u) < LARGEST
             s.signals[own + U, 0, l] = u if known else np.nan
             s.last_input[j, l] = u if known else s.last_input[j, l]
-            s.signals[own + HELD, 0, l] = s.last_input[j, l]
-            s.signals[own + G, 0, l] = colour(s, own + HELD, own + G, l)
+            enlarge(s, u, 1 + j, l)
+            held = s.last_input[j, l]
+            s.signals[own + HELD, 0, l] = held
+            s.signals[own + G, 0, l] = filtered(s, colour(s, own + HELD, own + G, l), held, 1 + j, l)
             x = s.signals[own + G, 0, l]
             for i in range(nf[j]):
                 x += s.damped[at_f[j] + i, l] * s.signals[own + UF, i + 1, l]
-            s.signals[own + UF, 0, l] = x
+            s.signals[own + UF, 0, l] = filtered(s, x, held, 1 + j, l)
 
     step: Step = take_inputs
     return step
@@ -179,11 +224,11 @@ def taking_inputs(p: Places) -> Step:
 
 @lru_cache
 def _responses(p: Places) -> Any:
-    """``respond(s, filtered, l)`` stores the present w of every input, with ``filtered`` D/(C F) of it too."""
+    """``respond(s, gradient, l)`` stores the present w of every input, with ``gradient`` D/(C F) of it too."""
     m, nb, nf, nk, at_b, at_f = p.m, p.nb, p.nf, p.nk, p.at_b, p.at_f
 
     @kernel
-    def respond(s: State, filtered: bool, l: int) -> float:
+    def respond(s: State, gradient: bool, l: int) -> float:
         total = 0.0
         for j in range(m):
             w, wf, own = 0.0, 0.0, OWN + EACH * j
@@ -194,8 +239,9 @@ def _responses(p: Places) -> Any:
             for i in range(nf[j]):
                 w += s.point[at_f[j] + i, l] * s.signals[own + W, i + 1, l]
                 wf += s.damped[at_f[j] + i, l] * s.signals[own + WF, i + 1, l]
+            w = w if abs(w) < LARGEST else 0.0
             s.signals[own + W, 0, l] = w
-            s.signals[own + WF, 0, l] = wf if filtered else s.signals[own + WF, 0, l]
+            s.signals[own + WF, 0, l] = filtered(s, wf, 0.0, 0, l) if gradient else s.signals[own + WF, 0, l]
             total += w
         return total
 
@@ -205,7 +251,7 @@ def _responses(p: Places) -> Any:
 
 @lru_cache
 def _predictions(p: Places) -> tuple[Any, Any]:
-    """``predict(s, filtered, l)``: y_hat at s.point; ``noise(s, l)``: the part of it that earlier noise explains."""
+    """``predict(s, gradient, l)``: y_hat at s.point; ``noise(s, l)``: the part of it that earlier noise explains."""
     na, nc, nd, at_c, at_d, at_offset = p.na, p.nc, p.nd, p.at_c, p.at_d, p.at_offset
     respond = _responses(p)
 
@@ -219,8 +265,8 @@ def _predictions(p: Places) -> tuple[Any, Any]:
         return total
 
     @kernel
-    def predict(s: State, filtered: bool, l: int) -> float:
-        y_hat = respond(s, filtered, l) + noise(s, l)
+    def predict(s: State, gradient: bool, l: int) -> float:
+        y_hat = respond(s, gradient, l) + noise(s, l)
         for i in range(na):
             lag = s.signals[Y, i + 1, l]
             y_hat += s.point[i, l] * (lag if abs(lag) < LARGEST else 0.0)
@@ -261,6 +307,7 @@ def _gradient(p: Places) -> Any:
                 one -= s.point[at_d + i, l]
             for i in range(nc):
                 one -= s.damped[at_c + i, l] * s.signals[ONE, i + 1, l]
+            one = one if abs(one) < BEYOND else 1.0
             s.signals[ONE, 0, l] = one
             s.phi[at_offset, l] = one if settled else 1.0
 
@@ -298,7 +345,7 @@ def _regress(p: Places) -> Any:
         for i in range(n):
             complete = complete if abs(s.phi[i, l]) < LARGEST else 0.0
             along += s.phi[i, l] * s.point[i, l]
-        known = (s.usable[l] >= SETTLING * n) & (abs(y_hat - along) < LARGEST)
+        known = (s.usable[l] >= SETTLING * n) & credible(s, y_hat - along, 0, l)
         s.shift[l] = y_hat - along if known else 0.0
         s.measured[l] = s.y[l]
         s.y[l] -= s.shift[l]
@@ -311,44 +358,61 @@ def _regress(p: Places) -> Any:
 
 @lru_cache
 def _push(p: Places) -> Any:
-    na, n = p.na, p.n
+    na, n, m = p.na, p.n, p.m
     at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
-    linearise, (predict, noise), (colour, whiten) = _point(p), _predictions(p), _filters(p)
+    linearise, (predict, noise), (colour, whitened) = _point(p), _predictions(p), _filters(p)
 
     @kernel
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
         s.signals[Y, 0, l], s.signals[V, 0, l], s.signals[E, 0, l] = y, v, e
-        whiten(s, E, EF, l)
-        whiten(s, V, VF, l)
-        filtered = colour(s, Y, YF, l)
-        s.signals[YF, 0, l] = filtered if abs(filtered) < LARGEST else y
+        s.signals[EF, 0, l], s.signals[VF, 0, l] = whitened(s, E, EF, l), whitened(s, V, VF, l)
+        s.signals[YF, 0, l] = filtered(s, colour(s, Y, YF, l), y, 0, l)
         s.signals[Y, 0, l] = y if known else np.nan
+
+    @kernel
+    def responding(s: State, y: float, otherwise: float, l: int) -> float:
+        """w of one input as the output says: y without its autoregressive part."""
+        w = y
+        for i in range(na):
+            w -= s.theta[i, l] * s.signals[Y, i + 1, l]
+        w -= s.theta[at_offset, l] if at_offset >= 0 else 0.0
+        return w if credible(s, w, 0, l) else otherwise
+
+    @kernel
+    def possible(s: State, fitted: float, l: int) -> float:
+        """The fitted value of an output, after responses that contradict it have begun anew."""
+        for j in range(m):
+            w = s.signals[OWN + EACH * j + W, 0, l]
+            if not credible(s, w, 0, l):
+                again = responding(s, s.measured[l], 0.0, l) if first_f > 0 else 0.0
+                s.signals[OWN + EACH * j + W, 0, l] = again
+                fitted += again - w
+        return fitted
 
     @kernel
     def push(s: State, l: int) -> None:
         seen = s.seen[l] > 0.0
         informed = (s.valid[l] > 0.0) & ((s.s[l] != np.inf) | (s.noise[l] == np.inf))
         # w and e of this sample are those of the theta that has learned from it
+        enlarge(s, s.measured[l], 0, l)
         linearise(s, l)
         fitted = predict(s, False, l)
+        fitted = possible(s, fitted, l) if seen else fitted
         e = s.measured[l] - fitted if seen & informed else 0.0
         # what is left of an interpolated sample is rounding, and no regressor
         e = e if abs(e) > ROUNDING * (abs(s.measured[l]) + abs(fitted)) else 0.0
+        e = within(s, e, l)
         begun = s.usable[l] >= 0.5 * SETTLING * n
-        v = e + noise(s, l) if begun else 0.0
+        v = within(s, e + noise(s, l), l) if begun else 0.0
         s.y_hat[l] += s.shift[l]
         y = s.measured[l] if seen else s.y_hat[l]
-        y = y if abs(y) < LARGEST else 0.0
+        y = y if seen | credible(s, y, 0, l) else 0.0
         known = seen | (informed & ((na == 0) | (s.without[l] < na)))
         s.without[l] = 0.0 if seen else s.without[l] + 1.0
         remember(s, y, known, v, e if begun else 0.0, l)
         s.usable[l] += s.ok[l]
         if (first_f > 0) & (s.usable[l] < SETTLING * n):
-            w = y
-            for i in range(na):
-                w -= s.theta[i, l] * s.signals[Y, i + 1, l]
-            w -= s.theta[at_offset, l] if at_offset >= 0 else 0.0
-            s.signals[OWN + W, 0, l] = w if abs(w) < LARGEST else s.signals[OWN + W, 0, l]
+            s.signals[OWN + W, 0, l] = responding(s, y, s.signals[OWN + W, 0, l], l)
 
     step: Step = push
     return step

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
+from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, kernel
 
 COLLECTED = ("phi", "y", "dt", "valid")
@@ -16,3 +19,16 @@ def collect(o: State, s: State, l: int) -> None:
     o.y[l] = s.y[l]
     o.dt[l] = s.dt[l]
     o.valid[l] = s.valid[l]
+
+
+@lru_cache(maxsize=256)
+def collecting(steps: TrackerSteps) -> TrackerSteps:
+    """The steps of a tracker that store its own outputs and the sample."""
+    own = steps.store
+
+    @kernel
+    def both(o: State, s: State, l: int) -> None:
+        own(o, s, l)
+        collect(o, s, l)
+
+    return steps._replace(store=both)

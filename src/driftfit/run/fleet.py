@@ -16,7 +16,6 @@ from driftfit.run.outputs import Outputs
 from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program, State
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.run.warm_start import Run, carried, ended, first_interval
 
 
@@ -25,7 +24,7 @@ class Fleet(KeyedResults):
 
     ``fleet[key]`` is a view, nothing is copied. ``failed`` maps the key of each series without a result to the reason.
     If series have several outputs, keys are (series, output), and ``fleet[series]`` is the record of one series with
-    all of them: `Outputs`, or `Shared` where they share one theta, whose rows are then the result in `items`.
+    all of them, an `Outputs`. Outputs that share one theta are one Track.
     """
 
     _kind = "fleet"
@@ -56,7 +55,7 @@ class Fleet(KeyedResults):
     def __contains__(self, key: object) -> bool:
         return key in self._index or key in self._series
 
-    def series(self) -> dict[Hashable, Track | Outputs | Shared]:
+    def series(self) -> dict[Hashable, Track | Outputs]:
         """Every record by the key of its series, with all its outputs."""
         return {key: self._whole(k) for key, k in self._series.items()}
 
@@ -67,11 +66,10 @@ class Fleet(KeyedResults):
         """
         return {key: run.end().to_bytes() for key, run in self.series().items()}
 
-    def _whole(self, k: int) -> Track | Outputs | Shared:
+    def _whole(self, k: int) -> Track | Outputs:
         """The record of series k."""
         if not self.records.outputs:
-            run = self._run(k)
-            return run if run.program.shared is None else Shared(run)
+            return self._run(k)
         lanes = range(k * self.records.ny, (k + 1) * self.records.ny)
         starts = {place: self._starts[j] for place, j in enumerate(lanes) if j in self._starts}
         some = [self._lanes[j] for j in lanes]

@@ -1,7 +1,7 @@
 """Several outputs, one theta for each.
 
     ARX(.., ny=2), Regression(n, ny=2)     yo_t = phi_t' theta_o,t + v_o,t     the outputs are lanes of one tile
-    Regression(n, ny=2, shared=True)       yo_t = phi_o,t' theta_t + v_o,t     see `driftfit.run.shared_outputs`
+    Regression(n, ny=2, shared=True)       yo_t = phi_o,t' theta_t + v_o,t     one Track, see `driftfit.run.columns`
 
 Each output may have its own settings, as a mapping from its name to its tracker; all trackers are of one kind, because
 they share the compiled step. Each output of a record is a `Track` (``run["level"]``): a regression on the regressors
@@ -23,6 +23,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near
 from driftfit.models.regression import Regression
 from driftfit.run.collected_samples import COLLECTED, collect
+from driftfit.run.columns import Columns
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.program import Program, kept, lanes_of, shown, state_of, tile_of
 from driftfit.run.result import Lane, Track, names_of
@@ -30,7 +31,7 @@ from driftfit.run.warm_start import End
 from driftfit.trackers.base import Tracker
 
 
-class Outputs(KeyedResults):
+class Outputs(KeyedResults, Columns):
     """A record with several outputs, each with its own theta.
 
     Attributes
@@ -95,33 +96,15 @@ class Outputs(KeyedResults):
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(missing(name, self.outputs[0]) if not name.startswith("_") else name)
 
-    def _written(self, name: str) -> Array:
+    def in_rows(self, name: str) -> Array:
         """A field of the driver's output, (T, ny, ..)."""
-        return np.stack([lane.written(name) for lane in self._lanes if lane], axis=1)
+        if name not in self._stacked:
+            self._stacked[name] = np.stack([lane.written(name) for lane in self._lanes if lane], axis=1)
+        return self._stacked[name]
 
     @cached_property
-    def theta(self) -> Array:
-        return self._written("theta")
-
-    @cached_property
-    def std(self) -> Array:
-        return np.sqrt(self._written("var"))
-
-    @cached_property
-    def prediction(self) -> Array:
-        return self._written("y_hat")
-
-    @cached_property
-    def innovation(self) -> Array:
-        return self._written("e")
-
-    @cached_property
-    def innovation_std(self) -> Array:
-        return np.sqrt(self._written("s"))
-
-    @cached_property
-    def ok(self) -> Array:
-        return self._written("ok") > 0.0
+    def _stacked(self) -> dict[str, Array]:
+        return {}
 
     @property
     def time(self) -> Array:

@@ -68,9 +68,15 @@ def run_lanes(
     return lanes
 
 
-def prepare(programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64) -> list[Job]:
-    """Tiles at their start for all series, the longest first."""
-    jobs = [job for group in _groups(programs[:: records.ny]) for job in _jobs(programs, records, group, keep, dtype)]
+def prepare(
+    programs: Sequence[Program], records: Records, keep: str, dtype: Any = np.float64, collected: bool = False
+) -> list[Job]:
+    """Tiles at their start for all series, the longest first.
+
+    With ``collected`` every sample is stored as the tracker receives it, beside the results.
+    """
+    groups = _groups(programs[:: records.ny])
+    jobs = [job for group in groups for job in _jobs(programs, records, group, (keep, dtype, collected))]
     return sorted(jobs, key=lambda job: -len(job.out))
 
 
@@ -104,8 +110,10 @@ def width_of(program: Program, count: int, ny: int = 1) -> int:
     return ny if wide < 2 * ny else wide
 
 
-def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], keep: str, dtype: Any) -> Iterator[Job]:
-    """Tiles for the series of one group, longest first."""
+def _jobs(
+    programs: Sequence[Program], records: Records, group: Sequence[int], stored: tuple[str, Any, bool]
+) -> Iterator[Job]:
+    """Tiles for the series of one group, longest first; ``stored`` is what is kept, its type, and `collect`."""
     ny, program = records.ny, programs[group[0] * records.ny]
     L = width_of(program, len(group), ny)
     G = L // ny
@@ -117,17 +125,18 @@ def _jobs(programs: Sequence[Program], records: Records, group: Sequence[int], k
     longest = records.length[padded[:, 0]]
     ends = np.cumsum(longest)
     # one allocation for all tiles, so that it is large enough for huge pages
-    out = program.written(tiles[:1], int(ends[-1]), keep, dtype)
+    run, out = program.loop(tiles[:1], int(ends[-1]), *stored)
     for k, some in enumerate(lanes):
         live = (np.arange(L) < ny * G) & (place < len(order) - k * G)
-        yield Job(program.fill, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
+        yield Job(run, tiles[k : k + 1], some, live, out[ends[k] - longest[k] : ends[k]])
 
 
 def _tiles(programs: Sequence[Program], lanes: Array) -> Array:
     """Tiles at their start, one record per row of ``lanes``."""
     count, L = lanes.shape
     first = [programs[k] for k in lanes[0]]
-    tiles = repeat_tile(tile_of(first), count)
+    one = all(program is first[0] for program in first)
+    tiles = repeat_tile(first[0].lanes(L) if one else tile_of(first), count)
     if any(programs[k] is not first[lane] for row in lanes for lane, k in enumerate(row.tolist())):
         starts = {key: one.start for key, one in {id(one): one for one in programs}.items()}
         for name in first[0].start:
@@ -175,7 +184,7 @@ def _drive(job: Job, records: Records, stop: int) -> None:
     columns = records.known.columns
     given, factors = records.y.reshape(N, -1), columns.reshape(*columns.shape[:2], -1)
     y, u, known = _block(L, records.u.shape[1], min(BLOCK, len(columns)), columns.shape[1])
-    finals: dict[int, Array] = {}
+    finals: list[tuple[Array, Array]] = []
     bounds = sorted({*range(0, stop, BLOCK), *(int(end) for end in length if end < stop), stop})
     for a, b in pairwise(bounds) if stop else [(0, 0)]:
         size = b - a
@@ -183,10 +192,10 @@ def _drive(job: Job, records: Records, stop: int) -> None:
         _gather_signals(given, records.u, start, column, y[:size], u[:size])
         _gather_factors(factors, start, column, known if len(known) == 1 else known[:size])
         job.run(job.tile, y[:size], u[:size], known if len(known) == 1 else known[:size], job.out[a:b])
-        for lane in np.flatnonzero(length == b).tolist():
-            finals[lane] = words_of(job.tile)[:, lane].copy()
-    for lane, words in finals.items():
-        words_of(job.tile)[:, lane] = words
+        if b < stop and (ended := np.flatnonzero(length == b)).size:
+            finals.append((ended, words_of(job.tile)[:, ended]))
+    for ended, words in finals:
+        words_of(job.tile)[:, ended] = words
 
 
 def _block(L: int, m: int, factors: int, columns: int) -> tuple[Array, Array, Array]:

@@ -18,10 +18,12 @@ from rich.progress import Progress
 from driftfit.data import storage
 from driftfit.data.record import Record
 from driftfit.data.signals import check_ready
-from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, make_tile, output_type, repeat_tile
-from driftfit.engine.kernel import Array
+from driftfit.engine.drivers import Drivers, TrackerSteps, drivers, held_in, make_tile, output_type, repeat_tile
+from driftfit.engine.kernel import Array, Driver
+from driftfit.engine.settings import Settings
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
+from driftfit.run.collected_samples import COLLECTED, collecting
 from driftfit.run.states.layout import Layout, words_of
 from driftfit.trackers.base import Tracker
 
@@ -59,6 +61,13 @@ class Program:
     """Which of several outputs it belongs to, in one of several lanes."""
     shared: Model | None = None
     """The model of outputs that share one theta: ``model`` takes them one after the other, as rows of an instant."""
+
+    def __post_init__(self) -> None:
+        if (self.model.hidden is not None) != self.tracker.follows_states:
+            raise ValueError(
+                f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
+                "followed by JointKalman, which moves its hidden states and follows nothing else."
+            )
 
     def __reduce__(self) -> Any:
         """A copy, or a program sent to another process, consists of its fields."""
@@ -130,8 +139,9 @@ class Program:
     @cached_property
     def layout(self) -> Layout:
         """Where the fields of a lane are, and which of them a packed state holds."""
-        owner = {"model": storage.describe(self.model), "tracker": storage.describe(self.tracker)}
-        return Layout(self.tile().dtype, self.tracker.scratch, owner | {"output": self.output})
+        owner = {"model": _identified(self.model), "tracker": _identified(self.tracker), "output": self.output}
+        record = self.tile().dtype
+        return Layout(record, held_in(record, self.tracker_start), self.tracker.scratch, owner)
 
     def pack(self, tile: Array, lane: int = 0) -> bytes:
         """The state of a lane as bytes (`driftfit.run.states.layout`)."""
@@ -158,6 +168,16 @@ class Program:
             self._drivers[keep, steps] = found
         return found
 
+    def lanes(self, count: int) -> Array:
+        """A tile with this program in every lane, at its start; not to be changed, since it is made once."""
+        if count not in self._wide:
+            self._wide[count] = tile_of([self] * count)
+        return self._wide[count]
+
+    @cached_property
+    def _wide(self) -> dict[int, Array]:
+        return {}
+
     def tile(self, state: State | None = None) -> Array:
         """A tile of one lane at its start, or with the given fields."""
         tile = repeat_tile(self._begin, 1)
@@ -172,6 +192,16 @@ class Program:
     def written(self, tile: Array, T: int, keep: str = "std", dtype: Any = np.float64) -> Array:
         """An array for the results of T samples of a tile."""
         return np.empty(T, output_type(tile, self.tracker.outputs, keep, dtype))
+
+    def loop(self, tile: Array, T: int, keep: str, dtype: Any, collected: bool) -> tuple[Any, Array]:
+        """(the routine that runs tiles like this one, an array for the results of T samples).
+
+        With ``collected`` it stores every sample as the tracker receives it, in double precision.
+        """
+        if not collected:
+            return self.fill, self.written(tile, T, keep, dtype)
+        fields = dict.fromkeys((*self.tracker.outputs, *COLLECTED))
+        return self.drivers(steps=collecting(self.steps)).run, np.empty(T, output_type(tile, tuple(fields)))
 
     def run(self, tile: Array, record: Record, keep: str = "std", dtype: Any = np.float64) -> Array:
         """Run a tile over a record, a lane for each output; returns what is kept, (T,) of `output_type`."""
@@ -202,6 +232,12 @@ class Program:
             _copy(results, out[part])
 
 
+def _identified(settings: Settings) -> dict[str, Any]:
+    """A model or tracker as plain data, without settings of None: one that a later version adds changes nothing."""
+    said = storage.describe(settings)
+    return said | {"settings": {name: value for name, value in said["settings"].items() if value is not None}}
+
+
 def _copy(results: Array, out: Array) -> None:
     """Store what ``out`` keeps of results, all at once where it keeps all."""
     T, names = len(out), out.dtype.names or ()
@@ -221,6 +257,22 @@ def put_columns(given: Array, into: Array) -> None:
         return
     for k in range(into.shape[1]):
         into[:, k] = given[:, k]
+
+
+def put_fields(rows: Array, into: Mapping[str, Array], first: int) -> None:
+    """Copy fields of rows of eight-byte numbers to rows ``first`` and following of arrays of the same types."""
+    words = rows.view(np.int64).reshape(len(rows), -1)
+    fields: Mapping[str, Any] = rows.dtype.fields or {}
+    for name, values in into.items():
+        put_words(words, fields[name][1] // 8, values.view(np.int64).reshape(len(values), -1), first)
+
+
+@Driver
+def put_words(words: Array, column: int, into: Array, first: int) -> None:
+    """Copy columns of words, row by row: NumPy takes 30 ns for each short row, or reads all rows for each column."""
+    for t in range(words.shape[0]):
+        for k in range(into.shape[1]):
+            into[first + t, k] = words[t, column + k]
 
 
 def kept(rows: np.dtype[Any]) -> tuple[str, np.dtype[Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cached_property
 from os import PathLike
@@ -15,6 +14,7 @@ from driftfit.data.known import Known
 from driftfit.data.record import Labels, Record, time_text
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.columns import Columns
 from driftfit.run.live.conformal import quantile, widened
 from driftfit.run.program import Program, State, kept, lanes_of, state_of
 from driftfit.run.public_class import Plain
@@ -46,8 +46,16 @@ class Lane(NamedTuple):
         return Lane(out, tile)
 
 
-class Track(Plain):
+KINDS = ("track", "shared outputs")
+"""Kinds of files that hold a run of one output, and of outputs that share one theta."""
+
+
+class Track(Plain, Columns):
     """Parameters of a record, sample by sample.
+
+    Outputs that share one theta, ``Regression(n, ny=2, shared=True)``, are one Track whose samples are instants: theta
+    is that after all outputs of an instant, and what belongs to each output is (T, ny). `rows` is the Track of the
+    T ny rows, one after the other.
 
     Attributes
     ----------
@@ -73,8 +81,26 @@ class Track(Plain):
         return type(self), (self.program, self.record, self._lane.alone(self.program), self.start)
 
     @property
+    def rows_per_instant(self) -> int:
+        return 1 if self.program.shared is None else len(self.outputs)
+
+    @property
+    def rows(self) -> Track:
+        """A sample for each output: the T ny rows of outputs that share one theta, otherwise the run itself."""
+        return self if self.program.shared is None else self._rows
+
+    @cached_property
+    def _rows(self) -> Track:
+        return Track(replace(self.program, shared=None), self.record, self._lane, self.start)
+
+    @property
     def model(self) -> Model:
-        return self.program.model
+        return self.program.whole
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs of the model."""
+        return self.model.outputs
 
     @property
     def tracker(self) -> Tracker:
@@ -82,11 +108,11 @@ class Track(Plain):
 
     @property
     def y(self) -> Array:
-        return self.record.y
+        return self.by_row(self.record.y)
 
     @property
     def u(self) -> Array:
-        return self.record.u
+        return self.by_row(self.record.u)
 
     @property
     def labels(self) -> Labels:
@@ -95,7 +121,7 @@ class Track(Plain):
 
     @property
     def known(self) -> Known:
-        """The known factors of every sample."""
+        """The known factors of every row."""
         return self.record.known
 
     @property
@@ -124,11 +150,8 @@ class Track(Plain):
         var: Array = self._lane.tile["var"][0, :, self._lane.lane]
         return np.isinf(var)
 
-    def written(self, name: str) -> Array:
-        """A field of the driver's output at every sample, (T, ..): one of the tracker's ``outputs``, for example.
-
-        Replays the record, once, if only theta was kept.
-        """
+    def in_rows(self, name: str) -> Array:
+        """A field of the driver's output; replays the record, once, if only theta was kept."""
         return (self._lane if name in self.stores() else self._complete).written(name)
 
     @cached_property
@@ -144,10 +167,11 @@ class Track(Plain):
         return names_of(self._lane.out)
 
     def __len__(self) -> int:
-        return len(self.record)
+        return len(self.record) // self.rows_per_instant
 
     def __repr__(self) -> str:
-        return f"Track of {len(self)} samples, {int(self.ok.sum())} used: {self.model!r}, {self.tracker!r}"
+        of = "" if self.program.shared is None else f" of {len(self.outputs)} outputs"
+        return f"Track of {len(self)} samples{of}, {int(self.ok.sum())} used: {self.model!r}, {self.tracker!r}"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,53 +180,20 @@ class Track(Plain):
     @property
     def units(self) -> tuple[str, ...]:
         """Units of the parameters, empty if they are not known."""
-        dimensions = self.model.dimensions
-        if dimensions is None or self.names != self.model.names:
+        model = self.program.model
+        dimensions = model.dimensions
+        if dimensions is None or self.names != model.names:
             return ("",) * len(self.names)
         return tuple(self.labels.unit(*dimension) for dimension in dimensions)
 
     @property
     def time(self) -> Array:
         """The given times, or sample numbers."""
-        return np.arange(len(self)) if self.record.time is None else self.record.time
+        return np.arange(len(self)) if self.record.time is None else self.after_rows(self.record.time)
 
     def time_text(self, t: int) -> str:
         """The time of sample t, in the time zone of the table that it came from."""
         return time_text(self.time[t], self.labels.zone)
-
-    @property
-    def theta(self) -> Array:
-        return self.written("theta")
-
-    @property
-    def var(self) -> Array:
-        """(T, n): variances of the parameters."""
-        return self.written("var")
-
-    @cached_property
-    def std(self) -> Array:
-        return np.sqrt(self.var)
-
-    @property
-    def prediction(self) -> Array:
-        return self.written("y_hat")
-
-    @property
-    def innovation(self) -> Array:
-        return self.written("e")
-
-    @property
-    def innovation_var(self) -> Array:
-        """(T,): variances of the innovations."""
-        return self.written("s")
-
-    @cached_property
-    def innovation_std(self) -> Array:
-        return np.sqrt(self.innovation_var)
-
-    @cached_property
-    def ok(self) -> Array:
-        return self.written("ok") > 0.0
 
     @cached_property
     def loglik(self) -> float:
@@ -226,6 +217,8 @@ class Track(Plain):
         the noise variance (`driftfit.trackers.student`); for a tracker that weighs hypotheses it is that of their
         mixture. A model whose innovation is not that of y adds its log Jacobian.
         """
+        if self.program.shared is not None:
+            return self.by_row(self.rows.log_density)
         s, e = (np.asarray(part, dtype=np.float64) for part in (self.innovation_var, self.innovation))
         counted = self.ok & np.isfinite(s) & (s > 0.0)
         own = self.tracker.log_density(self._complete.out)
@@ -248,7 +241,7 @@ class Track(Plain):
         """
         half = quantile(level) * self.std
         if conformal:
-            half = half * widened(self.innovation, self.innovation_var, level, "band")[1:, None]
+            half = half * self.after_rows(self._widened(level, "band")[1:, None])
         return self.theta - half, self.theta + half
 
     def output_band(self, level: float = 0.95, conformal: bool = False) -> tuple[Array, Array]:
@@ -265,8 +258,12 @@ class Track(Plain):
             )
         half = quantile(level, "output_band") * self.innovation_std
         if conformal:
-            half = half * widened(self.innovation, self.innovation_var, level, "output_band")[:-1]
+            half = half * self.by_row(self._widened(level, "output_band")[:-1])
         return self.prediction - half, self.prediction + half
+
+    def _widened(self, level: float, verb: str) -> Array:
+        """The conformal factor before each row and after the last."""
+        return widened(self.in_rows("e"), self.in_rows("s"), level, verb)
 
     def cov(self, t: int) -> Array:
         """Covariance (n, n) of theta after sample t (negative t counts from the end).
@@ -283,12 +280,14 @@ class Track(Plain):
 
     def covariances(self) -> Array:
         """Covariances (T, n, n) of theta after every sample; replays the record unless they were stored."""
-        return self.written("P") if self.keeps_cov else self.program.run(self.fresh(), self.record, "cov")["P"][..., 0]
+        if self.keeps_cov:
+            return self.written("P")
+        return self.after_rows(self.program.run(self.fresh(), self.record, "cov")["P"][..., 0])
 
     def lane(self, t: int) -> dict[str, Array]:
         """The state after sample t, field by field; replays the record up to t, O(t)."""
         tile = self.fresh()
-        record = self.record.part(slice(0, t % len(self) + 1))
+        record = self.record.part(slice(0, (t % len(self) + 1) * self.rows_per_instant))
         self.program.drivers().run(tile, *lanes_of(record), self.program.written(tile, len(record)))
         return state_of(tile)
 
@@ -312,36 +311,28 @@ class Track(Plain):
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the result to one file without pickle, completely or not at all."""
-        storage.write(path, *self.stored())
-
-    def stored(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """(header, arrays): the content of a saved file."""
-        header = {
-            "kind": "track",
-            "model": storage.describe(self.model),
+        header: dict[str, Any] = {
+            "kind": KINDS[0],
+            "model": storage.describe(self.program.model),
             "tracker": storage.describe(self.tracker),
             "labels": asdict(self.labels),
             "keep": kept(self._lane.out.dtype)[0],
         }
-        arrays = {"y": self.y, "u": self.u, "known": self.known.columns}
+        if self.program.shared is not None:
+            header |= {"kind": KINDS[1], "shared": storage.describe(self.program.shared)}
+        arrays = {"y": self.record.y, "u": self.record.u, "known": self.known.columns}
         if self.record.time is not None:
             arrays["time"] = self.record.time
-        arrays |= {f"out_{name}": self.written(name) for name in self.stores()}
+        arrays |= {f"out_{name}": self.in_rows(name) for name in self.stores()}
         arrays |= {f"state_{name}": value for name, value in self.state.items()}
         arrays |= {f"start_{name}": value for name, value in (self.start or {}).items()}
-        return header, arrays
+        storage.write(path, header, arrays)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Read a file that `save` wrote."""
-        return cls.from_stored(path, *storage.read(path, "track"))
-
-    @classmethod
-    def from_stored(
-        cls, path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, Array],
-        shared: Model | None = None,
-    ) -> Self:  # fmt: skip
-        """The inverse of `stored`; ``path`` is named in error messages, ``shared`` is that of `Program`."""
+        header, arrays = storage.read(path, *KINDS)
+        shared = storage.rebuild(header["shared"], Model) if header["kind"] == KINDS[1] else None
         model, tracker = storage.rebuild(header["model"], Model), storage.rebuild(header["tracker"], Tracker)
         program = Program(model, tracker, shared=shared)
         record = Record(

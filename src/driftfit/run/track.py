@@ -20,7 +20,6 @@ from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, programs_of, tile_of
 from driftfit.run.result import Lane, Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.run.warm_start import Run, carried, first_interval
 from driftfit.trackers.base import Tracker
 
@@ -30,7 +29,7 @@ Trackers = Tracker | Sequence[Tracker] | Mapping[Any, Tracker]
 PART = 64_000_000
 """Bytes of results that `parts` holds at a time; a table of them takes some three times as much."""
 
-Result = Track | Fleet | Outputs | Shared
+Result = Track | Fleet | Outputs
 """The result of `track`, which depends on the number of series, of settings and of outputs."""
 
 
@@ -96,7 +95,8 @@ def _task(
 ) -> Task:
     check_roles("track", model, tracker, several=True)
     one_of("track", "keep", kept.keep, ("std", "cov", "theta"))
-    one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
+    if kept.dtype != "float64":  # the default, whose name NumPy would look up for a microsecond
+        one_of("track", "dtype", np.dtype(kept.dtype).name, ("float64", "float32"))
     if kept.keep == "theta" and len(model.outputs) > 1:
         raise ValueError("track: keep='theta' is for models of one output.")
     reading = Reading() if reading is None else reading
@@ -195,9 +195,7 @@ def _per_series(tracker: Trackers, records: Records) -> list[Any]:
     return list(tracker)
 
 
-def _one(
-    programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any
-) -> Track | Outputs | Shared:
+def _one(programs: Sequence[Program], records: Records, keep: str, before: Run | None, dtype: Any) -> Track | Outputs:
     """Run one series."""
     program, record = programs[0], records.part(0)
     starts = carried(before, programs)
@@ -209,17 +207,15 @@ def _one(
     if records.outputs:
         lanes = [Lane(out, tile, lane) for lane in range(records.ny)]
         return Outputs(programs, replace(records, known=record.known), lanes, {}, dict(enumerate(starts)))
-    run = Track(program, record, Lane(out, tile), *starts)
-    return run if program.shared is None else Shared(run)
+    return Track(program, record, Lane(out, tile), *starts)
 
 
-def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
+def warn_unlearned(run: Track | KeyedResults) -> None:
     """Warn of the parameters that `Tracker.unlearned` marks."""
-    one = run.rows if isinstance(run, Shared) else run
-    if isinstance(one, Track):
-        ends = [(one.program, one.state)] if one.undetermined.any() else []
+    if isinstance(run, Track):
+        ends = [(run.program, run.state)] if run.undetermined.any() else []
     else:
-        ends = list(one.undetermined())
+        ends = list(run.undetermined())
     found, counts, owners = 0, Counter[str](), []
     for program, state in ends:
         missed = [name for name, left in zip(program.names, program.tracker.unlearned(state), strict=True) if left]
@@ -229,9 +225,9 @@ def warn_unlearned(run: Track | Shared | KeyedResults) -> None:
     if not found:
         return
     named = ", ".join(counts)
-    if not isinstance(one, Track):
+    if not isinstance(run, Track):
         named = (
-            f"in {found} of {len(one.keys())} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
+            f"in {found} of {len(run.keys())} series {', '.join(f'{name} ({k})' for name, k in counts.most_common())}"
         )
     warn(
         f"{owners[0]}: {named} could not be learned, because their regressors never varied separately from the "

@@ -9,6 +9,7 @@ from typing import Any
 
 from driftfit.service.core.engine import Engine
 from driftfit.service.core.journal import Journal, Names
+from driftfit.service.core.results import Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 from driftfit.service.sources.contract import END, Reader, Source
 
@@ -107,10 +108,10 @@ class SinkThread(WorkerThread):
             self.state = "running"
             while (batch := self._next(journal, names)) is not None:
                 outcome, upto = batch
-                if outcome.results or outcome.events:
+                if outcome.parts or outcome.events:
                     writer.write(outcome)
                 self.at = self.engine.progress[self.sink.name] = upto
-                self.count += len(outcome.results)
+                self.count += len(outcome)
         finally:
             if writer is not None:
                 writer.close()
@@ -119,17 +120,18 @@ class SinkThread(WorkerThread):
     def _next(self, journal: Journal, names: Names) -> tuple[Outcome, int] | None:
         """The next batch for the sink, and the last group in it; None when the thread is to end."""
         begun = time.monotonic()
-        results: list[Any] = []
+        results: list[Results] = []
         events: list[Any] = []
-        first, upto = 0, self.at
+        count, first, upto = 0, 0, self.at
         while True:
             groups = journal.outcomes(upto)
-            for group, rows, happened in groups:
+            for group, parts, happened in groups:
                 first = first or group
-                results += rows
+                results += parts
+                count += sum(len(one.number) for one in parts)
                 events += happened
                 upto = group
-            late = time.monotonic() - begun >= self.sink.gather or len(results) >= self.sink.most
+            late = time.monotonic() - begun >= self.sink.gather or count >= self.sink.most
             if (results or events) and (late or self.stopping.is_set()):
                 return names.outcome(first, results, events), upto
             if self.stopping.is_set():

@@ -14,7 +14,6 @@ from rich.text import Text
 
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.show.parts.text import html_of, key_text, table_of
 
 SHOWN = 20
@@ -23,7 +22,7 @@ SHOWN = 20
 Row = tuple[str, str, float, float]
 
 
-def cell_of(result: Track | KeyedResults | Shared) -> str:
+def cell_of(result: Track | KeyedResults) -> str:
     """One line about the result and a table, as HTML."""
     rows, count = _rows(result)
     table = table_of("Parameters after the last sample", "", "", "theta", "std", "[0.025", "0.975]", names=2)
@@ -35,7 +34,7 @@ def cell_of(result: Track | KeyedResults | Shared) -> str:
     return html_of(Text(repr(result)), table, *more)
 
 
-def _rows(result: Track | KeyedResults | Shared) -> tuple[Iterator[Row], int]:
+def _rows(result: Track | KeyedResults) -> tuple[Iterator[Row], int]:
     """(key, name, theta, std) of every parameter of every lane, and how many there are."""
     if isinstance(result, KeyedResults):
         lanes = ((key_text(key), run) for key, run in result.items())
@@ -43,9 +42,8 @@ def _rows(result: Track | KeyedResults | Shared) -> tuple[Iterator[Row], int]:
     return _own("", result), len(result.names)
 
 
-def _own(key: str, run: Track | Shared) -> Iterator[Row]:
+def _own(key: str, run: Track) -> Iterator[Row]:
     # the lane's own end, which is cheap; a whole path of standard deviations is not
-    run = run.rows if isinstance(run, Shared) else run
     theta, std = run.theta[-1], np.sqrt(run.var[-1])
     for i, name in enumerate(run.names):
         yield key if i == 0 else "", name, float(theta[i]), float(std[i])

@@ -20,14 +20,13 @@ import numpy as np
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.show.parts.text import key_text
 
 if TYPE_CHECKING:
     import xarray
 
 
-def to_xarray(result: Track | KeyedResults | Shared) -> xarray.Dataset:
+def to_xarray(result: Track | KeyedResults) -> xarray.Dataset:
     """A result as a dataset; ImportError without xarray."""
     try:
         import xarray
@@ -40,10 +39,10 @@ def to_xarray(result: Track | KeyedResults | Shared) -> xarray.Dataset:
     return _dataset(xarray, result)
 
 
-def _dataset(xarray: Any, run: Track | Shared) -> xarray.Dataset:
+def _dataset(xarray: Any, run: Track) -> xarray.Dataset:
     labels = run.labels
     time = (labels.time or "time") if run.timed else "sample"
-    rows: tuple[str, ...] = (time, "output") if isinstance(run, Shared) else (time,)
+    rows: tuple[str, ...] = (time, "output") if run.rows_per_instant > 1 else (time,)
     inputs = labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[-1]))
     variables = {
         "theta": ((time, "parameter"), run.theta),
@@ -58,11 +57,10 @@ def _dataset(xarray: Any, run: Track | Shared) -> xarray.Dataset:
     if inputs:
         variables["u"] = ((*rows, "input"), run.u)
         coordinates["input"] = list(inputs)
-    if isinstance(run, Shared):
+    if run.rows_per_instant > 1:
         coordinates["output"] = list(run.outputs)
     attributes = {"model": repr(run.model), "tracker": repr(run.tracker), "loglik": float(run.loglik)}
     if labels.zone is not None:
         attributes["time_zone"] = str(labels.zone)
-    units = ("",) * len(run.names) if isinstance(run, Shared) else run.units
     found: xarray.Dataset = xarray.Dataset(variables, coordinates, attributes)
-    return found.assign_coords(unit_of_parameter=("parameter", np.array(units, dtype=str)))
+    return found.assign_coords(unit_of_parameter=("parameter", np.array(run.units, dtype=str)))

@@ -12,7 +12,7 @@ import json
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 import polars as pl
@@ -24,12 +24,11 @@ from driftfit.run.fleet import Fleet
 from driftfit.run.keyed_results import KeyedResults
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 from driftfit.trackers.base import Tracker
 from driftfit.use.forecast import forecast, forecast_outputs
 
-Result = Track | Shared | KeyedResults
-Single = Track | Outputs | Shared
+Result = Track | KeyedResults
+Single = Track | Outputs
 """One record."""
 
 ENDINGS = (".csv", ".parquet", ".npz")
@@ -47,7 +46,7 @@ def as_table(result: Result, arrays: bool = False) -> pl.DataFrame:
     for place, name in enumerate(result.records.labels.by if isinstance(result, Fleet) else ()):
         values = [key[place] if isinstance(key, tuple) else key for key in keys]
         columns[name] = pl.Series(values).gather(np.repeat(np.arange(len(records)), lengths))
-    signals = [_of_track(one, arrays) if isinstance(one, Track) else _of_outputs(one, arrays) for one in records]
+    signals = [_of_track(one, arrays) if _is_single(one) else _of_outputs(one, arrays) for one in records]
     for name in signals[0]:
         columns[name if name not in columns else f"{name}_"] = np.concatenate([part[name] for part in signals])
     table = pl.DataFrame(columns)
@@ -103,12 +102,17 @@ def _records(result: Result) -> tuple[list[Single], list[Any]]:
     if isinstance(result, Fleet):
         found = result.series()
         return list(found.values()), list(found)
-    assert isinstance(result, Track | Outputs | Shared)
+    assert isinstance(result, Track | Outputs)
     return [result], []
 
 
 def _time_name(run: Single) -> str:
     return run.labels.time or ("time" if run.timed else "sample")
+
+
+def _is_single(run: Single) -> TypeGuard[Track]:
+    """Whether a record has one output."""
+    return len(run.outputs) == 1
 
 
 def _of_track(run: Track, arrays: bool) -> dict[str, Array]:
@@ -131,7 +135,7 @@ def _parameters(names: Sequence[str], theta: Array, std: Array, of: str | None) 
     return dict(each)
 
 
-def _of_outputs(run: Outputs | Shared, arrays: bool) -> dict[str, Array]:
+def _of_outputs(run: Single, arrays: bool) -> dict[str, Array]:
     """The same of several outputs: each result with its output in brackets, inputs and parameters under their names."""
     columns: dict[str, Array] = {_time_name(run): run.time}
     for j, output in enumerate(run.outputs):
@@ -149,7 +153,7 @@ def _of_outputs(run: Outputs | Shared, arrays: bool) -> dict[str, Array]:
     return columns
 
 
-def _inputs(run: Track | Outputs) -> tuple[str, ...]:
+def _inputs(run: Single) -> tuple[str, ...]:
     return run.labels.u or tuple(f"u{j + 1}" for j in range(run.u.shape[1]))
 
 
@@ -163,12 +167,13 @@ def units_of(result: Result) -> dict[str, str]:
         return {}
     run = records[0]
     given = run.labels.units
-    signals = (run.labels.y,) if isinstance(run, Track) else run.outputs
+    single = _is_single(run)
+    signals = (run.labels.y,) if single else run.outputs
     units = {_free(name): given[name] for name in (*signals, *run.labels.u) if name in given}
     for name in signals:
-        own = _OWN[:3] if isinstance(run, Track) else [f"{what}[{name}]" for what in _OWN[:3]]
+        own = _OWN[:3] if single else [f"{what}[{name}]" for what in _OWN[:3]]
         units |= dict.fromkeys(own, given[name]) if name in given else {}
-    for one in run.values() if isinstance(run, Outputs) else [run.rows if isinstance(run, Shared) else run]:
+    for one in run.values() if isinstance(run, Outputs) else [run]:
         for name, unit in zip(one.names, one.units, strict=True):
             units |= {f"theta_{name}": unit, f"std_{name}": unit} if unit else {}
     return units
@@ -197,11 +202,10 @@ def forecasts_table(fleet: Fleet, h: int, u: Any) -> pl.DataFrame:
 
 def _forecasts(run: Single, h: int, u: Any) -> Iterator[tuple[tuple[str, ...], dict[str, Array]]]:
     """The forecast of each output, and its name if there are several."""
-    if isinstance(run, Track):
-        found = forecast(run, h, u)
+    found = forecast_outputs(run, h, u) if isinstance(run, Outputs) else forecast(run, h, u)
+    if _is_single(run):
         yield (), _columns(run.names, found.y_hat, found.y_std, found.theta, found.std)
         return
-    found = forecast_outputs(run, h, u)
     for j, output in enumerate(run.outputs):
         own = [part[:, j] for part in (found.y_hat, found.y_std)]
         paths = [part[:, j] if isinstance(run, Outputs) else part for part in (found.theta, found.std)]

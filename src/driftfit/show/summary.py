@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -11,7 +11,6 @@ from rich.text import Text
 from driftfit.judge.compare import Comparison, compare
 from driftfit.run.outputs import Outputs
 from driftfit.run.result import Track, burn_in, root_mean_square
-from driftfit.run.shared_outputs import Shared
 from driftfit.show.parts.by_output import ByOutput
 from driftfit.show.parts.text import Printed, counts, facts, shortened, table_of
 
@@ -81,7 +80,8 @@ class Summary(Printed):
 
 
 def summarise(run: Track) -> Summary:
-    """Build the summary of a run."""
+    """Build the summary of a run; of outputs that share one theta that of all rows."""
+    remarks, run = _of_each_output(run), run.rows
     burn = burn_in(run.model.n)
     low, high = run.band(0.95)
     path = run.theta[burn:] if len(run) > burn else run.theta[-1:]
@@ -95,7 +95,7 @@ def summarise(run: Track) -> Summary:
     tracker = shortened(repr(run.tracker))
     return Summary(
         repr(run.model), tracker, len(run), int(np.sum(run.ok)), run.loglik, burn, rows, compare(run),
-        _signals(run), _span(run), counts(run.labels.dropped), (*_missing(run), *run.tracker.remarks(run)),
+        _signals(run), _span(run), counts(run.labels.dropped), (*remarks, *_missing(run), *run.tracker.remarks(run)),
     )  # fmt: skip
 
 
@@ -104,14 +104,14 @@ def summarise_outputs(run: Outputs) -> ByOutput[Summary]:
     return ByOutput({name: summarise(run[name]) for name in run.outputs})
 
 
-def summarise_shared(run: Shared) -> Summary:
-    """The summary of the rows of a shared theta, with the one-step error of each output after the start."""
+def _of_each_output(run: Track) -> tuple[tuple[str, str], ...]:
+    """The one-step error of each of the outputs that share one theta, after the start."""
+    if run.rows_per_instant == 1:
+        return ()
     kept = run.innovation[burn_in(len(run.names)) :]
     errors = (root_mean_square(e[np.isfinite(e)]) for e in kept.T)
     text = ", ".join(f"{name} {error:.5g}" for name, error in zip(run.outputs, errors, strict=True))
-    summary = summarise(run.rows)
-    remarks = (("Rows", f"{len(run.outputs)} of each sample"), ("RMS error of", text), *summary.remarks)
-    return replace(summary, remarks=remarks)
+    return ("Rows", f"{len(run.outputs)} of each sample"), ("RMS error of", text)
 
 
 def _signals(run: Track) -> str:

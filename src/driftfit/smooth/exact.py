@@ -5,10 +5,10 @@ It minimises the following cost, and computes the corresponding posterior distri
     J = sum_t weight_t (y_t - phi_t' theta_t)^2 + sum_t |G^-1 E_t^-1 (theta_t - theta_{t-1})|^2 / drift_t + prior
 
 with G G' = q and E_t the square roots of the factors of each parameter's drift. There are two methods. The fast one
-(`driftfit.smooth.parts.elimination`) handles a diagonal q with a diffuse start, and tests its own result by a step of
-refinement. If the test fails, and in all other cases, the safe one (`driftfit.smooth.parts.two_filters`) works on
-square roots of information. ``Path.method`` names the method that was used. Second differences instead of first ones
-are in `driftfit.smooth.parts.slopes`.
+(`driftfit.smooth.parts.elimination`) handles a diagonal q with a diffuse start, and tests its own result by a second
+problem with a known solution. If the test fails, and in all other cases, the safe one
+(`driftfit.smooth.parts.two_filters`) works on square roots of information. ``Path.method`` names the method that was
+used. Second differences instead of first ones are in `driftfit.smooth.parts.slopes`.
 
 If the regressors never span all directions, a constant shift in the complement costs nothing. The first point then
 takes theta0 there, the limit of a vanishing prior, and std is inf for parameters that are not determined. Rank is
@@ -38,8 +38,18 @@ def smooth(walk: Walk, keep: str = "std") -> Path:
     scale = column_scale(walk.phi, walk.weight)
     rank, unseen = ranks(walk.phi, walk.weight, scale)
     simple = keep == "std" and walk.p0 is None and rank[-1] == n and np.array_equal(walk.q, np.diag(np.diag(walk.q)))
-    found = elimination.smooth(walk) if simple else None
+    found = elimination.smooth(walk, scale) if simple else None
     if found is None:
         G = triangular_root(walk.q * np.outer(scale, scale))
         found = two_filters.smooth(walk, scale, G, two_filters.start(walk, scale, unseen), keep)
-    return found._replace(rank=rank)
+    return spread(walk, found)._replace(rank=rank)
+
+
+def spread(walk: Walk, path: Path) -> Path:
+    """The path with the variance between the paths under all drifts that are possible."""
+    if not len(walk.paths):
+        return path
+    away = np.sqrt(walk.belief)[:, None, None] * (walk.paths - path.theta)
+    cov = path.cov + np.einsum("kti,ktj->tij", away, away) if len(path.cov) else path.cov
+    lag = path.lag_cov + np.einsum("kti,ktj->tij", away[:, :-1], away[:, 1:]) if len(path.lag_cov) else path.lag_cov
+    return path._replace(var=path.var + np.sum(away**2, axis=0), cov=cov, lag_cov=lag)

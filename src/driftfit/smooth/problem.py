@@ -13,7 +13,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps, output_type
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.run.collected_samples import COLLECTED, collect
-from driftfit.run.program import BLOCK, lanes_of, put_columns
+from driftfit.run.program import BLOCK, lanes_of, put_fields
 from driftfit.run.result import Track
 from driftfit.smooth.parts.pooled_drift import average_drift
 from driftfit.smooth.parts.walk import NONE, Walk, free
@@ -66,8 +66,7 @@ def replay(run: Track) -> dict[str, Array]:
         part = slice(a, min(a + BLOCK, T))
         rows = block[: part.stop - a]
         loop(tile, *lanes_of(run.record.part(part)), rows)
-        for name, values in seen.items():
-            put_columns(rows[name], values[part])
+        put_fields(rows, seen, a)
     return seen
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, Self
 
 from driftfit.engine.kernel import Array
-from driftfit.run.shared_outputs import Shared
+from driftfit.run.result import Track
 from driftfit.smooth.smoothed import Smoothed
 
 
@@ -23,13 +23,13 @@ class SmoothedShared(Smoothed):
     """
 
     @classmethod
-    def of_shared(cls, run: Shared, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Self:
+    def of_shared(cls, run: Track, keep: str = "std", order_by: Any = None, undetermined: str = "min_norm") -> Self:
         """Smooth a record of outputs that share one theta."""
         if order_by is not None:
             raise ValueError("smooth: order_by= would separate the rows of an instant; it needs a single output.")
         return cls(Smoothed.of(run.rows, keep, undetermined=undetermined), run)
 
-    def __init__(self, rows: Smoothed, run: Shared) -> None:
+    def __init__(self, rows: Smoothed, run: Track) -> None:
         self.rows, self._ny = rows, len(run.outputs)
         self.run: Any = run
         self.walk, self._path, self.order_by = rows.walk, rows._path, None

@@ -104,7 +104,17 @@ class Smoothed:
 
     @cached_property
     def std(self) -> Array:
-        return np.sqrt(self.r * self._path.var)
+        var = self.r * self._fold * self._path.var
+        return np.sqrt(var, out=var)
+
+    @property
+    def _fold(self) -> float:
+        """What errors of rounding that readings share multiply variances by
+        (`driftfit.trackers.parts.coarse.shared_rounding`), with the r phi' V phi of the used samples.
+        """
+        common, used = self.run.state.get("common", 0.0), self.walk.weight > 0.0
+        undecided = self.r * float(np.mean(self.leverage[used] / self.walk.weight[used])) if common > 0.0 else 0.0
+        return 1.0 + len(self.run.names) * float(common) / undecided if undecided > 0.0 else 1.0
 
     @property
     def slope(self) -> Array:

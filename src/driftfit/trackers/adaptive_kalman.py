@@ -45,6 +45,7 @@ from driftfit.engine.kernel import Array, State, kernel, log
 from driftfit.engine.settings import numbers
 from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.coarse.shared_rounding import nothing_shared_among_filters, share_among_filters
 from driftfit.trackers.parts.coordinates import (
     FRAME,
     frame,
@@ -103,9 +104,8 @@ def interact(s: State, l: int) -> None:
 
 
 @kernel
-def join_filters(s: State, l: int) -> None:
-    """Estimate and covariance of the mixture, and the interaction of the filters, while columns may be free."""
-    mixture(s, l)
+def go_on(s: State, l: int) -> None:
+    """The estimate of the mixture, and the interaction of the filters, while columns may be free."""
     if s.ok[l] > 0.0:
         located_within(s, l)
     interact(s, l)
@@ -124,7 +124,8 @@ def settle(s: State, l: int) -> None:
             s.C[i, i, k, l] = 1.0 if s.S[i, i, l] > 0.0 else 0.0
     frame(s, l)
     begin_with_drift(s, finest(s, l), l)
-    join_filters(s, l)
+    mixture(s, l)
+    go_on(s, l)
 
 
 @kernel
@@ -171,6 +172,7 @@ def correct(s: State, l: int) -> None:
 @kernel
 def report(s: State, l: int) -> None:
     mixture(s, l)
+    share_among_filters(s, l)
     if s.ok[l] > 0.0:
         located(s, l)
     interact(s, l)
@@ -185,7 +187,9 @@ def begin(s: State, l: int) -> None:
         predict(s, l)
         whiten_noise(s, l)
         follow(s, whiten_within(s, s.white.ctypes.data, l), l)
-        join_filters(s, l)
+        mixture(s, l)
+        share_among_filters(s, l)
+        go_on(s, l)
     else:
         resolve(s, l)
         learn_scales(s, l)
@@ -280,11 +284,16 @@ class AdaptiveKalman(Tracker):
             **no_proportion(),
             **unresolved(),
             **not_frozen(),
+            **nothing_shared_among_filters(),
             **no_weights(n),
             **white(n),
             **modes,
             **levels,
         }
+
+    @property
+    def pads(self) -> bool:
+        return True
 
     @property
     def steps(self) -> TrackerSteps:

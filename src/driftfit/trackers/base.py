@@ -68,10 +68,17 @@ class Tracker(Settings, ABC):
     """Whether the variance of its innovation has an estimated factor, the mean of e^2 / s over the samples before.
     Their number, ``count`` in the state, is the degrees of freedom of the density (`driftfit.trackers.student`).
     """
+    follows_states: ClassVar[bool] = False
+    """Whether it moves the hidden states of a model (`Model.hidden`) between samples; it then needs such a model."""
     scratch: ClassVar[tuple[str, ...]] = ()
     """Fields that carry nothing from one sample to the next; packed states leave them out."""
     output_error: ClassVar[bool] = False
     """Whether the innovation is that of y itself, even for a model that is fitted to another quantity."""
+
+    @property
+    def beyond(self) -> str:
+        """Why theta is not a random walk, or y not phi' theta and noise; empty if they are, as most verbs assume."""
+        return ""
 
     @classmethod
     def own_model(cls, na: int, nb: int, nk: int) -> Model | None:
@@ -89,6 +96,13 @@ class Tracker(Settings, ABC):
     @abstractmethod
     def steps(self) -> TrackerSteps:
         """The compiled steps."""
+
+    @property
+    def pads(self) -> bool:
+        """Whether a parameter that is known to be 0 and never excited leaves the others bit for bit as they are without
+        it, so that structures of several sizes may share a driver (`driftfit.trackers.parts.padded`).
+        """
+        return False
 
     def state_for(self, model: Model) -> Mapping[str, Any]:
         """The state for a bound model."""

@@ -154,6 +154,10 @@ class FLS(Tracker):
         }
 
     @property
+    def pads(self) -> bool:
+        return self.differences == 1
+
+    @property
     def steps(self) -> TrackerSteps:
         return second_differences.STEPS if self.differences == 2 else STEPS
 

@@ -235,6 +235,7 @@ class InstrumentalVariables(Tracker):
             "log_forgetting": np.log(np.asarray(self.forgetting)),
             "r": 1.0,
             "c_max": self.c_max,
+            "discounted": 0.0,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),

@@ -11,6 +11,9 @@ with w the weight of the sample and d known factors of the drift, 1 unless given
 Use it if the size of the drift is known or can be tuned; `RLS` needs only a memory length, `AugmentedFLS` has no
 covariance. Without excitation P grows by exactly q per sample: it is finite, and describes the growing uncertainty.
 
+``laws`` say more of single parameters: that they return to a mean, follow a trend or a season, or drift at their own
+rate (`driftfit.trackers.laws.law`); all others remain random walks.
+
 form="sqrt" keeps the square root of the information instead (`driftfit.trackers.parts.square_root`). It gives the same
 numbers for ordinary data, and positive variances for collinear or badly scaled regressors and extreme ratios of q to r,
 at O(n^3).
@@ -22,17 +25,19 @@ O(n^2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps, diagonal
-from driftfit.engine.kernel import State, kernel
+from driftfit.engine.kernel import Array, State, kernel
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
 from driftfit.models.base import Model
 from driftfit.trackers.base import RandomWalk, Tracker
+from driftfit.trackers.laws import filter as laws_filter
+from driftfit.trackers.laws.law import OWNER, Law, laws_of, table_of
 from driftfit.trackers.parts import square_root
 from driftfit.trackers.parts.diffuse import (
     MACHINES,
@@ -91,11 +96,15 @@ class Kalman(Tracker):
         Mean of theta before the first sample.
     form : "covariance" or "sqrt"
         "sqrt" for collinear or badly scaled regressors: variances are positive by construction.
+    laws : mapping from the name of a parameter to `Law`, or None
+        How single parameters move, instead of a random walk. With laws q is a number or (n,), form is "covariance";
+        theta0 and p0 are those of the levels, and slopes and seasons start from no knowledge.
 
     Raises
     ------
     ValueError
-        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), or r is not positive.
+        If q or p0 is not a covariance (with form="sqrt" p0 must be positive definite), r is not positive, or laws do
+        not fit.
     """
 
     q: Any = None
@@ -103,6 +112,7 @@ class Kalman(Tracker):
     p0: Any = None
     theta0: Any = 0.0
     form: str = "covariance"
+    laws: Any = None
 
     required: ClassVar[tuple[str, ...]] = ("q", "r")
     scratch: ClassVar[tuple[str, ...]] = ("g", "R", *SCRATCH)
@@ -124,6 +134,32 @@ class Kalman(Tracker):
                     'form="covariance".'
                 )
 
+        self._set("laws", laws_of("Kalman", self.laws))
+        if self.laws is not None and (self.form == "sqrt" or np.ndim(self.q) == 2):
+            raise ValueError('Kalman: with laws every q is a number or (n,), and form must be "covariance".')
+
+    def settings(self) -> dict[str, Any]:
+        plain = super().settings()
+        if self.laws is not None:
+            plain["laws"] = tuple((name, law.settings()) for name, law in self.laws)
+        return plain
+
+    @classmethod
+    def from_settings(cls, settings: dict[str, Any]) -> Self:
+        laws = settings.get("laws")
+        given = None if laws is None else tuple((name, Law.from_settings(law)) for name, law in laws)
+        return super().from_settings({**settings, "laws": given} if given else settings)
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        if self.laws is None:
+            return self.state(model.n)
+        names, n = model.names, model.n
+        table = table_of("Kalman", self.laws, names, vector("Kalman", "q", self.q, n))
+        p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
+        laws = {names.index(name): law for name, law in self.laws}
+        start = laws_filter.state(table, vector("Kalman", "theta0", self.theta0, n), p0, laws)
+        return {**start, "r": self.r}
+
     def state(self, n: int) -> Mapping[str, Any]:
         together = np.ndim(self.q) == 2
         return {
@@ -143,12 +179,41 @@ class Kalman(Tracker):
         return square_root.state(vector("Kalman", "theta0", self.theta0, n), p0)
 
     @property
+    def pads(self) -> bool:
+        return self.laws is None
+
+    @property
     def steps(self) -> TrackerSteps:
+        if self.laws is not None:
+            return laws_filter.STEPS
         if self.form == "sqrt":
             return square_root.STEPS
         return TOGETHER if np.ndim(self.q) == 2 else INDEPENDENT
 
+    @property
+    def beyond(self) -> str:
+        return "" if self.laws is None else "has laws by which theta moves"
+
+    def widen(self, lane: Mapping[str, Array], p: Array) -> None:
+        super().widen(lane, p)
+        if self.laws is not None:
+            levels = _levels(lane)
+            lane["C"][levels, levels] += p
+
+    def place(self, lane: Mapping[str, Array], which: Sequence[int], values: Array) -> None:
+        if self.laws is not None:
+            levels = _levels(lane)[list(which)]
+            lane["x"][levels] += np.asarray(values) - lane["theta"][list(which)]
+        super().place(lane, which, values)
+
     def random_walk(self, model: Model) -> RandomWalk:
+        if self.laws is not None:
+            raise ValueError("smoothing needs random walks; this Kalman has laws.")
         n = model.n
         p0 = None if self.p0 is None else matrix("Kalman", "p0", self.p0, n)
         return RandomWalk(matrix("Kalman", "q", self.q, n), self.r, vector("Kalman", "theta0", self.theta0, n), p0)
+
+
+def _levels(lane: Mapping[str, Array]) -> Array:
+    """The place of the level of every parameter among the components."""
+    return np.array([int(np.argmax(lane["law"][OWNER] == i)) for i in range(len(lane["theta"]))])

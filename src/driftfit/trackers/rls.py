@@ -13,6 +13,10 @@ Use it if all parameters drift alike and nothing is known about noise and drift.
 forgetting would let P grow without bound. It stops when a variance is ``c_max`` times its value at the time when the
 regressors first had full rank (before that: when they last spanned a new direction), which does not depend on units.
 
+A model that is linearised poorly at first has its first samples forgotten, also for lambda = 1: up to sample k = N of
+`Model.settling` the memory is at most max(N / 10, k / 4) samples, the lambda(t) -> 1 of Ljung and Soderstrom (1983),
+section 5.6.
+
 Directional forgetting (kind="directional") forgets only in the direction of a sample, after it has been used:
 
     g = P phi;  P <- P + (1/lambda - 1) g g' / (phi' g)
@@ -37,6 +41,7 @@ import numpy as np
 from driftfit.engine.drivers import TrackerSteps
 from driftfit.engine.kernel import State, exp, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, one_of, vector
+from driftfit.models.base import Model
 from driftfit.trackers.base import Tracker
 from driftfit.trackers.parts.coarse.shared_rounding import folded, nothing_shared, share_rounding, spanned_folded
 from driftfit.trackers.parts.diffuse import (
@@ -57,8 +62,10 @@ from driftfit.trackers.parts.resolution import resolution, resolve, unresolved
 @kernel
 def growth(s: State, l: int) -> float:
     """The factor by which forgetting multiplies P."""
-    dt = s.dt[l]
+    dt, used = s.dt[l], s.count[l]
     faded = s.forgetting[l] if dt == 1.0 else exp(dt * s.log_forgetting[l])
+    early = (used < s.discounted[l]) & (s.ok[l] > 0.0)
+    faded = min(faded, 1.0 - 1.0 / max(0.1 * s.discounted[l], 0.25 * used)) if early else faded
     grown = 0.0
     for i in range(s.theta.shape[0]):
         # rounding can make a variance negative, which must not grow past the cap
@@ -243,9 +250,13 @@ class RLS(Tracker):
             "g": np.zeros(n),
             "c_max": self.c_max,
             "per_cap": np.divide(1.0, first, out=np.zeros(n), where=first > 0.0),
+            "discounted": 0.0,
             **no_scale(),
             **(knowing_nothing(n) if self.p0 is None else knowing(n)),
         }
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        return {**self.state(model.n), "discounted": model.settling}
 
     def remarks(self, run: Any) -> tuple[tuple[str, str], ...]:
         return resolution(run.state)

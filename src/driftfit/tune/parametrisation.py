@@ -71,6 +71,8 @@ def _find(task: Task, tracker: Tracker, groups: Any, bounds: Bounds) -> Knobs:
         return _changes(tracker, bounds)
     if groups is not None and missing not in (["mu"], ["q"], ["q", "r"]):
         raise ValueError(f"tune: groups belong to q and mu; {tracker!r} leaves {', '.join(missing) or 'nothing'} open.")
+    if getattr(tracker, "laws", None) is not None and missing != ["r"]:
+        raise ValueError("tune: with laws give q, and leave r open at most; compare laws by run.loglik.")
     if missing == ["mu"]:
         return _weight(task, tracker, groups, bounds)
     if missing in (["q"], ["q", "r"]):

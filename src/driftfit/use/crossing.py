@@ -40,6 +40,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, whole
 from driftfit.run.program import state_of
 from driftfit.run.result import Track
+from driftfit.use.prediction import within
 from driftfit.use.simulate import noise_at
 
 if TYPE_CHECKING:
@@ -147,6 +148,7 @@ def crossing(
     if not run.tracker.covariance or run.tracker.weighs:
         why = "jumps between hypotheses, which is no random walk" if run.tracker.weighs else "carries no covariance"
         raise ValueError(f"crossing: {type(run.tracker).__name__} {why}; track with Kalman, AdaptiveKalman or FLS.")
+    within("crossing", run)
     sign = -1.0 if side == "below" else 1.0
     if what in run.names:
         h = len(run) if horizon is None else whole("crossing", "horizon", horizon, 1)

@@ -19,6 +19,7 @@ w = F(y), so its errors are those of w: r sum_{0<j<h} psi_j^2 is added to phi' P
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -31,11 +32,9 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.base import Model
 from driftfit.run.live.live import Live
-from driftfit.run.live.outputs import LiveOutputs
 from driftfit.run.outputs import Outputs
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import Track
-from driftfit.run.shared_outputs import Shared
 
 
 class Forecast(NamedTuple):
@@ -60,7 +59,7 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
         The record.
     h : int
         Number of samples, at least 1.
-    u : (h,), (h, m) or None
+    u : (h,), (h, m), (h, ny, m) for outputs that share one theta, or None
         Future inputs; None: not known, so that only theta is forecast.
 
     Raises
@@ -68,12 +67,24 @@ def forecast(run: Track, h: int, u: Any = None) -> Forecast:
     ValueError
         If h is below 1, or u does not have h rows and the model's number of inputs.
     """
+    if run.rows_per_instant > 1:
+        model: Any = run.model
+        return _of_outputs(Live(replace(model, regressors=run.rows.model.m), run.tracker, warm_start=run), h, u)
     return forecast_from(run.program, run.program.resting(run.state), future(run.model, h, u))
 
 
 def forecast_stream(live: Live, h: int, u: Any = None) -> Forecast:
     """`forecast` from the present state of a stream; while `apply` is outstanding, the first row of u is its input."""
-    return forecast_from(live.program, *live.driven_on(future(live.model, h, u)))
+    if len(live.model.outputs) > 1:
+        return _of_outputs(copy(live), h, u)
+    ((one, tile),), inputs = live.driven_on(future(live.model, h, u))
+    return forecast_from(one, tile, inputs)
+
+
+def forecast_outputs(run: Outputs, h: int, u: Any = None) -> Forecast:
+    """Forecast h nominal samples of several outputs: theta and std (h, ny, n), y_hat and y_std (h, ny)."""
+    tracker = dict(zip(run.outputs, run.trackers, strict=True))
+    return _of_outputs(Live(run.model, tracker, warm_start=run), h, u)
 
 
 def future(model: Model, h: int, u: Any) -> Array:
@@ -113,30 +124,20 @@ def forecast_from(program: Program, tile: Array, inputs: Array) -> Forecast:
     return result._replace(y_std=np.sqrt(result.y_std + later) / model.output_slope(now, result.y_hat))
 
 
-def forecast_outputs(run: Outputs | Shared, h: int, u: Any = None) -> Forecast:
-    """Forecast h nominal samples of several outputs: theta and std (h, ny, n) or (h, n), y_hat and y_std (h, ny)."""
-    if isinstance(run, Outputs):
-        tracker = dict(zip(run.outputs, run.trackers, strict=True))
-        return drive_on(LiveOutputs(run.model, tracker, warm_start=run), h, u)
-    model: Any = run.model
-    return drive_on(LiveOutputs(replace(model, regressors=run.rows.model.m), run.tracker, warm_start=run), h, u)
-
-
-def drive_on(live: LiveOutputs, h: int, u: Any) -> Forecast:
+def _of_outputs(live: Live, h: int, u: Any) -> Forecast:
     """Forecast from the present state of a stream of several outputs, which is advanced."""
+    model: Any = live.model
     whole("forecast", "h", h, 1)
     inputs = [None] * h if u is None else list(as_numbers("u", u))
     if len(inputs) != h:
         raise ValueError(f"forecast: u must have a row for each of the {h} samples; got shape {np.shape(u)}.")
-    model: Any = live.model
+    apart, rows = live.driven_on(np.array([live.inputs_of(row) for row in inputs]))
+    if apart:
+        found = [forecast_from(program, tile, rows) for program, tile in apart]
+        return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
     if live.awaits:
         live.apply(inputs[0])
         inputs = [*inputs[1:], None]
-    apart = live.alone()
-    if apart:
-        rows = np.array([live.inputs_of(row) for row in inputs])
-        found = [forecast_from(program, tile, rows) for program, tile in apart]
-        return Forecast(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
     parts: list[tuple[Array, ...]] = []
     lagged = None if model.shared or not live.trackers[0].covariance else LagErrors.of(model, model.n)
     for row in inputs:

@@ -1,4 +1,4 @@
-"""The ARX system behind a stream, now: poles, gains and responses with bands, as `Track` has them."""
+"""The system behind a stream, now: poles, gains and responses with bands, as `Track` has them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LiveSystem:
         self.model, self.tracker, self.names = live.model, live.tracker, live.names
         self.theta = live.theta[None]
         self._cov = live.cov
-        system.arx_of(self)
+        system.linear(self)
 
     def __len__(self) -> int:
         return 1

@@ -35,6 +35,12 @@ class Prediction(NamedTuple):
         return self.y_hat - half, self.y_hat + half
 
 
+def within(verb: str, run: Track) -> None:
+    """ValueError for a run whose theta is no random walk, or whose output is not phi' theta and noise."""
+    if run.tracker.beyond:
+        raise ValueError(f"{verb}: {type(run.tracker).__name__} {run.tracker.beyond}; use run.forecast.")
+
+
 def moved(values: Array, by: int, rest: float = np.nan) -> Array:
     """Values (T, ..) delayed by a number of samples (advanced if it is negative)."""
     out = np.full(values.shape, rest)

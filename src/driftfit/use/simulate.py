@@ -27,11 +27,13 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.polynomial import PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
+from driftfit.use.delta_method import spread
 from driftfit.use.draws import ahead_by_draws, simulate_by_draws
-from driftfit.use.prediction import Prediction, drift, moved, unbroken
-from driftfit.use.system import covariances, taken
+from driftfit.use.prediction import Prediction, drift, moved, unbroken, within
+from driftfit.use.system import covariances, filtered, taken
 
 
 def ahead(run: Track, k: int) -> Prediction:
@@ -43,6 +45,7 @@ def ahead(run: Track, k: int) -> Prediction:
         If k is below 1, the model cannot be run forward, or theta has a slope.
     """
     whole("ahead", "k", k, 1)
+    within("ahead", run)
     if getattr(run.tracker, "differences", 1) > 1:
         raise ValueError(
             "ahead: predictions over a record assume a constant theta, but here it follows its slope; use run.forecast."
@@ -79,7 +82,8 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     Parameters
     ----------
     run : Track
-        A run of a model that can be run forward: ARX, Regression, HammersteinWiener, or your own with `play`.
+        A run of a model that can be run forward: ARX, Regression, polynomial models, HammersteinWiener, or your own
+        with `play`.
     u : (h,), (h, m), or None without inputs
         Inputs. Before them the system is at rest: inputs and outputs are zero.
     at : int
@@ -92,11 +96,14 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     ValueError
         If u does not fit the model, or the model cannot be run forward.
     """
+    within("simulate", run)
     h = len(u) if u is not None else len(np.atleast_1d(y if y is not None else []))
     inputs = inputs_for(run.model, u, h)
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
     given = np.zeros(0) if y is None else np.asarray(y, float)
+    if isinstance(run.model, PolynomialModel):
+        return _through_transfers(run, run.model, inputs, at, given)
     if not isinstance(run.model, ARX | Regression):
         return simulate_by_draws(run, inputs, at, given)
     na, U = input_regressors(run.model, inputs, rest=0.0)
@@ -115,6 +122,31 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
             energy[k] = np.sum(psi[: k - len(given) + 1] ** 2)
     of_theta = np.einsum("ti,ij,tj->t", S, cov, S)
     return Prediction(out, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
+
+
+def _through_transfers(run: Track, model: PolynomialModel, u: Array, at: int, given: Array) -> Prediction:
+    """Inputs (h, m) through the transfer functions of a sample, from rest, with noise through that of the noise."""
+    if len(given):
+        raise ValueError("simulate: transfer functions start from rest; leave y out.")
+    h = len(u)
+
+    def response(theta: Array) -> Array:
+        total = np.zeros((len(theta), h))
+        for j in range(model.m):
+            total += filtered(*model.transfers(theta)[1][j], u[:, j])
+        if model.offset:
+            total += filtered(
+                theta[:, -1:], np.concatenate([np.ones((len(theta), 1)), -theta[:, : model.na]], axis=1), np.ones(h)
+            )
+        return total
+
+    theta, cov = taken(run, at)
+    y_hat, of_theta = spread(response, theta, cov)
+    used = run.innovation_var[: range(len(run))[at] + 1]
+    known = used[np.isfinite(used)]
+    r = known[-1] if len(known) else np.nan
+    energy = np.cumsum(model.noise_response(theta[0], h) ** 2)
+    return Prediction(y_hat[0], of_theta[0], np.sqrt(of_theta[0] ** 2 + r * energy))
 
 
 def fit(y: Any, y_hat: Any) -> float:

@@ -1,9 +1,11 @@
-"""The system behind an ARX run, over time: poles, gain, responses with bands, long-run effects, export to scipy.
+"""The system behind a run, over time: poles, gain, responses with bands, long-run effects, export to scipy.
 
-    y = sum_j B_j(z) / A(z) u_j,     A(z) = 1 - a_1 z^-1 - ..,   B_j(z) = z^-nk (b_1 + b_2 z^-1 + ..)
+    y = sum_j B_j(z) / A_j(z) u_j,     A_j(z) = 1 - a_1 z^-1 - ..,   B_j(z) = z^-nk (b_1 + b_2 z^-1 + ..)
 
-    poles               roots of z^na A(z)                       gain of input j      B_j(1) / A(1)
-    step response       of B_j / A, h samples                    frequency response   B_j(e^iw) / A(e^iw)
+    poles               roots of all A_j                         gain of input j      B_j(1) / A_j(1)
+    step response       of B_j / A_j, h samples                  frequency response   B_j(e^iw) / A_j(e^iw)
+
+In an ARX model all A_j are A; in polynomial models A_j = A F_j (`Model.transfers`).
 
 At every sample the parameters of that sample are assumed to be constant: the frozen system. Standard deviations come
 from the covariance of the run by the delta method (`driftfit.use.delta_method`); for a frequency response they are
@@ -78,13 +80,23 @@ class LongRun(NamedTuple):
     high: float
 
 
-def arx_of(run: Followed) -> ARX:
-    """The ARX model of a run; ValueError if it has another model."""
-    if not isinstance(run.model, ARX) or len(run.model.outputs) > 1 or run.names != run.model.names:
+def linear(run: Followed) -> Model:
+    """The model of a run; ValueError if its inputs do not act through transfer functions."""
+    if run.names != run.model.names:
         raise ValueError(
-            f"poles, gains and responses belong to runs of ARX with one output; this run has {run.model!r}."
+            f"poles, gains and responses belong to runs of ARX; this run follows {', '.join(run.names)} instead."
         )
+    run.model.transfers(run.theta[:1])
     return run.model
+
+
+def companion(poles: Array) -> Array:
+    """Matrices (T, k, k) whose eigenvalues are the roots of polynomials (T, k + 1) in powers of z^-1."""
+    k = poles.shape[1] - 1
+    found = np.zeros((len(poles), k, k))
+    found[:, :1] = np.where(np.isfinite(poles), -poles, 0.0)[:, None, 1:]
+    found[:, np.arange(1, k), np.arange(k - 1)] = 1.0
+    return found
 
 
 def covariances(run: Track) -> Array:
@@ -115,30 +127,21 @@ def taken(run: Followed, at: Any) -> tuple[Array, Array]:
 
 
 def poles(run: Followed, at: Any = None) -> Array:
-    """Poles of the frozen systems, (T, na) complex, largest magnitude first; ``at`` selects samples."""
-    model = arx_of(run)
+    """Poles of the frozen systems, (T, k) complex, largest magnitude first; ``at`` selects samples."""
     theta = run.theta if at is None else run.theta[np.atleast_1d(at)]
-    na = model.na
-    if na == 0:
-        return np.zeros((len(theta), 0), complex)
-    companion = np.zeros((len(theta), na, na))
-    companion[:, 0] = np.where(np.isfinite(theta[:, :na]), theta[:, :na], 0.0)
-    companion[:, np.arange(1, na), np.arange(na - 1)] = 1.0
-    roots = np.linalg.eigvals(companion).astype(complex)
+    matrices = companion(linear(run).transfers(theta)[0])
+    roots = np.linalg.eigvals(matrices).astype(complex) if matrices.shape[1] else np.zeros((len(theta), 0), complex)
     order = np.argsort(-np.abs(roots), axis=1, kind="stable")
     return np.take_along_axis(roots, order, axis=1)
 
 
 def largest_pole(run: Followed, at: Any = None) -> Response:
     """Magnitude of the largest pole over time, with its standard deviation; below 1 the system is stable."""
-    model = arx_of(run)
-    na = model.na
+    model = linear(run)
 
     def largest(theta: Array) -> Array:
-        companion = np.zeros((len(theta), max(na, 1), max(na, 1)))
-        companion[:, 0, :na] = theta[:, :na]
-        companion[:, np.arange(1, na), np.arange(na - 1)] = 1.0
-        size: Array = np.abs(np.linalg.eigvals(companion)).max(axis=1)
+        matrices = companion(model.transfers(theta)[0])
+        size: Array = np.abs(np.linalg.eigvals(matrices)).max(axis=1) if matrices.shape[1] else np.zeros(len(theta))
         return size
 
     return Response(*spread(largest, *taken(run, at)))
@@ -146,52 +149,51 @@ def largest_pole(run: Followed, at: Any = None) -> Response:
 
 def dc_gain(run: Followed, at: Any = None) -> Response:
     """Static gain of every input, (T, m), with its standard deviation."""
-    model = arx_of(run)
+    model = linear(run)
     return Response(*spread(lambda theta: _gain(model, theta), *taken(run, at)))
 
 
-def _gain(model: ARX, theta: Array) -> Array:
-    A, B = model.polynomials(theta)
+def _gain(model: Model, theta: Array) -> Array:
+    _, parts = model.transfers(theta)
     with np.errstate(divide="ignore", invalid="ignore"):
-        gains = np.array([b.sum(axis=-1) / A.sum(axis=-1) for b in B]).reshape(len(B), len(theta))
+        gains = np.array([B.sum(axis=-1) / A.sum(axis=-1) for B, A in parts]).reshape(len(parts), len(theta))
     return np.moveaxis(gains, 0, -1)
 
 
 def step_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit step of one input at sample 0; ``at`` selects samples, None all (T h n numbers)."""
-    model, j = arx_of(run), input_of(run, input)
+    model, j = linear(run), input_of(run, input)
     whole("step_response", "h", h, 1)
     drive = np.ones(h)
-    return Response(*spread(lambda theta: _filtered(model, theta, j, drive), *taken(run, at)))
+    return Response(*spread(lambda theta: filtered(*model.transfers(theta)[1][j], drive), *taken(run, at)))
 
 
 def impulse_response(run: Followed, h: int, input: int | str = 0, at: Any = -1) -> Response:
     """Response (T, h) to a unit impulse of one input at sample 0."""
-    model, j = arx_of(run), input_of(run, input)
+    model, j = linear(run), input_of(run, input)
     whole("impulse_response", "h", h, 1)
-    return Response(*spread(lambda theta: _filtered(model, theta, j, np.eye(1, h)[0]), *taken(run, at)))
+    return Response(*spread(lambda theta: filtered(*model.transfers(theta)[1][j], np.eye(1, h)[0]), *taken(run, at)))
 
 
-def _filtered(model: ARX, theta: Array, j: int, drive: Array) -> Array:
-    """B_j / A applied to one signal (h,), for every row of theta."""
-    A, B = model.polynomials(theta)
-    y = np.zeros((len(theta), len(drive)))
+def filtered(B: Array, A: Array, drive: Array) -> Array:
+    """B / A, rows of coefficients (T, .), applied to one signal (h,)."""
+    y = np.zeros((len(B), len(drive)))
     for k in range(len(drive)):
-        for i in range(min(k + 1, B[j].shape[-1])):
-            y[:, k] += B[j][:, i] * drive[k - i]
+        for i in range(min(k + 1, B.shape[-1])):
+            y[:, k] += B[:, i] * drive[k - i]
         for i in range(1, min(k + 1, A.shape[-1])):
             y[:, k] -= A[:, i] * y[:, k - i]
     return y
 
 
 def frequency_response(run: Followed, w: Any = None, input: int | str = 0, at: Any = -1) -> FrequencyResponse:
-    """B_j / A on the unit circle at w (k,) radians per sample, 0.01 to pi by default."""
-    model, j = arx_of(run), input_of(run, input)
+    """B_j / A_j on the unit circle at w (k,) radians per sample, 0.01 to pi by default."""
+    model, j = linear(run), input_of(run, input)
     grid = np.geomspace(0.01, np.pi, 100) if w is None else np.atleast_1d(np.asarray(w, float))
 
     def on_circle(theta: Array) -> Array:
-        A, B = model.polynomials(theta)
-        return _at(B[j], grid) / _at(A, grid)
+        B, A = model.transfers(theta)[1][j]
+        return _at(B, grid) / _at(A, grid)
 
     theta, cov = taken(run, at)
     H = on_circle(theta)
@@ -209,7 +211,7 @@ def _at(polynomial: Array, w: Array) -> Array:
 def input_of(run: Followed, input: int | str) -> int:
     """The index of an input, from its index or name."""
     m = run.model.m
-    names = run.model.inputs if isinstance(run.model, ARX) and isinstance(run.model.inputs, tuple) else ()
+    names = run.model.input_names
     if isinstance(input, str):
         if input not in names:
             raise ValueError(f"there is no input {input!r}; there is {', '.join(names) or 'none with a name'}.")
@@ -223,10 +225,10 @@ def to_scipy(run: Followed, at: int = -1, dt: float = 1.0, input: int | str = 0)
     """The frozen system at a sample, from one input to y, as `scipy.signal.dlti` (a transfer function in z)."""
     from scipy import signal
 
-    model, j = arx_of(run), input_of(run, input)
-    A, B = model.polynomials(run.theta[at])
-    length = max(len(A), len(B[j]))  # with equally many powers of z^-1 in both, they are powers of z
-    num, den = (np.pad(part, (0, length - len(part))) for part in (B[j], A))
+    model, j = linear(run), input_of(run, input)
+    parts = model.transfers(run.theta[at])[1][j]
+    length = max(map(len, parts))  # with equally many powers of z^-1 in both, they are powers of z
+    num, den = (np.pad(part, (0, length - len(part))) for part in parts)
     lead = int(np.argmax(num != 0.0)) if np.any(num) else 0  # a leading zero coefficient makes scipy warn
     return signal.dlti(num[lead:], den, dt=dt)
 
@@ -236,7 +238,9 @@ def long_run(run: Followed, at: int = -1, level: float = 0.95) -> tuple[LongRun,
 
     In a model of logarithms it is the long-run elasticity. ValueError for models other than ARX.
     """
-    model = arx_of(run)
+    model = linear(run)
+    if not isinstance(model, ARX):
+        raise ValueError(f"long_run: Fieller's interval is for ARX; take dc_gain of {type(model).__name__}.")
     theta, cov = taken(run, at)
     gain = Response(*spread(lambda theta: _gain(model, theta), theta, cov))
     found, place = [], model.na

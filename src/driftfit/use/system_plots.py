@@ -1,4 +1,4 @@
-"""Plots of the system behind an ARX run: its responses over time, its poles in the plane, its fit on other data."""
+"""Plots of the system behind a run: its responses over time, its poles in the plane, its fit on other data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from driftfit.data.signals import as_output
 from driftfit.engine.kernel import Array
 from driftfit.show.parts.axes import BLUE, GREY, RED, frame, named, panels, settled
 from driftfit.use.simulate import fit, simulate
-from driftfit.use.system import arx_of, dc_gain, frequency_response, input_of, largest_pole, poles, step_response
+from driftfit.use.system import dc_gain, frequency_response, input_of, largest_pole, linear, poles, step_response
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +34,7 @@ def plot_system(
     Parameters
     ----------
     run : Track
-        A run of an ARX model.
+        A run of ARX, ARMAX, OE or BoxJenkins.
     input : int or name
         The input of the step.
     at : samples
@@ -53,7 +53,7 @@ def plot_system(
     ValueError
         For another model, or an input that does not exist.
     """
-    arx_of(run)
+    linear(run)
     j = input_of(run, input)
     first = settled(run).start
     chosen = np.unique(np.linspace(first, len(run) - 1, TIMES).astype(int)) if at is None else np.atleast_1d(at)
@@ -69,9 +69,10 @@ def plot_system(
 
 def _settling(run: Track, at: Array) -> int:
     """Samples until the slowest stable mode has decayed to 2 per cent."""
-    sizes = np.abs(poles(run, at)[:, 0]) if arx_of(run).na else np.zeros(1)
+    found, (_, parts) = poles(run, at), run.model.transfers(run.theta[:1])
+    sizes = np.abs(found[:, 0]) if found.shape[1] else np.zeros(1)
     slowest = float(np.max(np.where(sizes < 1.0, sizes, 0.99)))
-    lags = max(nb + nk for nb, nk in arx_of(run).lags)
+    lags = max(B.shape[-1] for B, _ in parts)
     return int(np.clip(lags + (np.log(0.02) / np.log(slowest) if slowest > 0.02 else 1.0), 10, LONGEST))
 
 
@@ -146,7 +147,7 @@ def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
     axis.fill_between(run.time, low, high, color=BLUE, alpha=0.2, lw=0)
     axis.plot(run.time, gain.value[:, j], color=BLUE, lw=1.3)
     frame(axis, np.concatenate([gain.value[first:, j], low[first:], high[first:]]))
-    if arx_of(run).na:
+    if poles(run, -1).shape[1]:
         size = axis.twinx()
         size.plot(run.time, pole.value, color=RED, lw=0.8)
         size.set_ylabel("largest pole (red)", fontsize=8)
@@ -158,8 +159,8 @@ def _gain(axis: Axes, run: Track, j: int, first: int, level: float) -> None:
 
 
 def _input_name(run: Track, j: int) -> str:
-    names = arx_of(run).inputs
-    return str(names[j]) if isinstance(names, tuple) else f"u{j + 1}"
+    names = run.model.input_names
+    return str(names[j]) if names else f"u{j + 1}"
 
 
 def _titled(axis: Axes, title: str) -> None:

@@ -31,7 +31,7 @@ from driftfit.bridges.spark.pieces import (
     results,
     why,
 )
-from driftfit.bridges.spark.task import Task, chunks, continued, series_of, times, units_of
+from driftfit.bridges.spark.task import Task, chunks, continued, series_of, times, units_of, words_after
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import one_of
 from driftfit.judge.verdict import verdict
@@ -182,7 +182,7 @@ class Partition:
         if found is not None:
             add(sums, some, found)
             last[some.keys] = some.time[some.first + some.length - 1]
-            states |= dict(zip(some.keys.tolist(), found.states(), strict=True))
+            states |= words_after(found, some)
         return Piece(table, first, settings, programs, why(programs, there, sums), last, sums, some, found, states)
 
     def _named(self, piece: Piece, which: list[int]) -> dict[str, Any]:

@@ -11,11 +11,21 @@ import numpy as np
 import pyarrow as pa
 
 from driftfit.bridges.spark.pieces import COUNTS, LATE, REPEATED, SUMS, UNTIMED, add, filled, instants, named, results
-from driftfit.bridges.spark.task import Series, Task, chunks, continued, numbers, series_of, times, units_of
+from driftfit.bridges.spark.task import (
+    Series,
+    Task,
+    chunks,
+    continued,
+    numbers,
+    series_of,
+    times,
+    units_of,
+    words_after,
+)
 from driftfit.data.storage import describe
 from driftfit.engine.kernel import Array
 from driftfit.run.live.alarm import LiveAlarm
-from driftfit.run.live.rule import AlarmRule
+from driftfit.run.live.rule import FROZEN, AlarmRule
 from driftfit.run.program import Program, state_of
 from driftfit.run.result import burn_in
 from driftfit.run.states import late
@@ -72,7 +82,9 @@ class Flow:
         known.newest[good] = fates.newest[good]
         released = order[right & (fates.fate == late.RELEASED)]
         some = series_of(task, table, known.code, released, known.time, good)
-        found = continued(task, table, some, known.programs, known.words, known.last) if len(released) else None
+        frozen = self.rule is not None and self.rule.kind in FROZEN
+        going = (task, table, some, known.programs, known.words, known.last, frozen)
+        found = continued(*going) if len(released) else None
         if found is not None:
             yield self._results(known, some, found)
         yield from self._left_out(known, order[right], fates.fate[right])
@@ -97,7 +109,7 @@ class Flow:
         earlier = known.counts[:, 0].copy()
         known.counts[...] += sums[:, : len(COUNTS)].astype(np.int64)
         known.last[some.keys] = some.time[some.first + some.length - 1]
-        known.words.update(zip(some.keys.tolist(), found.states(), strict=True))
+        known.words.update(words_after(found, some))
         own = {name: known.table.column(name).take(pa.array(some.rows)) for name in self.task.columns}
         alarms = {} if self.rule is None else self._watched(known, some, found, earlier)
         return self._table("result", own, results(self.task, found), alarms, known.table)
@@ -105,9 +117,9 @@ class Flow:
     def _watched(self, known: Known, some: Series, found: Advanced, earlier: Array) -> dict[str, Any]:
         """The alarms at every sample, as `LiveAlarm` gives them."""
         assert self.rule is not None
-        on, causes = np.zeros(len(some.rows), bool), [None] * len(some.rows)  # type: tuple[Array, list[str | None]]
+        causes: list[str | None] = [None] * len(some.rows)
         plain = describe(self.rule)
-        lanes, e, s = found.lanes(), found.column("e"), found.column("s")
+        lanes = found.lanes()
         for j, k in enumerate(some.keys.tolist()):
             program, (job, lane) = found.programs[j], lanes[j]
             if known.watch[k] is None:
@@ -115,14 +127,11 @@ class Flow:
                 alarm = LiveAlarm(self.rule, program.tracker, program.names, wait)
             else:
                 alarm = LiveAlarm.of({**json.loads(known.watch[k]), "rule": plain}, program.tracker, program.names)
-            for t in range(int(some.length[j])):
-                row = int(some.first[j]) + t
-                alarm.take(job.out[t : t + 1], lane, e[row], s[row])
-                on[row] = alarm.active
-                causes[row] = alarm.cause if alarm.active else None
+            count, first = int(some.length[j]), int(some.first[j])
+            causes[first : first + count] = alarm.take_many(job.out[:count], lane, np.ones(count))
             alarm.onsets()
             known.watch[k] = json.dumps({name: value for name, value in alarm.plain().items() if name != "rule"})
-        return {"alarm": on, "cause": pa.array(causes, pa.string())}
+        return {"alarm": [cause is not None for cause in causes], "cause": pa.array(causes, pa.string())}
 
     def _left_out(self, known: Known, order: Array, fate: Array) -> Iterator[pa.Table]:
         """Rows that wait, and rows that are left out and counted."""

@@ -24,7 +24,7 @@ from driftfit.data.clock import Clock
 from driftfit.data.storage import describe, rebuild
 from driftfit.models.base import Model
 from driftfit.run.live.alarm import check_rule
-from driftfit.run.live.rule import FROZEN, AlarmRule
+from driftfit.run.live.rule import AlarmRule
 from driftfit.trackers.base import Tracker
 
 STATE = {"state": "binary", "settings": "string", **dict.fromkeys(COUNTS, "bigint"), "watch": "string"}
@@ -79,8 +79,8 @@ def follow(
     task = task_of(stream, model, tracker, {"y": y, "u": u, "by": by, "time": time}, dt, settings, arrays)
     kinds = dict(rows_of(stream, task, None).dtypes)
     dated = kinds[time].startswith("timestamp")
-    if rule is not None and check_rule(rule).kind in FROZEN:
-        raise ValueError(f"spark.follow: a rule of kind {rule.kind!r} is not for Spark; use 'innovation' or 'band'.")
+    if rule is not None:
+        check_rule(rule)
     schema = _schema(task, kinds, rule is not None)
     store = Store(stream.sparkSession, path)
     flow = Flow(task, schema, duration("hold", hold, dated), rule, _before(store, task, schema, migrate))

@@ -190,8 +190,9 @@ def series_of(task: Task, table: pa.Table, code: Array, rows: Array, time: Array
 
 
 def continued(
-    task: Task, table: pa.Table, some: Series, programs: Sequence[Any], states: Mapping[int, Array], last: Array
-) -> Advanced:
+    task: Task, table: pa.Table, some: Series, programs: Sequence[Any], states: Mapping[int, Array], last: Array,
+    collected: bool = False,
+) -> Advanced:  # fmt: skip
     """Run the series from their states, by the number of the unit; ``last`` (U,) are times of their last samples.
 
     ``programs`` has an entry for each unit; those of the series are programs.
@@ -206,8 +207,19 @@ def continued(
     u = np.stack(inputs, axis=1) if inputs else np.zeros((len(some.rows), 0))
     labels = Labels(task.y, task.order, task.time, zone=task.zone, by=task.by)
     records = Records(tuple(some.keys.tolist()), some.first, some.length, some.y, u, Known.of(gaps), some.time, labels)
-    begun = {j: states[k] for j, k in enumerate(some.keys.tolist()) if k in states}
-    return advance([programs[k] for k in some.keys.tolist()], records, begun, threads=1)
+    keys = some.keys.tolist()
+    begun = np.array([k in states for k in keys])
+    words = np.zeros((len(keys), max((len(states[k]) for k in keys if k in states), default=0)), np.int64)
+    for j in np.flatnonzero(begun).tolist():
+        words[j, : len(states[keys[j]])] = states[keys[j]]
+    return advance([programs[k] for k in keys], records, words, begun, threads=1, collected=collected)
+
+
+def words_after(found: Advanced, some: Series) -> dict[int, Array]:
+    """The words of every series after its last sample, by the number of its unit."""
+    rows = found.states()
+    sizes = [program.layout.size for program in found.programs]
+    return {k: row[:size] for k, row, size in zip(some.keys.tolist(), rows, sizes, strict=True)}
 
 
 def lists(values: Array) -> pa.Array:

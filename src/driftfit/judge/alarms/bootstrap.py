@@ -35,12 +35,14 @@ from driftfit.run.live.likelihood_ratio import (
     scan_scores,
 )
 
-RECORDS, SAMPLES = 64, 64_000
-"""Simulated records, and samples of all together."""
+RECORDS, SAMPLES = 64, 1000
+"""Simulated records, and the samples of each that count."""
 START = SHORT << (LEVELS - 1)
 """Samples at the beginning of a record that are not counted: the longest window is not complete."""
 SEEN = 100.0
 """Onsets in all records from which a limit is known; rarer ones are extrapolated."""
+OFTEN = 10.0
+"""The smallest number of samples from one onset to the next from which a limit is extrapolated."""
 CORRELATED = 1e-3
 """p-value of whiteness of squared scores below which residuals are drawn in blocks."""
 STEP = 8.0
@@ -51,9 +53,9 @@ Made = list[tuple[Array, int]]
 
 
 def simulated(frozen: Frozen, rows: Rows, seed: int, records: int = RECORDS) -> Made:
-    """The statistics of records without a change."""
+    """The statistics of records without a change; fewer records are the first of more."""
     rng = np.random.default_rng(seed)
-    (N, n), T = rows.phi.shape, SAMPLES // RECORDS + START
+    (N, n), T = rows.phi.shape, SAMPLES + START
     root, block = np.linalg.cholesky(frozen.cov), _block(frozen, rows.x)
     drawn = scipy.special.ndtri(scipy.stats.qmc.Sobol(n, rng=seed).random(records) * (1.0 - 1e-9) + 5e-10)
     made = []
@@ -96,8 +98,8 @@ def _played(frozen: Frozen, x: Array, rng: np.random.Generator) -> Array:
 def limits(made: Made, columns: list[int], every: float) -> tuple[Array, Array]:
     """Limits (c,) of columns for one onset in ``every`` samples, and the growth (c,) of their square with its log."""
     parts = [(findings[:, columns], start) for findings, start in made]
-    base = min(every, SAMPLES / SEEN)
-    often = max(base / STEP, 10.0)
+    base = min(every, max(SAMPLES * len(made) / SEEN, STEP * OFTEN))
+    often = max(base / STEP, OFTEN)
     near, nearer = limit_of(parts, base), limit_of(parts, often)
     growth = np.maximum(near**2 - nearer**2, 0.1) / np.log(base / often)
     return np.sqrt(near**2 + growth * np.log(every / base)), growth

@@ -121,7 +121,8 @@ def limit_of(made: Iterable[tuple[Array, int]], every: float) -> Array:
     low, high = allowed / columns, allowed
     for _ in range(STEPS if columns > 1 else 0):
         middle = 0.5 * (low + high)
-        begun = sum([len(onsets(np.any(part > limits(middle), axis=1))) for part in parts])
+        over = limits(middle)
+        begun = sum([len(onsets(np.any(part > over, axis=1))) for part in parts])
         low, high = (middle, high) if begun <= allowed else (low, middle)
     return limits(low)
 

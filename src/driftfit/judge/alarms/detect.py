@@ -47,6 +47,7 @@ from rich.text import Text
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers, one_of, whole
+from driftfit.judge.alarms.bootstrap import RECORDS
 from driftfit.judge.alarms.calibration import limit_of, null_records
 from driftfit.judge.alarms.onsets import held, onsets
 from driftfit.judge.alarms.reference import burn, in_samples
@@ -201,6 +202,7 @@ def detect(
     calibrate: bool = False,
     at: int = -1,
     seed: int = 0,
+    records: int = RECORDS,
     start: int | None = None,
 ) -> Alarms:
     """Find alarms in a run.
@@ -228,6 +230,8 @@ def detect(
         The sample whose parameters are the true ones in that simulation.
     seed : int
         Seed of that simulation, and of the bootstrap of "glr" and "cusum".
+    records : int
+        Simulated records of that bootstrap, at least 8: fewer take less time, and give limits that are less accurate.
     start : int or None
         With a rule: the first sample that is judged. None: after the start of the run, or at once after a warm start.
 
@@ -253,7 +257,7 @@ def detect(
         kind = "glr"
     asked = AlarmRule(kind, every, (), (), whole("detect", "hold", hold, 0), whole("detect", "window", window, 4))
     reference = in_samples(run, reference)
-    rule, first = rule_of(run, asked, reference, seed)
+    rule, first = rule_of(run, asked, reference, seed, whole("detect", "records", records, 8))
     if kind in FROZEN or (not calibrate and kind != "probability"):
         return judged(run, rule, first)
     made = []

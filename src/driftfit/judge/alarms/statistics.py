@@ -14,7 +14,7 @@ import scipy
 from driftfit.engine.drivers import output_type
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import plain
-from driftfit.judge.alarms.bootstrap import limits, simulated
+from driftfit.judge.alarms.bootstrap import RECORDS, limits, simulated
 from driftfit.judge.alarms.frozen import frozen_model
 from driftfit.judge.alarms.onsets import (
     chance,
@@ -39,10 +39,12 @@ Chance = Callable[[Array, int], float]
 """Probability that a record without a fault reaches these highest values (c,) in a given number of samples."""
 
 
-def rule_of(run: Track, rule: AlarmRule, reference: Reference, seed: int) -> tuple[AlarmRule, int]:
+def rule_of(
+    run: Track, rule: AlarmRule, reference: Reference, seed: int, records: int = RECORDS
+) -> tuple[AlarmRule, int]:
     """A rule with its names, reference and limits, and the first sample of the run that it judges."""
     if rule.kind in FROZEN:
-        return _frozen(run, rule, reference, seed)
+        return _frozen(run, rule, reference, seed, records)
     return RULES[rule.kind](run, rule, reference)
 
 
@@ -56,7 +58,7 @@ def samples_of(run: Track) -> tuple[Array, Array]:
     return out["phi"][..., 0], np.column_stack([out["y"], out["ok"], noise, out["dt"]])
 
 
-def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int) -> tuple[AlarmRule, int]:
+def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int, records: int) -> tuple[AlarmRule, int]:
     """The model of the reference, and limits by its bootstrap."""
     if isinstance(reference, Mapping):
         raise ValueError(
@@ -83,7 +85,7 @@ def _frozen(run: Track, rule: AlarmRule, reference: Reference, seed: int) -> tup
         frozen=tuple(plain(one) for one in frozen),
         simulated=True,
     )
-    found, growth = limits(simulated(frozen, known, seed), rule.entries, rule.every)
+    found, growth = limits(simulated(frozen, known, seed, records), rule.entries, rule.every)
     return replace(rule, limits=plain(found), growth=plain(growth)), start
 
 

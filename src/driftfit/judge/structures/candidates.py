@@ -3,16 +3,17 @@
     phi_t of a structure = its columns of the union's phi_t
 
 The union is run once to collect its regressors (missing lags are filled by constant least squares on all of
-them), so all structures use the same rows. Structures with equally many columns have states of the same shape and run
-in parallel, in fleets of up to 32. Several records are run separately, each from the start, and written one after the
-other.
+them), so all structures use the same rows. They run in parallel, in lanes of drivers for a few sizes: a structure
+has columns of zeros up to the next size (`driftfit.trackers.parts.padded`), and most share one compiled driver.
+Trackers that do not allow that take a driver for each number of columns. Several records are run separately, each from
+the start, and written one after the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,10 +24,11 @@ from driftfit.judge.constant_fit import constant_least_squares
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.regression import Regression
-from driftfit.run.fleet import run_fleet
+from driftfit.run.parallel_lanes import run_lanes
 from driftfit.run.program import Program
-from driftfit.run.result import Track, burn_in, track_record
+from driftfit.run.result import Lane, Track, burn_in, track_record
 from driftfit.trackers.base import Tracker
+from driftfit.trackers.parts.padded import padded, size_of
 
 TOGETHER = 32
 
@@ -94,21 +96,46 @@ class Pool:
     def predict(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
         """Run structures and return their predictions."""
         found: dict[int, Predicted] = {}
-        sizes = sorted({s.n for s in structures if s.columns is not None})
-        for n in sizes:
-            same = [k for k, s in enumerate(structures) if s.n == n and s.columns is not None]
+        columns = [k for k, s in enumerate(structures) if s.columns is not None]
+        shared = tracker.pads and columns
+        sizes = [structures[k].n for k in columns]
+        size = size_of(sizes, len(self.names), len(self.gaps)) if shared else 0
+        together: dict[int, list[int]] = {}
+        for k in columns:
+            together.setdefault(size or structures[k].n, []).append(k)
+        for size, same in together.items():
             for first in range(0, len(same), TOGETHER):
                 part = same[first : first + TOGETHER]
-                runs = self._lanes(tracker, [structures[k] for k in part])
+                runs = self._lanes(tracker, [structures[k] for k in part], size)
                 found |= dict(zip(part, runs, strict=True))
-        for k, structure in enumerate(structures):
-            if structure.columns is None:
-                found[k] = self._alone(tracker, structure)
+        for models in self._families(tracker, structures):
+            for k, model in models.items():
+                wide = model.as_large_as(list(models.values())) if len(models) > 1 else model
+                runs = [run_within(Program(wide, tracker), Program(model, tracker), one) for one in self.records]
+                found[k] = joined([predicted(run) for run in runs])
         return [found[k] for k in range(len(structures))]
 
-    def _lanes(self, tracker: Tracker, structures: Sequence[Structure]) -> list[Predicted]:
-        count, T, n = len(structures), len(self.gaps), structures[0].n
-        u = np.concatenate([self.phi[:, list(s.columns or ())] for s in structures])
+    def _families(self, tracker: Tracker, structures: Sequence[Structure]) -> list[dict[int, Model]]:
+        """The models that are no columns, by their place: those that share a driver, and each of the others."""
+        families: dict[Any, dict[int, Model]] = {}
+        for k, structure in enumerate(structures):
+            if structure.columns is None:
+                assert structure.model is not None
+                shared = tracker.pads and structure.model.family is not None
+                families.setdefault((structure.model.family if shared else k, shared), {})[k] = structure.model
+        found: list[dict[int, Model]] = []
+        for models in families.values():
+            sizes = [model.n for model in models.values()]
+            together = size_of(sizes, max(sizes), len(self.gaps)) > 0
+            found += [models] if together else [{k: model} for k, model in models.items()]
+        return found
+
+    def _lanes(self, tracker: Tracker, structures: Sequence[Structure], size: int) -> list[Predicted]:
+        """Run structures of at most ``size`` columns in drivers of that size."""
+        count, T, R = len(structures), len(self.gaps), len(self.records)
+        u = np.zeros((count * T, size))
+        for k, structure in enumerate(structures):
+            u[k * T : k * T + T, : structure.n] = self.phi[:, list(structure.columns or ())]
         spans = self.spans
         first = np.array([k * T + span.start for k in range(count) for span in spans])
         length = np.array([span.stop - span.start for _ in range(count) for span in spans])
@@ -118,14 +145,30 @@ class Pool:
             tuple(range(len(first))), first, length, np.tile(self.y, count), u,
             Known(np.tile(known.columns, (count, 1))),
         )  # fmt: skip
-        fleet = run_fleet([Program(Regression(n), tracker)] * len(first), records)
-        R = len(spans)
-        return [joined([predicted(fleet[k * R + r]) for r in range(R)]) for k in range(count)]
+        program = Program(Regression(size), tracker)
+        starts = {n: padded(tracker, n, size) for n in {s.n for s in structures} if n < size}
+        begun = {k * R + r: starts[s.n] for k, s in enumerate(structures) if s.n in starts for r in range(R)}
+        lanes = run_lanes([program] * len(first), records, "std", begun)
+        runs = [Track(program, records.part(k), lane) for k, lane in enumerate(lanes) if lane is not None]
+        if len(runs) < len(lanes):
+            raise KeyboardInterrupt
+        return [joined([predicted(run) for run in runs[k * R : (k + 1) * R]]) for k in range(count)]
 
-    def _alone(self, tracker: Tracker, structure: Structure) -> Predicted:
-        assert structure.model is not None
-        program = Program(structure.model, tracker)
-        return joined([predicted(track_record(program, record)) for record in self.records])
+
+def run_within(wide: Program, program: Program, record: Record) -> Track:
+    """The run of a program over a record in the driver of a wider one (`Model.as_large_as`), or in its own."""
+    if wide.model is program.model:
+        return track_record(program, record)
+    n = program.model.n
+    tile = wide.tile(padded(program.tracker, n, wide.model.n))
+    out = wide.run(tile, record)
+    fields = {name: (out.dtype[name], place[1]) for name, place in (out.dtype.fields or {}).items()}
+    own = {
+        name: np.dtype((kind.base, (n, 1) if name in ("theta", "var") else kind.shape))
+        for name, (kind, _) in fields.items()
+    }
+    narrow = {"names": list(own), "formats": list(own.values()), "offsets": [place for _, place in fields.values()]}
+    return Track(program, record, Lane(out.view(np.dtype({**narrow, "itemsize": out.dtype.itemsize})), tile))
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:

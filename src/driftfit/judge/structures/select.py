@@ -9,9 +9,10 @@ those after the first m that all of them could predict, m = max(50, 5 n of the l
 (n / 2) log m is the cost of learning n parameters in the first m samples, which are not scored (Rissanen, 1986).
 
 * `select(grid(ARX, na=[1, 2, 3], nb=[1, 2], nk=[0, 1]), y, u)` compares a list of models. ARX and Regression models are
-  columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures with
-  equally many columns run in parallel as lanes of one compiled driver. Other models, such as Hammerstein-Wiener, run
-  one by one; a model whose regressors contain the present output supplies its Jacobian (``log_jacobian``).
+  columns of one regression, the union of their regressors. It is built once, its rows are shared, and structures run
+  in parallel as lanes of one compiled driver, as wide as the largest of them. Other models, such as
+  Hammerstein-Wiener, run one by one, in one driver for all orders of the same bases; a model whose regressors contain
+  the present output supplies its Jacobian (``log_jacobian``).
 * `select(model, y, u)` with one model searches for the best subset of its regressors: all subsets of up to 5
   regressors, and from there to 30 a search that adds the best and drops the worst, with p runs per round instead of
   2^p in all.

@@ -47,6 +47,7 @@ from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import numbers, output_names, warn, whole
 from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.any_orders import AnyOrders
 from driftfit.models.hammerstein_wiener.curves.basis import Basis, Polynomial, basis_of
 from driftfit.models.hammerstein_wiener.evaluate_bases import DIGITS
 from driftfit.models.hammerstein_wiener.products import Structure
@@ -264,6 +265,15 @@ class HammersteinWiener(Model):
     @property
     def steps(self) -> ModelSteps:
         return _steps(self)
+
+    @property
+    def family(self) -> Any:
+        """The compiled functions of its bases."""
+        return None if len(self.outputs) > 1 else (*(basis.kind for basis in self.bases), self.out.kind)
+
+    def as_large_as(self, family: Sequence[Model]) -> Model:
+        room = max(np.size(one.memory()["blocks"]) for one in family)
+        return AnyOrders(self, self.family, self.places, max(one.n for one in family), room)
 
     @property
     def apply(self) -> Step | None:

@@ -121,12 +121,12 @@ def _entering(into: tuple[Kind, ...], i: int = 0, moves: bool = True) -> Any:
 
 
 @lru_cache
-def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
+def regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
     """The computation of ``regress``, for the functions of all bases."""
     enter, output_at, bare_output_at = _entering(into), output_values(out), output_values(out, bends=False)
     lay, locate, invert = laying(output_at), locating(lanes), inverting(out)
 
-    def regress_work(m: Array, p: Places, theta: Array) -> None:
+    def regress_sample(m: Array, p: Places, theta: Array) -> None:
         n_out, rows, g, h = p[N_OUT], 1 + max(p[NA], 1), p[G_PAST], p[H_PAST]
         if not m[SEEN, 0] > 0.0:  # the previous sample
             for k in range(n_out):
@@ -172,13 +172,13 @@ def _regress_work(into: tuple[Kind, ...], out: Kind, lanes: bool) -> Any:
         if p[NK] > 0:
             fill(m, p, p[NEXT], 1, seen)
 
-    return part(regress_work)
+    return part(regress_sample)
 
 
 @lru_cache
 def _regress(into: tuple[Kind, ...], out: Kind, p: tuple[int, ...], lanes: bool) -> Any:
     """The compiled routine of ``regress``."""
-    work, orders = _regress_work(into, out, lanes), np.array(p)
+    work, orders = regress_work(into, out, lanes), np.array(p)
 
     def machine_regress(blocks: int, theta: int, L: int) -> None:
         stride = L if lanes else 1  # known to the compiler

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from driftfit.data.clock import instant
 from driftfit.data.storage import describe, rebuild
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.run.live.change import Change, change_of
 from driftfit.run.live.likelihood_ratio import memory_of, scan
 from driftfit.run.live.rule import FROZEN, AlarmRule, change_probability, check_fits, last_power_and_mean
@@ -96,11 +97,44 @@ class LiveAlarm:
 
     def take(self, tile: Array, lane: int, e: float, s: float, time: Any = None) -> None:
         """Judge the sample that a lane of the tile has just processed; e is its innovation, with variance s."""
-        before, judged = self.active, self._wait == 0
+        judged = self._wait == 0
         if judged:
             self._compare(tile, lane, e, s)
+        self._note(judged, judged and bool(self.rule.exceeded(self.statistic)), time)
+
+    def take_many(self, rows: Array, lane: int, noise: Array, time: Array | None = None) -> list[str | None]:
+        """Judge T samples that a lane has processed, as `take` does one after the other; the cause wherever it is on.
+
+        Parameters
+        ----------
+        rows : (T,) of the driver's output
+            Of "glr" and "cusum" with the samples as well (`driftfit.run.collected_samples.COLLECTED`).
+        lane : int
+        noise : (T,)
+            Factors of the noise variance.
+        time : (T,) or None
+        """
+        T, first = len(rows), min(self._wait, len(rows))
+        statistic, findings = self._compare_many(rows[first:], lane, noise[first:])
+        on = np.zeros(T, bool)
+        on[first:] = self.rule.exceeded(statistic)
+        if not self._left and not on.any():  # nothing begins or ends
+            self._wait, self.samples, self.begun = self._wait - first, self.samples + T, False
+            if first < T:
+                self._show(statistic[-1], findings[-1:])
+            return [None] * T
+        causes: list[str | None] = []
+        for t in range(T):
+            if t >= first:
+                self._show(statistic[t - first], findings[t - first : t - first + 1])
+            self._note(t >= first, bool(on[t]), None if time is None else instant(time[t]))
+            causes.append(self.cause if self.active else None)
+        return causes
+
+    def _note(self, judged: bool, on: bool, time: Any) -> None:
+        """Count a sample whose statistic is known, and whether the alarm is on."""
+        before = self.active
         self._wait -= not judged
-        on = judged and bool(self.rule.exceeded(self.statistic))
         self._left = self.rule.hold + 1 if on else max(self._left - 1, 0)
         self.active = self._left > 0
         self.begun = self.active and not before
@@ -109,6 +143,12 @@ class LiveAlarm:
             onset = (self.cause, float(self.statistic[j]), self.rule.limits[j])
             self._onsets.append(Onset(self.samples, time, *onset))
         self.samples += 1
+
+    def _show(self, statistic: Array, findings: Array) -> None:
+        """Make these the last statistic."""
+        self.statistic = statistic.copy()
+        if self.rule.kind in FROZEN:
+            self._findings[...] = findings
 
     def _compare(self, tile: Array, lane: int, e: float, s: float) -> None:
         """The statistic after a sample; without a new one the last is kept."""
@@ -133,6 +173,40 @@ class LiveAlarm:
                 if len(self._scores) == rule.window:
                     self.statistic = last_power_and_mean(np.array(self._scores))
 
+    def _compare_many(self, rows: Array, lane: int, noise: Array) -> tuple[Array, Array]:
+        """(statistics (T, c) after samples, findings of a frozen model)."""
+        rule, T = self.rule, len(rows)
+        findings = np.empty((T, 0))
+        if rule.kind in FROZEN:
+            samples, phi = np.ones((T, self._row.shape[1])), rows["phi"][..., lane]
+            samples[:, : phi.shape[1]] = phi
+            known = {"y": rows["y"][:, lane], "ok": rows["ok"][:, lane], "noise": noise, "dt": rows["dt"][:, lane]}
+            for place, name in enumerate(ROW, len(rule.parameters)):
+                samples[:, place] = known[name]
+            findings = np.empty((T, self._findings.shape[1]))
+            scan(samples, self._frozen, self._memory, findings)
+            return findings[:, rule.entries], findings
+        if rule.kind == "band":
+            theta, var = (rows[name][:, self._columns, lane] for name in ("theta", "var"))
+            return rule.outside(theta, np.sqrt(var)), findings
+        if rule.kind == "probability":
+            each = ({name: rows[name][t, ..., lane] for name in self._tracker.outputs} for t in range(T))
+            return np.array([change_probability(self._tracker, one) for one in each]).reshape(T, 1), findings
+        return self._moving(rule.scores(rows["e"][:, lane], np.sqrt(rows["s"][:, lane]))), findings
+
+    def _moving(self, g: Array) -> Array:
+        """Power and mean (T, 2) over the last scores at every sample, repeated where g (T,) is not finite."""
+        fine = np.isfinite(g)
+        count, window = len(self._scores), self.rule.window
+        every = np.concatenate([np.array(self._scores), g[fine]])
+        self._scores.extend(g[fine].tolist())
+        # row k is the statistic when k scores have been added; the first is that of before
+        after = np.tile(self.statistic, (int(fine.sum()) + 1, 1))
+        first = max(window - count, 1)
+        if first < len(after):
+            moving(every[count + first - window :], window, after[first:])
+        return np.asarray(after[np.cumsum(fine)])
+
     def plain(self) -> dict[str, Any]:
         """The state as plain data."""
         return {
@@ -155,6 +229,17 @@ class LiveAlarm:
         if state.get("memory"):
             alarm._findings[0] = alarm._memory.findings
         return alarm
+
+
+@Driver
+def moving(g: Array, window: int, into: Array) -> None:
+    """Sums of g^2 and absolute sums of g (k, 2) over windows of g (k + window - 1,), added from the oldest on."""
+    for k in range(into.shape[0]):
+        power, mean = 0.0, 0.0
+        for j in range(window):
+            power += g[k + j] * g[k + j]
+            mean += g[k + j]
+        into[k, 0], into[k, 1] = power, abs(mean)
 
 
 def check_rule(rule: Any) -> AlarmRule:

@@ -6,6 +6,7 @@ It gives the same bits as `update` for one sample after the other, because both 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -13,90 +14,46 @@ from typing import Any
 import numpy as np
 
 from driftfit.data.clock import LOOK, Clock, Pace, instant
-from driftfit.data.known import Known
+from driftfit.data.known import NOISE, Known
 from driftfit.data.labels import times_of
 from driftfit.data.limits import Gate
-from driftfit.data.record import Reading, Record, Records
+from driftfit.data.record import Reading, Records
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.run.columns import SCALARS, Columns
 from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.fixed_lag import Window
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.late_input import check_applied
+from driftfit.run.live.rule import FROZEN
 from driftfit.run.program import Program, lanes_of
 from driftfit.run.track import records_of
 from driftfit.trackers.base import Tracker
 
-SCALARS = ("y_hat", "e", "s", "ok")
-"""What belongs to one sample, as opposed to the state after it."""
 
-
-class Batch:
+class Batch(Columns):
     """What a stream reports of T samples: the columns of `track`, a row for each sample.
 
     A sample that was ignored for its time has no prediction and is not used; theta and std are those before it.
-
-    Attributes
-    ----------
-    theta, std : (T, n), (T, ny, n) for several outputs, (T, n) where these share one theta
-        Parameters after each sample, and their standard deviations.
-    prediction, innovation, innovation_std : (T,) or (T, ny)
-        One-step prediction made before the output was observed, its error, and the standard deviation of that error.
-    ok : (T,) or (T, ny), bool
-        Which samples were used.
     """
 
-    def __init__(self, out: Array, rows: int = 1) -> None:
-        """``out`` is what the driver wrote, ``rows`` rows for each sample."""
-        self._out, self._rows = out, rows
+    def __init__(self, out: Array, rows_per_instant: int = 1) -> None:
+        """``out`` is what the driver wrote."""
+        self._out, self._rows_per_instant = out, rows_per_instant
+
+    @property
+    def rows_per_instant(self) -> int:
+        return self._rows_per_instant
 
     def __len__(self) -> int:
-        return len(self._out) // self._rows
+        return len(self._out) // self.rows_per_instant
 
     def __repr__(self) -> str:
         return f"Batch of {len(self)} samples"
 
-    def written(self, name: str) -> Array:
-        """A field that the tracker stores for every sample, such as one of its ``outputs``."""
+    def in_rows(self, name: str) -> Array:
         field: Array = self._out[name]
-        field = field[..., 0] if field.shape[-1] == 1 else np.moveaxis(field, -1, 1)
-        if self._rows == 1:
-            return field
-        return field.reshape(len(self), self._rows) if name in SCALARS else field[self._rows - 1 :: self._rows]
-
-    @property
-    def theta(self) -> Array:
-        return self.written("theta")
-
-    @property
-    def var(self) -> Array:
-        """Variances of the parameters, in the shape of theta."""
-        return self.written("var")
-
-    @property
-    def std(self) -> Array:
-        return np.sqrt(self.var)
-
-    @property
-    def prediction(self) -> Array:
-        return self.written("y_hat")
-
-    @property
-    def innovation(self) -> Array:
-        return self.written("e")
-
-    @property
-    def innovation_var(self) -> Array:
-        """Variances of the innovations, in their shape."""
-        return self.written("s")
-
-    @property
-    def innovation_std(self) -> Array:
-        return np.sqrt(self.innovation_var)
-
-    @property
-    def ok(self) -> Array:
-        return self.written("ok") > 0.0
+        return field[..., 0] if field.shape[-1] == 1 else np.moveaxis(field, -1, 1)
 
 
 def row_of(tile: Array, dtype: np.dtype[Any]) -> Array:
@@ -140,13 +97,17 @@ class Batched(ABC):
         """The tracker of each output."""
 
     @property
-    def held(self) -> bool:
-        """Whether an operator has stopped the learning."""
-        return False
+    @abstractmethod
+    def resting(self) -> tuple[float, float, float]:
+        """Interval, noise and drift of a sample that gives none."""
 
     @abstractmethod
-    def _settle(self, held: bool, told: bool) -> None:
-        """Reset what was known of one sample; ``told`` if that was more than interval, noise and drift."""
+    def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
+        """Set the known factors of samples that give none; ``extra`` if others than these three were given."""
+
+    @property
+    def _rows_per_instant(self) -> int:
+        return len(self.model.outputs) if self.model.shared else 1
 
     @cached_property
     def _loop(self) -> Any:
@@ -163,9 +124,10 @@ class Batched(ABC):
     ) -> Batch:
         """Process T samples at once: results and state are those of `update` for each of them in turn, bit for bit.
 
-        Signals and factors are given as to `track`. Where nothing follows single samples (no ``lag``, no alarms), the
-        compiled loop of a record does the work, at the cost of a record per sample and some 30 us per call; otherwise
-        the samples go through it one by one. The first call compiles the loop, unless `track` has done so before.
+        Signals and factors are given as to `track`. Where nothing needs the state after every sample (no ``lag``, no
+        alarm on a frozen model), the compiled loop of a record does the work, at the cost of a record per sample and
+        some 30 us per call; otherwise the samples go through it one by one. The first call compiles the loop, unless
+        `track` has done so before.
 
         Parameters
         ----------
@@ -188,19 +150,21 @@ class Batched(ABC):
             If shapes do not fit, or the input of the last sample is outstanding (`apply`); the state is then unchanged.
         """
         check_applied(self._awaits)
-        rows = len(self.model.outputs) if self.model.shared else 1
+        rows = self._rows_per_instant
         if len(y) == 0:
             return Batch(np.empty(0, self._row_type), rows)
         records = self._records(y, u, Reading(weights=weights, drift=drift, indexed=False), prob)
-        held, told = self.held, records.known.columns.shape[1] > len(HELD)
+        resting, extra = self.resting, records.known.columns.shape[1] > len(HELD)
         before = None if time is None else row_of(self._tile, self._row_type)
         records, taken = self._arrived(records, time)
-        if held:
-            records = replace(records, known=Known.of(*HELD))
+        if resting == HELD:
+            columns = np.broadcast_to(np.reshape(HELD, (3, 1)), (3, len(self.model.outputs)))
+            records = replace(records, known=Known(columns[None, :, 0] if records.y.ndim == 1 else columns[None]))
         out = np.empty(rows * len(records.y), self._row_type)
         if len(out):
-            self._drive((records.in_rows() if self.model.shared else records).part(0), out)
-            self._settle(held, told)
+            record = (records.in_rows() if self.model.shared else records).part(0)
+            self._drive(*lanes_of(record), out, record.time)
+            self._settle(resting, extra)
         if before is not None and not taken.all():
             out = with_ignored(out, before, np.repeat(taken, rows))
         return Batch(out, rows)
@@ -241,20 +205,22 @@ class Batched(ABC):
             records = replace(records, y=y.reshape(records.y.shape), u=u)
         return records, taken
 
-    def _drive(self, record: Record, out: Array) -> None:
-        """Drive the tile over the samples, and let alarms and windows see each of them."""
-        y, u, known = lanes_of(record)
-        if not self._watching and not self._windows:
+    def _drive(self, y: Array, u: Array, known: Array, out: Array, time: Any = None) -> None:
+        """Drive the tile over rows, of which ``time`` has the times, and let alarms and windows see each of them."""
+        if not self._windows and not any(alarm.rule.kind in FROZEN for _, alarm in self._watching):
             self._loop(self._tile, y, u, known, out)
+            for lane, alarm in self._watching:
+                noise = np.broadcast_to(known[:, NOISE, min(lane, known.shape[2] - 1)], len(y))
+                alarm.take_many(out, lane, noise, time)
             return
         for t in range(len(y)):
             row, own = slice(t, t + 1), known[t : t + 1] if len(known) > 1 else known
             self._loop(self._tile, y[row], u[row], own, out[row])
-            self._keep(out[t], own[0], None if record.time is None else instant(record.time[t]))
+            self._keep(out["e"][t], out["s"][t], own[0], None if time is None else instant(time[t]))
 
-    def _keep(self, row: Array, known: Array, time: Any) -> None:
-        """Give the sample that was just processed, with its known factors (k, L), to alarms and windows."""
+    def _keep(self, e: Sequence[float], s: Sequence[float], known: Array, time: Any) -> None:
+        """Give the row that was just processed, with its known factors (k, L), to alarms and windows."""
         for lane, alarm in self._watching:
-            alarm.take(self._tile, lane, float(row["e"][lane]), float(row["s"][lane]), time)
+            alarm.take(self._tile, lane, float(e[lane]), float(s[lane]), time)
         for lane, window in enumerate(self._windows):
             window.push(self._tile, (known[0, lane], known[1, lane], known[2, lane]), lane)

@@ -11,7 +11,7 @@ import numpy as np
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import near, numbers, vector
 from driftfit.run.live.fixed_lag import Window
-from driftfit.trackers.base import Tracker
+from driftfit.run.program import Program
 
 KNOWN = ("interval", "noise", "drift")
 ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
@@ -21,18 +21,13 @@ ORDINARY, HELD = (1.0, 1.0, 1.0), (0.0, np.inf, 1.0)
 class Operated(ABC):
     """The operator's hand on a stream: a hold, resets."""
 
-    tracker: Tracker
+    programs: tuple[Program, ...]
     _tile: Array
     _windows: list[Window]
 
-    @property
     @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-
-    @abstractmethod
-    def lane(self) -> dict[str, Array]:
-        """The fields of the record, as views."""
+    def lane(self, lane: int = 0) -> dict[str, Array]:
+        """The fields of the record, or of that of one of several outputs, as views."""
 
     def hold(self, on: bool = True) -> None:
         """Stop learning, or with ``hold(False)`` resume: for work on the plant, a test, a sensor being cleaned.
@@ -47,13 +42,18 @@ class Operated(ABC):
         """Whether `hold` is on."""
         return bool(self._tile["noise"][0, 0] == np.inf)
 
+    @property
+    def resting(self) -> tuple[float, float, float]:
+        """Interval, noise and drift of a sample that gives none."""
+        return HELD if self.held else ORDINARY
+
     def reset(self, which: str | int | Sequence[str | int] | None = None, p: Any = None, theta: Any = None) -> None:
         """Pass an operator's knowledge to the tracker: these parameters may have changed, or have new values.
 
         Parameters
         ----------
         which : name, index, several of them, or None
-            The parameters; None is all.
+            The parameters; None is all. Indices count the parameters of all outputs, one output after the other.
         p : number or one per parameter
             Variance of the change, in squared units of theta; it is added to the present variance. After maintenance
             a large value lets the next samples decide.
@@ -74,22 +74,30 @@ class Operated(ABC):
             )
         count = len(chosen)
         if p is not None:
-            moved = np.zeros(len(self.names))
-            moved[chosen] = vector("Live.reset", "p", numbers("Live.reset", "p", p, low=0.0), count)
-            self.tracker.widen(self.lane(), moved)
+            moved = vector("Live.reset", "p", numbers("Live.reset", "p", p, low=0.0), count)
         if theta is not None:
             values = vector("Live.reset", "theta", numbers("Live.reset", "theta", theta), count)
-            self.tracker.place(self.lane(), chosen, values)
+        for number, program in enumerate(self.programs):
+            places = [k for k, (lane, _) in enumerate(chosen) if lane == number]
+            own = [chosen[k][1] for k in places]
+            if own and p is not None:
+                added = np.zeros(len(program.names))
+                added[own] = moved[places]
+                program.tracker.widen(self.lane(number), added)
+            if own and theta is not None:
+                program.tracker.place(self.lane(number), own, values[places])
 
-    def _chosen(self, which: Any) -> list[int]:
-        """Indices of parameters."""
+    def _chosen(self, which: Any) -> list[tuple[int, int]]:
+        """(output, index) of parameters."""
+        named = [(lane, i, name) for lane, one in enumerate(self.programs) for i, name in enumerate(one.names)]
         if which is None:
-            return list(range(len(self.names)))
+            return [(lane, i) for lane, i, _ in named]
         chosen = []
         for one in [which] if isinstance(which, str | int) else which:
-            if one not in self.names and not (isinstance(one, int) and 0 <= one < len(self.names)):
-                raise ValueError(f"Live.reset: no parameter {one!r}; {near(str(one), self.names)}")
-            chosen.append(one if isinstance(one, int) else self.names.index(one))
+            found = [(lane, i) for k, (lane, i, name) in enumerate(named) if one in (name, k)]
+            if not found:
+                raise ValueError(f"Live.reset: no parameter {one!r}; {near(str(one), [name for *_, name in named])}")
+            chosen.append(found[0])
         return chosen
 
     def _rest(self, known: tuple[float, float, float]) -> None:

@@ -9,81 +9,81 @@ gives the same bits as the record with u_t and y_t in one row.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, overload
 
 import numpy as np
 
 from driftfit.data.arguments import check_roles
 from driftfit.data.clock import instant
-from driftfit.data.labels import by_name
+from driftfit.data.labels import by_name, order_of
 from driftfit.data.signals import noise_of
-from driftfit.data.storage import Kept
 from driftfit.engine.arrays import as_numbers, factor
 from driftfit.engine.drivers import as_compiled, one_or_all
 from driftfit.engine.kernel import Array
 from driftfit.models.base import Model
+from driftfit.models.regression import Regression
 from driftfit.run.live.alarm import LiveAlarm
+from driftfit.run.live.batch import Batch
 from driftfit.run.live.fixed_lag import FixedLag, Window
-from driftfit.run.live.interventions import HELD, ORDINARY, Operated
+from driftfit.run.live.interventions import HELD, Operated
 from driftfit.run.live.late_input import INPUT, LATER, NOTHING
-from driftfit.run.live.outputs import LiveOutputs
 from driftfit.run.live.rule import AlarmRule
 from driftfit.run.live.stream import Stream
-from driftfit.run.program import state_of
+from driftfit.run.program import Program, state_of
 from driftfit.run.warm_start import Run
 from driftfit.trackers.base import Tracker
 
 Step = tuple[float, float, float, bool]
 """(y_hat, e, s, ok): one-step prediction, innovation, its variance, and whether the sample was used."""
 
-_FLOAT = np.dtype(np.float64)
+Steps = tuple[Array, Array, Array, Array]
+"""The same for several outputs, each (ny,)."""
+
+Factors = tuple[float, Any, float]
+"""Interval, factor of the noise variance (one, or one per output), factor of the drift."""
+
+ROWS = "rows"
+"""The name of the alarm of outputs that share one theta."""
+
+_FLOAT, _ARRAY = np.dtype(np.float64), np.ndarray
 
 
 class Live(Operated, Stream):
     """Track a stream.
 
-    A stream can be copied, pickled and sent to another process, as well as saved: it continues as if never stopped.
+    With several outputs y and all that `update` returns are (ny,); ``theta`` and ``std`` are (ny, n), or (n,) where the
+    outputs share one theta. A stream can be copied, pickled and sent to another process, as well as saved: it continues
+    as if never stopped.
 
     Parameters
     ----------
     model, tracker : Model, Tracker
         As for `track`. A model with several inputs must declare them: ``ARX(2, [1, 1])``, ``inputs=["pressure",
-        "flow"]``.
+        "flow"]``. With several outputs ``tracker`` may map the name of each output to its tracker.
     dt : number, duration, step of the calendar or "label"
         Nominal interval between samples, as for `track`; with datetimes it is required.
     lag : int
         Keep the last ``lag`` samples for `smooth`; 0 keeps none.
-    warm_start : Track, Live or None
-        Continue where that run ended.
+    warm_start : Track, Outputs, Live or None
+        Continue where that run ended; it has the same outputs.
     limits : mapping from signals to (low, high)
         Valid ranges as for `track`: a number outside its range is missing, and counted in ``outside``.
 
     Memory is constant. One update costs a call of a compiled function: well below a microsecond for a few parameters.
     """
 
-    _kind: ClassVar[str] = "state"
-
-    @classmethod
-    def _kinds(cls) -> Mapping[str, type[Kept]]:
-        """A file of a stream with several outputs gives that."""
-        return {cls._kind: cls, LiveOutputs.public()._kind: LiveOutputs.public()}
-
-    def __new__(cls, model: Model, *args: Any, **kwargs: Any) -> Any:
-        """A stream with several outputs is a `LiveOutputs`."""
-        tracker = args[0] if args else kwargs.get("tracker")
-        check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
-        if len(model.outputs) == 1:
-            return super().__new__(cls)
-        return LiveOutputs(model, *args, **kwargs)
-
     def __init__(
-        self, model: Model, tracker: Tracker, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
+        self, model: Model, tracker: Any = None, dt: Any = None, lag: int = 0, warm_start: Run | None = None,
         limits: Mapping[Any, Any] | None = None,
     ) -> None:  # fmt: skip
+        check_roles("Live", model, tracker, several=isinstance(model, Model) and len(model.outputs) > 1)
         self._begin(model, tracker, dt, lag, warm_start, limits)
-        (self.program,), (self.tracker,) = self.programs, self.trackers
-        self._windows = [Window(self.model, self.tracker, lag)] if lag else []
+        self._single = len(self.model.outputs) == 1
+        if lag:
+            regression = self._rows if self._single else Regression(self._rows.n)
+            rows = (lag + 1) * len(self.model.outputs) - 1 if self.model.shared else lag
+            self._windows = [Window(regression, one, rows) for one in self.trackers]
         self._open()
 
     def _open(self) -> None:
@@ -91,69 +91,91 @@ class Live(Operated, Stream):
         tile = self._tile
         self._scratch = tile.copy()
         self._bytes, self._scratch_bytes = tile.view(np.uint8), self._scratch.view(np.uint8)
-        self._m = self.model.m
-        self._unknown = np.full(self._m, np.nan)
-        self._shape = (self._m,)
+        self._m = self._rows.m
+        self._shape = (len(self.model.outputs), self._m) if self.model.shared else (self._m,)
+        self._unknown = np.full(self._shape, np.nan)
         self._interval = tile["interval"][0]
         self._unit = self._clock.count if self._clock.kind in ("number", "unset") else 0.0
-        self._update = self.program.drivers().updater(tile, self._m)
-        self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
+        if self._single:
+            self._update = self.program.drivers().updater(tile, self._m)
+            self._seen, self._scratch_seen = as_compiled(tile), as_compiled(self._scratch)  # views
         self._expect(self._awaits)
 
     def _expect(self, what: int) -> None:
         super()._expect(what)
-        # whether a sample needs more than a call of the compiled step
-        self._careful = self._gate is not None or bool(self._windows or self._watching) or what != NOTHING
+        # whether a sample needs more than a call of the compiled step of one output
+        self._careful = (
+            not self._single or self._gate is not None or bool(self._windows or self._watching) or what != NOTHING
+        )
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return self.program.names
+    def program(self) -> Program:
+        """The program of the one theta; ValueError if each output has its own."""
+        if len(self.programs) > 1:
+            raise ValueError(f"this needs a stream of one output; this one has {', '.join(self.model.outputs)}.")
+        return self.programs[0]
+
+    @property
+    def tracker(self) -> Tracker:
+        """The tracker of the one theta; ValueError if each output has its own."""
+        return self.program.tracker
+
+    @property
+    def names(self) -> tuple[Any, ...]:
+        """Names of the parameters; one tuple for each output where they have one theta each."""
+        found = tuple(one.names for one in self.programs)
+        return found[0] if len(found) == 1 else found
+
+    @overload
+    def update(
+        self, y: float | None, u: Any = LATER, time: Any = None, weight: float = 1.0, drift: Any = 1.0, prob: Any = None
+    ) -> Step: ...
+
+    @overload
+    def update(
+        self, y: Array | Sequence[Any] | Mapping[str, Any], u: Any = LATER, time: Any = None, weight: Any = 1.0,
+        drift: Any = 1.0, prob: Any = None,
+    ) -> Steps: ...  # fmt: skip
 
     def update(
-        self,
-        y: float | None,
-        u: Any = LATER,
-        time: Any = None,
-        weight: float = 1.0,
-        drift: Any = 1.0,
-        prob: Any = None,
-    ) -> Step:
-        """Process one sample and return (y_hat, e, s, ok).
+        self, y: Any, u: Any = LATER, time: Any = None, weight: Any = 1.0, drift: Any = 1.0, prob: Any = None
+    ) -> Any:
+        """Process one sample and return (y_hat, e, s, ok), numbers, or arrays (ny,) for several outputs.
 
-        ``y`` is a number; None, NaN or inf if it is missing. ``u`` is a number for one input, a sequence of m
-        otherwise, or a mapping from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
+        ``y`` is a number, or of several outputs (ny,) or a mapping from their names; None, NaN or inf if it is missing.
+        ``u`` is a number for one input, a sequence of m otherwise ((ny, m) where outputs share one theta), or a mapping
+        from the names of the inputs; None if it is missing. If ``u`` is left out, it comes with
         `apply`, before the next sample; ValueError for a model that has inputs and needs them at once. With ``time``,
         the interval since the last sample scales the drift; a time that is not after the last is counted in ``ignored``
-        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it),
+        and leaves the state unchanged. ``weight`` divides the noise variance of this sample (0: do not use it); it is
+        one number, or one for each output,
         ``drift`` multiplies the drift before it: one number, or one for each parameter (random-walk trackers) or change
         (`Bank`). A `Bank` also takes ``prob``, prior probabilities of its changes or joint events at this sample.
         """
         if prob is not None or type(drift) is not float:
             return self._update_with_extra(y, u, time, weight, drift, prob)
-        if weight != 1.0 or drift != 1.0 or self._careful:
-            return self._sample(y, u, time, weight, drift)  # type: ignore[no-any-return]
+        if self._careful or weight != 1.0 or drift != 1.0:
+            return self._sample(y, u, time, weight, drift)
         if not isinstance(y, float):
             y = float(as_numbers("y", y))
         if type(u) is not float or self._m != 1:
             if u is LATER and self._m:
                 return self._update_later(y) if time is None else self._sample(y, u, time, weight, drift)
-            u = self._floats(u)
+            if type(u) is _ARRAY and self._m == 1 and u.size == 1:
+                u = u.item()
+            if type(u) is not float or self._m != 1:
+                u = self._floats(u)
         if time is None:
-            return self._update(self._seen, y, u)  # type: ignore[no-any-return]
+            return self._update(self._seen, y, u)
         return self._update_at(y, u, time)
 
     def _floats(self, u: Any) -> Any:
         """The inputs as the compiled step takes them; it reads m floats from any address, so they must exist."""
-        if type(u) is np.ndarray:
-            if self._m == 1 and u.size == 1:
-                u = u.item()
-                return u if type(u) is float else self._inputs(u).item()
-            if u.dtype is _FLOAT and u.shape == self._shape:
-                return u if self._m != 1 else u.item()
+        if type(u) is _ARRAY and u.dtype is _FLOAT and u.shape == self._shape and self._m != 1:
+            return u
         return one_or_all(self._inputs(u))
 
-    def _update_at(self, y: float, u: Any, time: Any) -> Step:
+    def _update_at(self, y: float, u: Any, time: Any) -> Any:
         """A sample whose only known factor is its time: the interval is written for this step alone."""
         last = self._last
         if type(time) is float and type(last) is float and self._unit:  # `Clock.since` for the commonest case
@@ -174,46 +196,90 @@ class Live(Operated, Stream):
         self._interval[0] = resting
         return step
 
-    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: float, drift: Any, prob: Any) -> Step:
+    def _update_with_extra(self, y: Any, u: Any, time: Any, weight: Any, drift: Any, prob: Any) -> Any:
         """A sample with more known factors than interval, noise and drift."""
         each = np.ndim(drift) == 1
+        extra = (prob, drift if each else None)
         if each or prob is not None:
-            self.tracker.set_extra(self.lane(), self.model, prob, drift if each else None)
+            self._set_extra(*extra)
         try:
-            return self._sample(y, u, time, weight, 1.0 if each else float(drift))  # type: ignore[no-any-return]
+            return self._sample(y, u, time, weight, 1.0 if each else float(drift))
         finally:
             if each or prob is not None:
-                self.tracker.set_extra(self.lane(), self.model, None, None)
+                self._set_extra(None, None)
 
-    def _factors(self, interval: float, weight: Any, drift: Any) -> tuple[float, float, float]:
-        noise = 1.0 if weight == 1.0 else float(noise_of(weight))
+    def _set_extra(self, prob: Any, drift: Any) -> None:
+        """Set the known factors of the next sample that only some trackers have; None is the default."""
+        for lane, tracker in enumerate(self.trackers):
+            tracker.set_extra(self.lane(lane), self._rows, prob, drift)
+
+    def _factors(self, interval: float, weight: Any, drift: Any) -> Factors:
+        noise: Any = 1.0
+        if not self._single:
+            noise = noise_of(weight, len(self.model.outputs))
+        elif weight != 1.0:
+            noise = float(noise_of(weight))
         return interval, noise, 1.0 if drift == 1.0 else float(factor("drift", drift))
 
-    def _checked(self, y: Any, u: Any) -> tuple[float, Array]:
-        given, inputs = float(as_numbers("y", y)), self._inputs(u)
-        if self._gate is not None:
-            (given,), inputs = self._gate.sample(np.array([given]), inputs)
-        return float(given), inputs
+    def _checked(self, y: Any, u: Any) -> tuple[Array, Array]:
+        outputs, inputs = self._outputs(y), self._inputs(u)
+        return (outputs, inputs) if self._gate is None else self._gate.sample(outputs, inputs)
 
-    def _nothing(self) -> Step:
-        return (np.nan, np.nan, np.nan, False)
+    def _outputs(self, y: Any) -> Array:
+        """y as floats (ny,)."""
+        outputs = self.model.outputs
+        if hasattr(y, "keys"):
+            order_of("Live.update: the model", outputs, list(y.keys()), "outputs")
+            y = [y[name] for name in outputs]
+        given = as_numbers("y", y)
+        if given.shape != (len(outputs),) and not (self._single and given.size == 1):
+            wanted = "one number" if self._single else f"({len(outputs)},)"
+            raise ValueError(f"Live.update: y must be {wanted}; got shape {given.shape}.")
+        return given.reshape(-1)
 
-    def _step(self, y: float, u: Array, known: tuple[float, float, float], time: Any) -> Step:
-        known = HELD if self.held else known
-        self._rest(known)
-        step: Step = self._update(self._seen, y, one_or_all(u))
-        for _, alarm in self._watching:
-            alarm.take(self._tile, 0, step[1], step[2], time)
-        if known is not HELD:
-            self._rest(ORDINARY)
-        for window in self._windows:
-            window.push(self._tile, known)
+    def _nothing(self) -> Any:
+        nan = np.full(len(self.model.outputs), np.nan)
+        return (
+            (np.nan, np.nan, np.nan, False)
+            if self._single
+            else (nan, nan.copy(), nan.copy(), np.zeros(nan.shape, bool))
+        )
+
+    def _step(self, y: Array, u: Array, known: Any, time: Any) -> Any:
+        resting = self.resting
+        known = HELD if resting == HELD else known
+        if self._single:
+            self._rest(known)
+            step = self._update(self._seen, float(y[0]), one_or_all(u))
+            if self._watching or self._windows:
+                self._keep(step[1:2], step[2:3], np.reshape(known, (3, 1)), time)
+        else:
+            out = np.empty(len(y) if self.model.shared else 1, self._row_type)
+            self._drive(*self._row(y, u, known), out, None if time is None else [time] * len(out))
+            step = self._reported(out)
+        self._rest(resting)
         return step
 
-    def _settle(self, held: bool, told: bool) -> None:
-        self._rest(HELD if held else ORDINARY)
-        if told:
-            self.tracker.set_extra(self.lane(), self.model, None, None)
+    def _row(self, y: Array, u: Array, known: Factors) -> tuple[Array, Array, Array]:
+        """(y, u, known) of a sample of several outputs, as drivers take them."""
+        ny, shared = len(y), self.model.shared
+        columns = np.empty((ny, 3) if shared else (3, ny))
+        interval, noise, drift = columns.T if shared else columns
+        interval[:], noise[:], drift[:] = known
+        if not shared:
+            return y[None], np.repeat(u.reshape(1, self._m, 1), ny, axis=2), columns[None]
+        interval[1:] = 0.0  # the rows of an instant are successive samples between which no time passes
+        return y[:, None], u[:, :, None], columns[:, :, None]
+
+    def _reported(self, out: Array) -> Steps:
+        """What `update` returns of the rows of a sample."""
+        batch = Batch(out, self._rows_per_instant)
+        return batch.prediction[0], batch.innovation[0], batch.innovation_var[0], batch.ok[0]
+
+    def _settle(self, resting: tuple[float, float, float], extra: bool) -> None:
+        self._rest(resting)
+        if extra:
+            self._set_extra(None, None)
 
     def _update_later(self, y: float) -> Step:
         """A sample without known factors, whose input comes with `apply`."""
@@ -222,26 +288,54 @@ class Live(Operated, Stream):
         self._expect(INPUT)
         return step
 
-    def predict(self, u: Any = None) -> tuple[float, float]:
+    def predict(self, u: Any = None) -> tuple[Any, Any]:
         """(y_hat, s): the prediction of the next output if its input is ``u``; the state stays unchanged.
 
-        While `apply` is outstanding ``u`` is the input that it would receive, so that candidates can be compared.
+        Both are numbers, or (ny,) for several outputs. While `apply` is outstanding ``u`` is the input that it would
+        receive, so that candidates can be compared.
         """
         self._scratch_bytes[:] = self._bytes  # copying a record field by field takes ten times as long
         inputs = self._inputs(u) if self._gate is None else self._gate.inputs(self._inputs(u))
         self._put(self._scratch, inputs)
-        y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
+        if self._single:
+            y_hat, _, s, _ = self._update(self._scratch_seen, np.nan, one_or_all(inputs))
+        else:
+            missing = np.full(len(self.model.outputs), np.nan)
+            y_hat, _, s, _ = self._passed(self._scratch, missing, inputs, self.resting)
         return y_hat, s
+
+    def pass_by(self, y: Array, u: Any) -> None:
+        """Let one nominal sample of several outputs pass: y goes to the lags and is not used."""
+        resting = self.resting
+        self._passed(self._tile, y, self._inputs(u), (1.0, np.inf, 1.0))
+        self._rest(resting)
+
+    def _passed(self, tile: Array, y: Array, u: Array, known: Factors) -> Steps:
+        """Drive a tile of several outputs over a sample that neither alarms nor windows see."""
+        signals = self._row(y, u, known)
+        out = np.empty(len(signals[0]), self._row_type)
+        self._loop(tile, *signals, out)
+        return self._reported(out)
 
     def smooth(self) -> FixedLag:
         """The last ``lag`` + 1 samples, oldest first, each estimated from all samples so far: theta, std (lag + 1, n).
 
-        Row 0 equals the result of `Track.smooth` at that sample for a record that ends now.
+        They are (lag + 1, ny, n) for outputs that each have their own theta. Row 0 equals the result of `Track.smooth`
+        at that sample for a record that ends now.
         """
-        ((_, window),) = self._windowed()
-        return window.smooth(self._tile)
+        found = [window.smooth(self._tile, lane) for lane, window in self._windowed()]
+        if len(found) > 1:
+            return FixedLag(*(np.stack(part, axis=1) for part in zip(*found, strict=True)))
+        ny = self._rows_per_instant
+        return FixedLag(*(part[ny - 1 :: ny] for part in found[0]))
 
-    def detect(self, rule: AlarmRule, wait: int | None = None) -> LiveAlarm:
+    @overload
+    def detect(self, rule: AlarmRule, wait: int | None = None) -> LiveAlarm: ...
+
+    @overload
+    def detect(self, rule: Mapping[str, AlarmRule], wait: int | None = None) -> dict[str, LiveAlarm]: ...
+
+    def detect(self, rule: Any, wait: int | None = None) -> Any:
         """Watch the stream from the next sample on by the rule of a reference run, ``run.detect(...).rule``.
 
         After every update the alarm shows whether it is on, whether it has just begun, and its cause (`LiveAlarm`). It
@@ -250,74 +344,120 @@ class Live(Operated, Stream):
 
         Parameters
         ----------
-        rule : AlarmRule
-            Limits and settings. The tracker should be that of the reference run.
+        rule : AlarmRule, or mapping from the names of outputs to rules
+            Limits and settings. The tracker should be that of the reference run. Where each of several outputs has its
+            own theta, give the rules by output, ``{"flow": run["flow"].detect(...).rule}``; a later rule replaces an
+            earlier one. Outputs that share one theta have one rule, and the alarm counts their rows.
         wait : int or None
             Number of samples that are not judged. None: those of the start, max(50, 5 n); 0 after a warm start.
+
+        Returns
+        -------
+        The alarm, or for several outputs the alarms by output.
 
         Raises
         ------
         ValueError
-            If the tracker or model does not support the rule.
+            If the tracker or model does not support the rule, or for an unknown output.
         """
-        alarm = self._watch(0, rule, wait)
-        self._expect(self._awaits)
-        return alarm
+        if self._single:
+            alarm = self._watch(0, rule, wait)
+            self._expect(self._awaits)
+            return alarm
+        rules = {ROWS: rule} if isinstance(rule, AlarmRule) else rule
+        lanes = {ROWS: 0} if self.model.shared else {name: lane for lane, name in enumerate(self.model.outputs)}
+        if any(name not in lanes for name in rules):
+            raise ValueError(
+                f"Live.detect: give rules by the name of their output; got {list(rules)!r}, and the outputs are "
+                f"{', '.join(self.model.outputs)}."
+            )
+        replaced = {lanes[name] for name in rules}
+        self._watching = [(lane, alarm) for lane, alarm in self._watching if lane not in replaced]
+        for name, one in rules.items():
+            self._watch(lanes[name], one, wait)
+        return self.alarms
 
     @property
-    def alarms(self) -> tuple[LiveAlarm, ...]:
-        """The alarms that watch this stream, in the order in which `detect` made them."""
-        return tuple(alarm for _, alarm in self._watching)
+    def alarms(self) -> Any:
+        """The alarms that watch this stream, in the order in which `detect` made them; of several outputs by name."""
+        if self._single:
+            return tuple(alarm for _, alarm in self._watching)
+        return {ROWS if self.model.shared else self.model.outputs[lane]: alarm for lane, alarm in self._watching}
 
-    def lane(self) -> dict[str, Array]:
-        """The fields of the record, as views."""
-        return state_of(self._tile)
-
-    def _fields(self) -> Mapping[str, Array]:
-        return self.lane()
+    def lane(self, lane: int = 0) -> dict[str, Array]:
+        """The fields of the record, or of that of one of several outputs, as views."""
+        return state_of(self._tile, lane)
 
     def before(self, steps: float) -> Any:
         """The time so many nominal intervals before the last sample; None where samples have no times."""
         time = None if self._last is None else self._clock.moved(self._last, np.array([-steps]))
         return None if time is None else time[0]
 
-    def driven_on(self, inputs: Array) -> tuple[Array, Array]:
-        """(a copy of the state to be driven on, inputs (h, m) then): what `apply` is to bring is the first of them."""
-        tile = self.program.resting(self.lane())
-        if self._awaits == INPUT:
-            self._placing()(tile, inputs[0])
+    def driven_on(self, inputs: Array) -> tuple[list[tuple[Program, Array]], Array]:
+        """(each program with a copy of its state to be driven on, inputs (h, m) then).
+
+        What `apply` is to bring is the first of the inputs. There is no copy where outputs are regressors of each
+        other.
+        """
+        apart = [(one if self._single else one.alone, lane) for lane, one in enumerate(self.programs)]
+        copies = [(one, one.resting(self.lane(lane))) for one, lane in apart if one is not None]
+        if self._awaits == INPUT and copies:
+            for _, tile in copies:
+                self._placing()(as_compiled(tile), inputs[0])
             inputs = np.vstack([inputs[1:], np.full((1, self._m), np.nan)])
-        return tile, inputs
+        return copies, inputs
+
+    def inputs_of(self, u: Any) -> Array:
+        """u as floats, NaN where it is not known."""
+        return self._inputs(u)
 
     def _inputs(self, u: Any) -> Array:
-        """u as floats (m,)."""
+        """u as floats (m,), or (ny, m) where outputs share one theta."""
         if u is None or u is LATER:
             return self._unknown
-        given: Array = np.asarray(by_name(self.model, u), dtype=np.float64)
+        given: Array = np.asarray(u if self.model.shared else by_name(self.model, u), dtype=np.float64)
         if given.shape != self._shape:
-            if given.size != self._m:
-                raise ValueError(f"Live.update: the model has {self._m} inputs, but u has shape {given.shape}.")
+            if given.size != self._unknown.size:
+                wanted = f"shape {self._shape}" if self.model.shared else f"{self._m} inputs"
+                raise ValueError(f"Live.update: the model has {wanted}, but u has shape {given.shape}.")
             given = given.reshape(self._shape)
         return given
 
     @property
     def theta(self) -> Array:
-        """Parameters now, (n,)."""
-        theta: Array = self._tile["theta"][0, :, 0].copy()
-        return theta
+        """Parameters now, (n,), or (ny, n) where each output has its own."""
+        return self._of_lanes("theta")
 
     @property
     def std(self) -> Array:
-        """Their standard deviations, (n,): inf for parameters that are not determined yet, NaN without a covariance."""
-        var: Array = self._tile["var"][0, :, 0]
-        return np.sqrt(var) if self.tracker.covariance else np.full(len(var), np.nan)
+        """Their standard deviations: inf for parameters that are not determined yet, NaN without a covariance."""
+        var = self._of_lanes("var")
+        return np.sqrt(var) if self.trackers[0].covariance else np.full(var.shape, np.nan)
 
     @property
     def cov(self) -> Array:
-        """Covariance of theta, (n, n)."""
-        return self.tracker.cov(self.lane())
+        """Covariance of theta, (n, n), or (ny, n, n)."""
+        return self._by_lane(lambda tracker, lane: tracker.cov(lane))
 
     @property
     def learning(self) -> Array:
-        """Which parameters are being learned now, (n,) bool: False if recent inputs had too little excitation."""
-        return self.tracker.learning(self.lane())
+        """Which parameters are being learned now, bool in the shape of theta: False if recent inputs had too little
+        excitation.
+        """
+        return self._by_lane(lambda tracker, lane: tracker.learning(lane))
+
+    @property
+    def regressors(self) -> Array:
+        """Those of the last sample, (n,)."""
+        phi: Array = self._tile["phi"][0, :, 0].copy()
+        return phi
+
+    def _of_lanes(self, name: str) -> Array:
+        """A field (n,) of the one theta, or (ny, n)."""
+        values: Array = self._tile[name][0].T.copy()
+        return values[0] if len(values) == 1 else values
+
+    def _by_lane(self, found: Callable[[Tracker, dict[str, Array]], Array]) -> Array:
+        """What each tracker finds in its lane; without the first axis if there is one theta."""
+        parts = [found(tracker, self.lane(lane)) for lane, tracker in enumerate(self.trackers)]
+        return parts[0] if len(parts) == 1 else np.array(parts)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -100,14 +101,20 @@ class AlarmRule(Settings):
         """How much wider the limits are because the reference is itself an estimate."""
         return float(np.sqrt(1.0 + self.window / len(self.normal))) if self.normal else 1.0
 
+    @cached_property
+    def _arrays(self) -> tuple[Array, Array, Array, Array]:
+        """limits, low, high and normal."""
+        return np.array(self.limits), np.array(self.low), np.array(self.high), np.array(self.normal)
+
     def columns(self, names: Sequence[str]) -> list[int]:
         """Indices of the watched parameters among those of a run; ValueError if one does not exist."""
         return [names.index(name) for name in self.names] if self.kind == "band" else []
 
     def outside(self, theta: Array, std: Array) -> Array:
         """How many standard deviations parameters (.., c) are outside their bands; NaN if they are not determined."""
+        _, low, high, _ = self._arrays
         with np.errstate(invalid="ignore", divide="ignore"):
-            beyond = np.maximum(theta - np.array(self.high), np.array(self.low) - theta) / std
+            beyond = np.maximum(theta - high, low - theta) / std
         return np.where(np.isfinite(std), beyond, np.nan)
 
     def scores(self, innovation: Array, std: Array) -> Array:
@@ -115,16 +122,16 @@ class AlarmRule(Settings):
         with np.errstate(invalid="ignore", divide="ignore"):
             g = innovation / std
         g = np.where(np.isfinite(g), g, np.nan)
-        return normal_scores(g, np.array(self.normal)) if self.normal else g
+        return normal_scores(g, self._arrays[3]) if self.normal else g
 
     def exceeded(self, statistic: Array) -> Array:
         """Whether any column (.., c) is beyond its limit."""
         with np.errstate(invalid="ignore"):
-            return np.asarray((statistic > np.array(self.limits)).any(axis=-1))
+            return np.asarray((statistic > self._arrays[0]).any(axis=-1))
 
     def cause(self, statistic: Array) -> int:
         """The column (c,) that is furthest beyond its limit."""
-        ratio = np.where(np.isfinite(statistic), statistic / np.array(self.limits), -np.inf)
+        ratio = np.where(np.isfinite(statistic), statistic / self._arrays[0], -np.inf)
         return int(np.argmax(ratio))
 
     def limit_text(self, column: int) -> str:

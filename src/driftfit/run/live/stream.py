@@ -1,4 +1,4 @@
-"""The common part of streams with one and with several outputs: time, limits, late inputs, windows, alarms, files."""
+"""What a stream keeps besides its tile: time, limits, late inputs, windows, alarms, and its files."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from driftfit.run.live.rule import AlarmRule
 from driftfit.run.program import programs_of, state_of, tile_of
 from driftfit.run.public_class import Plain
 from driftfit.run.result import burn_in
-from driftfit.run.warm_start import UNSAID, End, Run, by_output, carried, ended, read, restore, written
+from driftfit.run.warm_start import KINDS, UNSAID, End, Run, by_output, carried, ended, read, restore, written
 from driftfit.trackers.base import Tracker
 
 
 class Stream(Batched, Plain, storage.Kept):
     """A stream: a tile with a lane for each program, which every sample changes.
 
-    Subclasses define how a sample is processed (`_step`), and what an ignored sample returns.
+    `driftfit.run.live.live.Live` defines how a sample is processed, and what is reported of it.
     """
 
     def _begin(
         self, model: Model, tracker: Any, dt: Any, lag: int, warm_start: Run | None, limits: Mapping[Any, Any] | None
     ) -> None:
-        """Set everything that does not depend on the number of outputs."""
+        """Set everything before the step is compiled."""
         self.programs = programs_of(model, tracker, model.m)
         self.model = self.programs[0].whole
         self._rows = self.programs[0].model
@@ -71,6 +71,10 @@ class Stream(Batched, Plain, storage.Kept):
     def _step(self, y: Any, u: Array, known: Any, time: Any) -> Any:
         """Process a sample within its limits: y and u as `_checked` returns them, ``known`` as `_factors` does."""
 
+    @classmethod
+    def _kinds(cls) -> Mapping[str, type[storage.Kept]]:
+        return dict.fromkeys(KINDS, cls)
+
     @abstractmethod
     def _factors(self, interval: float, weight: Any, drift: Any) -> Any:
         """The known numbers of a sample."""
@@ -82,10 +86,6 @@ class Stream(Batched, Plain, storage.Kept):
     @abstractmethod
     def _nothing(self) -> Any:
         """The result of a sample that is ignored."""
-
-    @abstractmethod
-    def _fields(self) -> Mapping[str, Array]:
-        """The fields of the tile that files contain, as views."""
 
     @abstractmethod
     def _inputs(self, u: Any) -> Array:
@@ -231,6 +231,8 @@ class Stream(Batched, Plain, storage.Kept):
         if "fields" in header:
             restore(source, live.programs, header, arrays, live._tile)
         else:  # an .npz of arrays, as states were before they had bytes of their own
-            storage.restore(source, trackers[0], arrays, "state_", live._fields())
+            fields = {name: live._tile[name][0] for name in storage.fields(live._tile)}
+            several = len(model.outputs) > 1
+            storage.restore(source, trackers[0], arrays, "state_", fields if several else state_of(live._tile))
         live._expect(extra["awaits"])
         return live

@@ -6,7 +6,7 @@ of them. The samples, results and states of a series are those of its record, bi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -41,29 +41,30 @@ class Advanced:
                 found[job.lanes[lane]] = job, lane
         return found
 
-    def states(self) -> list[Array]:
-        """The words of each series after its last sample, as `driftfit.run.states.layout.Layout.pack` takes them."""
-        found: list[Array] = [np.zeros(0)] * len(self.programs)
-        for job in self.jobs:
-            words = self.programs[job.lanes[0]].layout.taken(job.tile)
-            for lane in np.flatnonzero(job.live).tolist():
-                found[job.lanes[lane]] = words[lane]
+    def states(self) -> Array:
+        """The words (K, W) of each series after its last sample; of a layout with fewer words the first of them."""
+        layouts = [self.programs[job.lanes[0]].layout for job in self.jobs]
+        found = np.zeros((len(self.programs), max(one.size for one in layouts)), np.int64)
+        for job, layout in zip(self.jobs, layouts, strict=True):
+            found[job.lanes[job.live], : layout.size] = layout.taken(job.tile)[job.live]
         return found
 
 
 def advance(
-    programs: Sequence[Program], records: Records, states: Mapping[int, Array], threads: int | None = None
-) -> Advanced:
-    """Run every series of one output by its program, from its state if there is one.
+    programs: Sequence[Program], records: Records, states: Array, begun: Array, threads: int | None = None,
+    collected: bool = False,
+) -> Advanced:  # fmt: skip
+    """Run every series of one output by its program, from its state if it has ``begun``.
 
-    ``states`` maps the number of a series to the words of its state (`Layout.unpack`); the others begin at their start.
+    ``states`` (K, W) are the words of the states (`Layout.unpack`), as `Advanced.states` returns them; a series that
+    has not ``begun`` (K,) is at its start. With ``collected`` the fields of `collected_samples.COLLECTED` are kept too.
     """
-    jobs = prepare(programs, records, "std")
+    jobs = prepare(programs, records, "std", collected=collected)
     for job in jobs:
-        begun = np.array([k in states for k in job.lanes.tolist()])
-        if begun.any():
-            words = np.stack([states[k] for k in job.lanes[begun].tolist()])
-            programs[job.lanes[0]].layout.put(job.tile, np.flatnonzero(begun), words)
+        lanes = np.flatnonzero(begun[job.lanes])
+        if lanes.size:
+            layout = programs[job.lanes[0]].layout
+            layout.put(job.tile, lanes, states[job.lanes[lanes], : layout.size])
     run_jobs(jobs, records, threads)
     return Advanced(programs, records, jobs)
 

@@ -14,7 +14,6 @@ rows at one time is the first.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -71,46 +70,82 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
 
 
 class HoldBack:
-    """The rows of one series that wait, for a stream.
+    """The rows of many series that wait, each with a time and numbers.
+
+    Series are known by their places in the arrays (S,) of newest times that callers keep.
 
     Parameters
     ----------
-    hold : number, timedelta64 or timedelta
-        How far behind the newest time a row may be; 0 lets nothing wait.
+    hold : number
+        How far behind the newest time of its series a row may be; 0 lets nothing wait.
+    columns : int
+        Numbers of a row.
     """
 
-    def __init__(self, hold: Any) -> None:
-        self.hold = np.timedelta64(hold) if hasattr(hold, "total_seconds") else hold
-        if not self.hold >= (np.timedelta64(0) if isinstance(self.hold, np.timedelta64) else 0):
+    def __init__(self, hold: float, columns: int) -> None:
+        if not hold >= 0:
             raise ValueError(f"HoldBack: hold must not be negative; got {hold!r}.")
-        self.newest: Any = None
-        self.times: Array = np.zeros(0)
-        self.rows: list[Any] = []
-        self.counts: Counter[str] = Counter()
+        self.hold = hold
+        self.series: Array = np.zeros(0, np.int64)
+        self.time: Array = np.zeros(0)
+        self.rows: Array = np.zeros((0, columns))
 
     def __len__(self) -> int:
         """How many rows wait."""
-        return len(self.rows)
+        return len(self.time)
 
-    def take(self, times: Sequence[Any], rows: Sequence[Any]) -> tuple[Array, list[Any]]:
-        """Give rows with their times; returns those that are released now, in the order of their times."""
-        given = np.asarray(times)
-        given = given.astype("M8[us]" if given.dtype.kind == "M" else float)
-        time = np.concatenate([self.times.astype(given.dtype), given])
-        before = np.array(["NaT" if given.dtype.kind == "M" else np.nan], given.dtype)
-        if self.newest is not None:
-            before[0] = self.newest
-        every = [*self.rows, *rows]
-        waited = np.arange(len(time)) < len(self.rows)
-        order, fate, (self.newest,) = sort_out(np.zeros(len(time), int), time, waited, before, self.hold)
-        for code, reason in REASONS.items():
-            self.counts[reason] += int((fate == code).sum())
-        going, staying = order[fate == RELEASED], order[fate == WAITING]
-        self.times, self.rows = time[staying], [every[k] for k in staying]
-        return time[going], [every[k] for k in going]
+    def judge(self, series: Array, time: Array, newest: Array) -> tuple[Array, Array]:
+        """(those of the rows (N,) that `take` would take, sorted by series and time; the fates (N,) of all).
 
-    def rest(self) -> tuple[Array, list[Any]]:
-        """The rows that still wait, when no more will arrive."""
-        found = self.times, self.rows
-        self.times, self.rows = self.times[:0], []
-        return found
+        Nothing is changed.
+        """
+        waiting, fates = self._sorted_out(series, time, newest)
+        arriving = fates.order >= len(waiting)
+        taken = arriving & ((fates.fate == RELEASED) | (fates.fate == WAITING))
+        fate = np.empty(len(time), fates.fate.dtype)
+        fate[fates.order[arriving] - len(waiting)] = fates.fate[arriving]
+        return fates.order[taken] - len(waiting), fate
+
+    def take(self, series: Array, time: Array, rows: Array, newest: Array) -> tuple[Array, Array, Array]:
+        """Give rows (N, columns); returns (series, time, rows) of those that are released, sorted by series and time.
+
+        ``newest`` (S,) is brought up to date.
+        """
+        waiting, fates = self._sorted_out(series, time, newest)
+        newest[...] = fates.newest
+        every = [
+            np.concatenate([old[waiting], new]) for old, new in zip(self._columns(), (series, time, rows), strict=True)
+        ]
+        going, staying = (fates.order[fates.fate == code] for code in (RELEASED, WAITING))
+        self._keep(np.delete(np.arange(len(self)), waiting), [column[staying] for column in every])
+        return every[0][going], every[1][going], every[2][going]
+
+    def of(self, one: int) -> tuple[Array, Array]:
+        """(times, rows) of a series that wait."""
+        own = slice(*np.searchsorted(self.series, (one, one + 1)))
+        return self.time[own], self.rows[own]
+
+    def put(self, one: int, time: Array, rows: Array) -> None:
+        """Make these the rows of a series that wait."""
+        own = [np.full(len(time), one), time, rows]
+        self._keep(np.flatnonzero(self.series != one), own)
+
+    def _columns(self) -> tuple[Array, Array, Array]:
+        return self.series, self.time, self.rows
+
+    def _sorted_out(self, series: Array, time: Array, newest: Array) -> tuple[Array, Fates]:
+        """(the rows of these series that wait, the fates of those rows and then of the given ones)."""
+        there = np.zeros(len(newest), bool)
+        there[series] = True
+        waiting = np.flatnonzero(there[self.series])
+        waited = np.arange(len(waiting) + len(time)) < len(waiting)
+        every = (np.concatenate([self.series[waiting], series]), np.concatenate([self.time[waiting], time]))
+        return waiting, sort_out(*every, waited, newest, self.hold)
+
+    def _keep(self, which: Array, more: Sequence[Array]) -> None:
+        """Let these rows, and more, be all that wait, sorted by series and time."""
+        if not len(which) and not len(more[0]) and not len(self):
+            return
+        every = [np.concatenate([old[which], new]) for old, new in zip(self._columns(), more, strict=True)]
+        order = np.lexsort((every[1], every[0]))
+        self.series, self.time, self.rows = (column[order] for column in every)

@@ -23,7 +23,7 @@ import hashlib
 import json
 import sys
 import zlib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from math import prod
 from struct import Struct
@@ -52,23 +52,29 @@ def words_of(tile: Array) -> Array:
 class Layout:
     """The fields of a lane, those whose words a packed state holds, and whose state it is.
 
-    ``owner`` describes model and tracker as plain data; with the fields it makes the fingerprint.
+    ``names`` are the fields in the order of a packed state. ``owner`` describes model and tracker as plain data; with
+    the fields it makes the fingerprint.
     """
 
-    def __init__(self, record: np.dtype[Any], scratch: Collection[str], owner: Mapping[str, Any]) -> None:
-        held, at = [], 0
+    def __init__(
+        self, record: np.dtype[Any], names: Sequence[str], scratch: Collection[str], owner: Mapping[str, Any]
+    ) -> None:
+        held = []
         shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
-        for name in record.names or ():
-            kind, shape = record[name].base.kind, record[name].shape[:-1]
-            if name == "pad":
-                continue
+        places: Mapping[str, Any] = record.fields or {}
+        for name in names:
             if name not in scratch:
-                shapes[name] = (kind, shape)
-                held.append(np.arange(at, at + prod(shape)))
-            at += prod(shape)
+                (*shape, lanes), at = record[name].shape, places[name][1]
+                shapes[name] = (record[name].base.kind, tuple(shape))
+                held.append(at // (8 * lanes) + np.arange(prod(shape)))
         self.shapes = shapes
         self.held = np.concatenate(held)
         self.owner = dict(owner)
+
+    @property
+    def size(self) -> int:
+        """Words of a state, W."""
+        return len(self.held)
 
     @cached_property
     def text(self) -> str:

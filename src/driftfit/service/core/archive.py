@@ -15,7 +15,7 @@ from typing import Any
 
 import polars as pl
 
-from driftfit.service.core.journal import Journal, Pending
+from driftfit.service.core.journal import Act, Journal, Pending
 from driftfit.service.settings.options import ServiceOptions
 
 log = logging.getLogger("driftfit.service")
@@ -81,11 +81,17 @@ def export(folder: Path, needed: int, before: float) -> int:
             for item in items:
                 count = item.length
                 rows["number"] += range(number, number + count)
-                rows["unit"] += [names[item.unit]] * count
-                rows["time"] += item.times if item.times is not None else [None] * count
-                rows["values"] += item.rows if item.action is None else [[]]
-                rows["action"] += [None if item.action is None else str(item.action)] * count
                 number += count
+                if isinstance(item, Act):
+                    rows["unit"].append(names[item.unit])
+                    rows["time"].append(None)
+                    rows["values"].append([])
+                    rows["action"].append(str(item.action))
+                    continue
+                rows["unit"] += [names[unit] for unit in item.unit.tolist()]
+                rows["time"] += [None] * count if item.time is None else item.time.tolist()
+                rows["values"] += item.values.tolist()
+                rows["action"] += [None] * count
     finally:
         journal.close()
     target = folder / "journal" / f"{first:016d}-{upto - 1:016d}.parquet"

@@ -3,7 +3,8 @@
     gather -> admit -> commit (journal, positions, earlier results, states) -> acknowledge -> update -> results
 
 A transaction contains whatever has arrived while the one before was written, so groups grow with the load and nothing
-waits for a timer. Cost: one transaction of 1 to 10 ms per group, and some ten microseconds per sample.
+waits for a timer. Cost: one transaction of 1 to 10 ms per group, and a few microseconds per sample
+(`benchmarks/service.py stages`).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 from driftfit.service.core.archive import Archive
 from driftfit.service.core.calibration import rules_of
 from driftfit.service.core.intake import Action, Arrived, Intake
-from driftfit.service.core.journal import NEEDED_FROM, Item, Journal, Pending
+from driftfit.service.core.journal import NEEDED_FROM, Act, Item, Journal, Pending
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.core.units import Units
 from driftfit.service.settings.config import Config
@@ -33,6 +34,9 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it does other work."""
+PACE = 0.01
+"""Seconds from one transaction to the next at least: with single samples in a message the fixed cost of a group, about
+a millisecond, would otherwise be most of the work."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -58,6 +62,7 @@ class Engine:
         self.latencies: deque[float] = deque(maxlen=2000)
         """Seconds from the arrival of a batch to the results of its samples."""
         self._dirty: OrderedDict[int, tuple[int, float]] = OrderedDict()
+        """By unit: the number from which on the log has what its stored state does not, and when that came."""
         self._pending = Pending()
         self._pool = ThreadPoolExecutor(1, "driftfit-calibrate")
         self._archive = Archive(config.service, folder, self._pool)
@@ -70,32 +75,47 @@ class Engine:
         for first, items in self.journal.groups(self.journal.first_needed()):
             out, number = Out(), first
             for item in items:
-                if self._apply(number, item, out, replay=True):
-                    again += item.length
+                again += self._apply(number, item, out, replay=True)
                 number += item.length
             if first >= unstored:
                 self._pending.add_results(first, out.results, out.events, time.time())
-            self._flush_blocks(items)
+            self._pending.blocks += out.blocks
         for unit in self.units.resident:
             self._ask_for_limits(unit)
         return again
 
-    def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> bool:
-        """Pass an entry of the log to its unit, unless the unit's stored state already contains it."""
-        unit = self.units.get(item.unit)
-        if replay and number < self.units.since[item.unit]:
-            return False
-        self._dirty.setdefault(item.unit, (number, time.monotonic()))
-        if item.action is not None:
+    def _apply(self, number: int, item: Item, out: Out, replay: bool = False) -> int:
+        """Pass an entry of the log to its units, without what their stored states contain already; how much it was."""
+        if isinstance(item, Act):
+            unit = self.units.get(item.unit)
+            if replay and number < self.units.since[item.unit]:
+                return 0
+            self._touched([item.unit], number)
             unit.act(number, item.action, out)
-        else:
-            unit.take(number, item.times, item.rows, out)
-        return True
+            return 1
+        own, done = np.unique(item.unit), None
+        if replay:
+            for one in own.tolist():
+                self.units.get(one)
+            since = np.array([self.units.since[one] for one in own.tolist()])
+            done = number + np.arange(item.length) < since[np.searchsorted(own, item.unit)]
+            own = np.unique(item.unit[~done])
+        self._touched(own.tolist(), number)
+        self.units.sections[item.section].process(number, item, out, done)
+        return item.length - (0 if done is None else int(done.sum()))
+
+    def _touched(self, units: list[int], number: int) -> None:
+        """Note that the states of units changed from a number on."""
+        since = number, time.monotonic()
+        for unit in units:
+            self._dirty.setdefault(unit, since)
 
     def run(self) -> None:
         """Work until `stop`."""
         while not self._stop.is_set():
+            begun = time.monotonic()
             self.step(IDLE)
+            self._stop.wait(begun + PACE - time.monotonic())
         if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
@@ -136,24 +156,16 @@ class Engine:
 
     def _admit(self, arrived: Arrived) -> list[Item]:
         """The entries of the next group."""
-        items = []
-        refused = self.units.refused
         for source, batch in arrived.batches:
-            refused["unreadable"] += batch.refused
-            for samples in batch.samples:
-                found = self.units.of_topic(samples.topic, self._pending, self.next)
-                if not found:
-                    refused["no unit for the topic"] += samples.length
-                for number in found:
-                    times, rows = self.units.admitted(self.units.get(number), samples)
-                    if rows:
-                        items.append(Item(number, times, rows))
+            self.units.refused["unreadable"] += batch.refused
             if batch.position is not None:
                 self._pending.positions[f"source:{source}"] = batch.position
+        messages = (samples for _, batch in arrived.batches for samples in batch.samples)
+        items: list[Item] = [*self.units.admitted(messages, self._pending, self.next)]
         for action in arrived.actions:
             unit = self.units.names.get(action.unit)
             if unit is not None:
-                items.append(Item(unit, None, [], action.what))
+                items.append(Act(unit, action.what))
         return items
 
     def _process(self, first: int, items: list[Item], now: float) -> int:
@@ -163,17 +175,13 @@ class Engine:
             self._apply(number, item, out)
             number += item.length
         self._pending.add_results(first, out.results, out.events, now)
-        self._flush_blocks(items)
+        self._pending.blocks += out.blocks
         for unit in out.to_calibrate:
             self._ask_for_limits(self.units.get(unit))
-        self.samples += len(out.results)
+        self.samples += sum(len(one.number) for one in out.results)
         for _, unit, _, kind, detail in out.events:
             log.info(kind, extra={"unit": self.units.get(unit).name, "detail": detail})
         return number - first
-
-    def _flush_blocks(self, items: list[Item]) -> None:
-        for unit in {item.unit for item in items}:
-            self._pending.blocks += self.units.get(unit).blocks.flush()
 
     def _ask_for_limits(self, unit: Unit) -> None:
         """Find the limits of a unit's alarms in another thread; they come back as an action in the journal."""
@@ -195,6 +203,8 @@ class Engine:
     def _store_states(self, everything: bool = False) -> None:
         """Add the states that have been waiting longest to the next transaction."""
         begin, now = time.perf_counter(), time.monotonic()
+        if self._dirty:
+            self.units.note_programs(self._pending)
         while self._dirty and (everything or time.perf_counter() - begin < BUDGET):
             number, (_, since) = next(iter(self._dirty.items()))
             if not everything and now - since < self.config.service.snapshot:
@@ -204,7 +214,7 @@ class Engine:
             # the state contains every sample that was processed, which is all before the present group
             upto = self._pending.log[0] if self._pending.log is not None else self.next
             self._pending.snapshots.append((number, upto, unit.state()))
-            self._pending.blocks += unit.blocks.flush(all_of_it=True)
+            self._pending.blocks += self.units.sections[unit.streams.index].blocks.flush(unit.place, number)
         upto = self._pending.log[0] if self._pending.log is not None else self.next
         needed = next(iter(self._dirty.values()))[0] if self._dirty else upto
         if self._pending:

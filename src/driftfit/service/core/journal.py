@@ -1,7 +1,8 @@
 """The journal: one SQLite database in which samples, states, results and positions of sources change together.
 
-    log        what came in, in groups: numbered samples and operator's actions, in MessagePack
+    log        what came in, in groups: numbered samples in columns, and operator's actions
     unit       number, name, section and topic of every unit
+    program    models and trackers that states were made with, by the fingerprint of the states
     snapshot   the last stored state of a unit, and the number up to which it knows the samples
     result     what the trackers said, in the order in which they said it; sinks and the page read from here
     block      the results of one unit in pieces, with least, largest and mean of every column, for the page
@@ -21,8 +22,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
-from driftfit.service.sinks.contract import Event, Outcome, Result
+from driftfit.engine.kernel import Array
+from driftfit.service.core.results import Results
+from driftfit.service.sinks.contract import Event, Outcome
 
 SCHEMA = """
 create table if not exists meta (key text primary key, value text);
@@ -30,6 +34,7 @@ create table if not exists unit (id integer primary key, name text unique, secti
     about text);
 create table if not exists log (first integer primary key, count integer, at real, items blob);
 create table if not exists result (first integer primary key, count integer, at real, rows blob);
+create table if not exists program (tag blob primary key, about text);
 create table if not exists snapshot (unit integer primary key, number integer, state blob);
 create table if not exists block (unit integer, first integer, last integer, start real, stop real, count integer,
     rows blob, extremes blob, primary key (unit, first)) without rowid;
@@ -38,31 +43,62 @@ create table if not exists event (id integer primary key, number integer, unit i
 create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
-FORMAT = "1"
-RESULTS_FROM, NEEDED_FROM = "told", "floor"
-"""Keys of ``meta``, as format 1 has them: of `Journal.first_without_results` and `Journal.first_needed`."""
+FORMAT = "2"
+RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
+"""Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
 NAME = "driftfit.db"
 
 
-class Item(NamedTuple):
-    """One entry of a group: samples of a unit, or an action."""
+class Rows(NamedTuple):
+    """One entry of a group: samples of the units of a section, sorted by unit and time."""
 
-    unit: int
-    times: list[float] | None
-    rows: list[list[float]]
-    """y, u_1 .. u_m of each sample, NaN where missing."""
-    action: dict[str, Any] | None = None
-    """An action of an operator, or of the service itself; then there are no rows."""
+    section: int
+    unit: Array
+    """(N,): the number of each sample's unit."""
+    time: Array | None
+    """(N,), in seconds."""
+    values: Array
+    """(N, 1 + m): y, u_1 .. u_m, NaN where missing."""
 
     @property
     def length(self) -> int:
         """How many sample numbers of the journal the entry uses."""
-        return 1 if self.action is not None else len(self.rows)
+        return len(self.unit)
+
+    def some(self, which: Array) -> Rows:
+        """Some of the samples."""
+        time = None if self.time is None else self.time[which]
+        return Rows(self.section, self.unit[which], time, self.values[which])
+
+    def plain(self) -> list[Any]:
+        """The columns as bytes."""
+        time = None if self.time is None else self.time.tobytes()
+        return [self.section, self.unit.tobytes(), time, self.values.tobytes()]
+
+    @classmethod
+    def of(cls, section: int, unit: bytes, time: bytes | None, values: bytes) -> Rows:
+        """The inverse of `plain`."""
+        units = np.frombuffer(unit, np.int32)
+        times = None if time is None else np.frombuffer(time)
+        return cls(section, units, times, np.frombuffer(values).reshape(len(units), -1))
 
 
-_ITEMS = msgspec.msgpack.Decoder(list[tuple[int, list[float] | None, list[list[float]], dict[str, Any] | None]])
+class Act(NamedTuple):
+    """One entry of a group: an action on a unit, by an operator or by the service itself."""
+
+    unit: int
+    action: dict[str, Any]
+    length: int = 1
+
+    def plain(self) -> list[Any]:
+        """As numbers, texts and so on."""
+        return [self.unit, self.action]
+
+
+Item = Rows | Act
+_decode = msgspec.msgpack.Decoder(list[list[Any]]).decode
 _encode = msgspec.msgpack.Encoder().encode
-_RESULTS = msgspec.msgpack.Decoder(tuple[list[list[Any]], list[list[Any]]])
+_RESULTS = msgspec.msgpack.Decoder(tuple[list[tuple[bytes, bytes, bytes, bytes]], list[list[Any]]])
 
 
 class Journal:
@@ -116,13 +152,14 @@ class Journal:
             "select first, items from log where first >= ? order by first limit 64", (first,)
         ).fetchall():
             for start, items in rows:
-                yield start, [Item(*one) for one in _ITEMS.decode(items)]
+                yield start, [Rows.of(*one) if len(one) == 4 else Act(*one) for one in _decode(items)]
             first = rows[-1][0] + 1
 
-    def outcomes(self, after: int, most: int = 64) -> list[tuple[int, list[list[Any]], list[list[Any]]]]:
-        """(number of the group, rows of results, rows of events) of groups after one, the units as numbers."""
-        found = self.db.execute("select first, rows from result where first > ? order by first limit ?", (after, most))
-        return [(first, *_RESULTS.decode(rows)) for first, rows in found.fetchall()]
+    def outcomes(self, after: int, most: int = 64) -> list[tuple[int, list[Results], list[list[Any]]]]:
+        """(number of the group, results, rows of events) of groups after one, the units as numbers."""
+        query = "select first, rows from result where first > ? order by first limit ?"
+        found = [(first, *_RESULTS.decode(rows)) for first, rows in self.db.execute(query, (after, most)).fetchall()]
+        return [(first, [Results.of(*one) for one in parts], events) for first, parts, events in found]
 
     def units(self, after: int = 0) -> list[tuple[int, str, int, str, int, str]]:
         """(number, name, section, topic, born, about) of the units with larger numbers."""
@@ -139,16 +176,22 @@ class Journal:
         rows: list[list[float]] = []
         for _, items in self.groups(1):
             for item in items:
-                if item.unit == unit and item.action is None:
-                    times += item.times or []
-                    rows += item.rows
+                if isinstance(item, Rows):
+                    own = item.some(np.flatnonzero(item.unit == unit))
+                    times += [] if own.time is None else own.time.tolist()
+                    rows += own.values.tolist()
         return times, rows
+
+    def programs(self) -> dict[bytes, str]:
+        """Models and trackers that states were made with, by the fingerprint of the states."""
+        return dict(self.db.execute("select tag, about from program").fetchall())
 
 
 class Pending:
     """The contents of the next transaction."""
 
     def __init__(self) -> None:
+        self.programs: list[tuple[bytes, str]] = []
         self.units: list[tuple[int, str, int, str, int, str]] = []
         self.log: tuple[int, int, float, bytes] | None = None
         self.results: list[tuple[int, int, float, bytes]] = []
@@ -165,13 +208,14 @@ class Pending:
     def add_group(self, first: int, items: list[Item], at: float) -> None:
         """The group that is to be journaled."""
         count = sum(item.length for item in items)
-        self.log = (first, count, at, _encode(items))
+        self.log = (first, count, at, _encode([item.plain() for item in items]))
         self.meta["next"] = str(first + count)
 
-    def add_results(self, first: int, rows: list[list[Any]], events: list[list[Any]], at: float) -> None:
+    def add_results(self, first: int, parts: list[Results], events: list[list[Any]], at: float) -> None:
         """The results of a group."""
-        if rows or events:
-            self.results.append((first, len(rows), at, _encode((rows, events))))
+        if parts or events:
+            count = sum(len(one.number) for one in parts)
+            self.results.append((first, count, at, _encode(([one.plain() for one in parts], events))))
             self.events += [(n, unit, when, kind, _json(detail)) for n, unit, when, kind, detail in events]
         self.meta[RESULTS_FROM] = str(first + 1)
 
@@ -180,6 +224,7 @@ class Pending:
         db.execute("begin immediate")
         try:
             put = db.executemany
+            put("insert or ignore into program values (?, ?)", self.programs)
             put("insert into unit values (?, ?, ?, ?, ?, ?)", self.units)
             if self.log is not None:
                 db.execute("insert into log values (?, ?, ?, ?)", self.log)
@@ -217,15 +262,11 @@ class Names:
             self.names[number] = name
             self.about[name] = msgspec.json.decode(about) | {"topic": topic, "section": section, "number": number}
 
-    def outcome(self, group: int, rows: Iterable[list[Any]], events: Iterable[list[Any]]) -> Outcome:
-        """Stored rows as a batch for a sink."""
-        rows, events = list(rows), list(events)
-        if any(row[1] not in self.names for row in (*rows, *events)):
+    def outcome(self, group: int, parts: list[Results], events: Iterable[list[Any]]) -> Outcome:
+        """Stored results as a batch for a sink."""
+        events = list(events)
+        units = {unit for one in parts for unit in np.unique(one.unit).tolist()} | {row[1] for row in events}
+        if not units <= self.names.keys():
             self.read()
-        names = self.names
-        return Outcome(
-            group,
-            [Result(row[0], names[row[1]], *row[2:]) for row in rows],
-            [Event(row[0], names[row[1]], *row[2:]) for row in events],
-            self.about,
-        )
+        named = [Event(row[0], self.names[row[1]], *row[2:]) for row in events]
+        return Outcome(group, parts, named, self.names, self.about)

@@ -1,195 +1,108 @@
-"""One unit: a stream, its late samples, limits, alarms, and its history for the page.
+"""One unit: what is seldom used of it; its stream is a row of the arrays of `driftfit.service.core.streams`.
 
 Everything that changes the state comes from the journal in one order, so that the journal alone determines it: samples,
-and actions (hold, reset, new limits, the rule of an alarm). Samples with times wait until the newest time is
-``hold_back`` after them, and are then processed in the order of their times. With W the newest time minus hold_back
-
-    time <= W          late: counted, and not journaled (`admit`)
-    time among those that wait    duplicate: likewise
-    otherwise          journaled; processed once time <= W
-
-so the states are those of `track` on the journal's rows, bit for bit.
+and actions (hold, reset, new limits, the rule of an alarm).
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 import time as wall
-import zlib
 from array import array
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from driftfit.data.storage import rebuild
+from driftfit.engine.kernel import Array
+from driftfit.run.live.alarm import LiveAlarm
 from driftfit.run.live.rule import AlarmRule
-from driftfit.service.core.blocks import Blocks
+from driftfit.service.core.streams import Streams
 from driftfit.service.settings.config import UnitSettings, valid_range
 from driftfit.streams import Live
 
-AHEAD = 86_400.0
-"""A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
-sample late."""
-
-MANY = 16
-"""Samples from which on one call of the stream is faster than one for each of them."""
-
-Sample = tuple[float | None, int, list[float]]
-"""(time, number in the journal, y and u)."""
-
 
 class Unit:
-    """A unit of the service."""
+    """A unit of the service, at a place of its streams."""
 
-    def __init__(self, number: int, name: str, settings: UnitSettings) -> None:
-        self.number, self.name, self.settings = number, name, settings
-        self.live: Live | None = settings.live()
-        self.limits = [settings.limits.get(one, (-math.inf, math.inf)) for one in settings.columns]
-        self.newest = -math.inf
-        self.waiting: list[tuple[float, int, list[float]]] = []
-        self.counts: Counter[str] = Counter()
+    def __init__(self, number: int, name: str, streams: Streams, place: int) -> None:
+        self.number, self.name, self.streams, self.place = number, name, streams, place
+        self.rare: Counter[str] = Counter()
+        """How often something happened, other than samples that came and were used."""
         self.failure = ""
         self.acknowledged = True
         self.reference = array("d")
         """The first samples, from which the limits of alarms are found: time and row, one after the other."""
-        self.calibrated = settings.alarm is None
-        self.seen = 0
-        self.last: list[Any] | None = None
-        self.blocks = Blocks(number)
-        self._bind()
+        self.calibrated = self.settings.alarm is None
+        self.alarms: list[LiveAlarm] = []
+        self.alarmed = False
+        """Whether an alarm was on after the last sample."""
 
-    def _bind(self) -> None:
-        lane = {} if self.live is None else self.live.lane()
-        self._theta, self._var = lane.get("theta"), lane.get("var")
-        self._bounded = any(one != (-math.inf, math.inf) for one in self.limits)
+    @property
+    def settings(self) -> UnitSettings:
+        """Those of its streams."""
+        return self.streams.settings
 
-    def admit(self, times: list[float], rows: list[list[float]]) -> tuple[list[float], list[list[float]]]:
-        """The samples that may enter the journal; the others are counted."""
-        kept_times: list[float] = []
-        kept_rows: list[list[float]] = []
-        newest, wait = self.newest, self.settings.hold_back
-        known = {one[0] for one in self.waiting}
-        limit = max(wall.time(), newest) + AHEAD
-        for t, row in zip(times, rows, strict=True):
-            if not math.isfinite(t):
-                self.counts["no time"] += 1
-            elif t > limit:
-                self.counts["time in the future"] += 1
-            elif t in known:
-                self.counts["duplicate"] += 1
-            elif t <= newest - wait:
-                self.counts["duplicate" if t == newest else "late"] += 1
-            else:
-                newest = max(newest, t)
-                limit = max(limit, newest + AHEAD)
-                if wait:
-                    known.add(t)
-                kept_times.append(t)
-                kept_rows.append(row)
-        return kept_times, kept_rows
+    @property
+    def counts(self) -> Counter[str]:
+        """How often what happened."""
+        samples, used = self.streams.counted[self.place].tolist()
+        return Counter({name: count for name, count in (("samples", samples), ("used", used)) if count}) + self.rare
 
-    def take(self, first: int, times: list[float] | None, rows: list[list[float]], out: Out) -> None:
-        """Process samples of the journal."""
-        self.counts["samples"] += len(rows)
-        if self.failure:
-            return
-        try:
-            self._process(self._released(first, times, rows), out)
-        except Exception as error:  # whatever the error is, the other units continue
-            self.fail(first, error, out)
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Valid ranges by signal."""
+        return dict(zip(self.settings.columns, map(tuple, self.streams.limits[self.place].tolist()), strict=True))
+
+    @property
+    def live(self) -> Live:
+        """Its stream, as a copy."""
+        return self.streams.stream(self.place)
+
+    @property
+    def waiting(self) -> int:
+        """Samples that wait for late ones."""
+        return len(self.streams.waiting.of(self.place)[0])
 
     def fail(self, number: int, error: Exception, out: Out) -> None:
         """Stop this unit until an operator restarts it."""
         self.failure = f"{type(error).__name__}: {error}"[:500]
-        self.live = None
-        self.waiting.clear()
+        self.streams.clear(self.place)
         out.event(number, self.number, "failed", {"error": self.failure})
 
-    def _released(self, first: int, times: list[float] | None, rows: list[list[float]]) -> list[Sample]:
-        """The samples that are to be processed now, in their order."""
-        if times is None:
-            return [(None, first + k, row) for k, row in enumerate(rows)]
-        released: list[Sample] = []
-        for k, (t, row) in enumerate(zip(times, rows, strict=True)):
-            heapq.heappush(self.waiting, (t, first + k, row))
-            self.newest = max(self.newest, t)
-            while self.waiting and self.waiting[0][0] <= self.newest - self.settings.hold_back:
-                released.append(heapq.heappop(self.waiting))
-        return released
-
-    def _process(self, samples: list[Sample], out: Out) -> None:
-        """Update the stream, with many samples in one call, which gives the same bits in a tenth of the time."""
-        live = self.live
-        assert live is not None
-        if self._bounded:
-            samples = [(time, number, self._within(row)) for time, number, row in samples]
-        if len(samples) < MANY or live.alarms:
-            for sample in samples:
-                self._step(sample, out)
-            return
-        values = np.array([row for _, _, row in samples])
-        times = None if samples[0][0] is None else np.array([time for time, _, _ in samples])
-        found = live.update_many(values[:, 0], values[:, 1:], times)
-        columns = found.prediction, found.innovation, found.innovation_var, found.ok, found.theta, found.std
-        for sample, *results in zip(samples, *(column.tolist() for column in columns), strict=True):
-            self._tell(sample, results, False, out)
-
-    def _step(self, sample: Sample, out: Out) -> None:
-        """One sample."""
-        time, number, row = sample
-        live = self.live
-        assert live is not None
-        u: Any = row[1] if len(row) == 2 else row[1:]
-        step = live.update(row[0], u if len(row) > 1 else None, time=time)
-        on = False
-        for alarm in live.alarms:
-            if alarm.begun:
-                for onset in alarm.onsets():
-                    self.acknowledged = False
-                    detail = {"kind": alarm.rule.kind, "cause": onset.cause, "statistic": onset.statistic}
-                    out.event(number, self.number, "alarm", detail | {"limit": onset.limit, "time": time})
-            on = on or alarm.active
-        theta = self._theta.tolist() if self._theta is not None else []
-        std = [math.sqrt(v) if v >= 0.0 else math.nan for v in self._var.tolist()] if self._var is not None else []
-        self._tell(sample, [*step, theta, std], on, out)
-
-    def _tell(self, sample: Sample, results: list[Any], on: bool, out: Out) -> None:
-        """Pass on the results of a sample: y_hat, e, s, ok, theta, std, and whether an alarm is on."""
-        time, number, row = sample
-        self.counts["used"] += results[3]
-        if self.last is not None and self.last[10] and not on:
-            out.event(number, self.number, "over", {"time": time})
-        result = [number, self.number, time, row[0], *results, on]
-        self.last = result
-        self.seen += 1
-        self.blocks.add(result)
-        out.results.append(result)
-        if not self.calibrated:
-            self._remember(time, row, out)
-
-    def _within(self, row: list[float]) -> list[float]:
-        """A row without the values outside their ranges."""
-        found = list(row)
-        for k, (low, high) in enumerate(self.limits):
-            if row[k] < low or row[k] > high:
-                found[k] = math.nan
-                self.counts[f"{self.settings.columns[k]} outside its limits"] += 1
-        return found
-
-    def _remember(self, time: float | None, row: list[float], out: Out) -> None:
+    def remember(self, time: Array | None, rows: Array, out: Out) -> None:
         """Keep the samples of the reference; when they are complete, ask for the limits of the alarms."""
         alarm = self.settings.alarm
         assert alarm is not None
-        width = len(row) + 1
-        if len(self.reference) < alarm.reference * width:
-            self.reference.extend((math.nan if time is None else time, *row))
-            if len(self.reference) == alarm.reference * width:
+        width = rows.shape[1] + 1
+        missing = alarm.reference - len(self.reference) // width
+        if missing > 0:
+            first = np.full(len(rows), math.nan) if time is None else time
+            self.reference.frombytes(np.column_stack([first, rows])[:missing].tobytes())
+            if len(rows) >= missing:
                 out.to_calibrate.append(self.number)
 
-    def act(self, number: int, action: dict[str, Any], out: Out) -> None:
+    def watch(self, rows: Array, lane: int, noise: Array, time: Array | None, number: Array, out: Out) -> list[bool]:
+        """Judge results by its alarms; whether one is on after each sample."""
+        on = np.zeros(len(rows), bool)
+        for alarm in self.alarms:
+            before = alarm.samples
+            on |= np.array([cause is not None for cause in alarm.take_many(rows, lane, noise, time)])
+            for onset in alarm.onsets():
+                self.acknowledged = False
+                detail = {"kind": alarm.rule.kind, "cause": onset.cause, "statistic": onset.statistic}
+                place = int(number[onset.sample - before])
+                out.event(place, self.number, "alarm", detail | {"limit": onset.limit, "time": onset.time})
+        for t in np.flatnonzero(np.append(self.alarmed, on[:-1]) & ~on).tolist():
+            out.event(int(number[t]), self.number, "over", {"time": None if time is None else float(time[t])})
+        self.alarmed = bool(on[-1])
+        found: list[bool] = on.tolist()
+        return found
+
+    def act(self, number: int, action: Mapping[str, Any], out: Out) -> None:
         """Carry out an action of an operator, or of the service itself; problems become an event."""
         what = action["do"]
         detail: dict[str, Any] = {key: value for key, value in action.items() if key != "rules"}
@@ -199,90 +112,78 @@ class Unit:
             detail["refused"] = str(error)[:500]
         out.event(number, self.number, "calibrated" if what == "calibrated" else "action", detail)
 
-    def _act(self, what: str, action: dict[str, Any]) -> None:
+    def _act(self, what: str, action: Mapping[str, Any]) -> None:
+        streams, place = self.streams, self.place
         if what == "restart":
-            self.live, self.failure = self.settings.live(), ""
-            self.last, self.reference = None, array("d")
+            streams.clear(place)
+            self.failure, self.reference, self.alarms, self.alarmed = "", array("d"), [], False
             self.calibrated = self.settings.alarm is None
-            self.waiting.clear()
-            self._bind()
-            return
-        if what == "acknowledge":
+        elif what == "acknowledge":
             self.acknowledged = True
-            return
-        if what == "limits":
+        elif what == "limits":
             names = self.settings.columns
-            found = {name: valid_range(name, bounds, names) for name, bounds in action["limits"].items()}
-            self.limits = [found.get(name, old) for name, old in zip(names, self.limits, strict=True)]
-            self._bind()
-            return
-        if self.live is None:
+            for name, bounds in action["limits"].items():
+                streams.limits[place, names.index(name)] = valid_range(name, bounds, names)
+        elif self.failure:
             raise ValueError("the unit has failed; restart it.")
-        if what == "hold":
-            self.live.hold(bool(action["on"]))
+        elif what == "hold":
+            streams.held[place] = bool(action["on"])
         elif what == "reset":
-            self.live.reset(action.get("which"), p=action.get("p"), theta=action.get("theta"))
+            live = self.live
+            live.reset(action.get("which"), p=action.get("p"), theta=action.get("theta"))
+            streams.continue_from(place, live)
         elif what == "calibrated":
-            for rule in action["rules"]:
-                self.live.detect(rebuild(rule, AlarmRule), wait=0)
-            self.calibrated = True
-            self.reference = array("d")
+            rules = [rebuild(rule, AlarmRule) for rule in action["rules"]]
+            program = streams.program
+            self.alarms += [LiveAlarm(rule, program.tracker, program.names) for rule in rules]
+            self.calibrated, self.reference = True, array("d")
         else:
             raise ValueError(f"there is no action {what!r}.")
 
     def plain(self) -> dict[str, Any]:
         """The facts that the page shows besides the results."""
-        live = self.live
         return {
             "counts": dict(self.counts), "failure": self.failure, "acknowledged": self.acknowledged,
-            "calibrated": self.calibrated, "held": live is not None and live.held, "waiting": len(self.waiting),
-            "ignored": 0 if live is None else live.ignored,
-            "limits": {name: [None if math.isinf(v) else v for v in pair]
-                       for name, pair in zip(self.settings.columns, self.limits, strict=True)},
+            "calibrated": self.calibrated, "held": bool(self.streams.held[self.place]), "waiting": self.waiting,
+            "limits": {name: [None if math.isinf(v) else v for v in pair] for name, pair in self.limits.items()},
             "hypotheses": self._hypotheses(),
         }  # fmt: skip
 
     def _hypotheses(self) -> dict[str, float] | None:
         """Present probabilities of the events of a `Bank`; None for other trackers."""
-        if self.live is None or not self.live.tracker.weighs:
+        if self.failure or not self.streams.program.tracker.weighs:
             return None
         now = self.live.hypotheses
         return dict(zip(now.names, now.lag_prob[0].tolist(), strict=False))
 
     def state(self) -> bytes:
         """The state as bytes."""
-        live = b"" if self.live is None else zlib.compress(self.live.to_bytes(), 1)
-        kept = [live, self.newest, self.waiting, dict(self.counts), self.failure, self.acknowledged, self.calibrated,
-                self.reference.tobytes(), self.limits, self.last, self.seen]  # fmt: skip
+        alarms = [alarm.plain() for alarm in self.alarms]
+        kept = [self.streams.packed(self.place), dict(self.rare), self.failure, self.acknowledged, self.calibrated,
+                self.reference.tobytes(), alarms, self.alarmed]  # fmt: skip
         packed: bytes = msgspec.msgpack.encode(kept)
         return packed
 
-    @classmethod
-    def of(cls, number: int, name: str, settings: UnitSettings, state: bytes) -> Unit:
-        """The inverse of `state`."""
-        live, newest, waiting, counts, *rest = msgspec.msgpack.decode(state)
-        unit = cls.__new__(cls)
-        unit.number, unit.name, unit.settings = number, name, settings
-        unit.live = Live.from_bytes(zlib.decompress(live)) if live else None
-        unit.newest, unit.waiting = newest, [(t, n, row) for t, n, row in waiting]
-        unit.counts = Counter(counts)
-        unit.failure, unit.acknowledged, unit.calibrated, reference, limits, unit.last, unit.seen = rest
-        unit.reference = array("d")
-        unit.reference.frombytes(reference)
-        unit.limits = [(low, high) for low, high in limits]
-        unit.blocks = Blocks(number)
-        unit._bind()
-        return unit
+    def restore(self, state: bytes, programs: Mapping[bytes, str]) -> None:
+        """The inverse of `state`; ``programs`` describe what made states, by their fingerprint."""
+        packed, rare, *rest, reference, alarms, self.alarmed = msgspec.msgpack.decode(state)
+        self.failure, self.acknowledged, self.calibrated = rest
+        self.rare, self.reference = Counter(rare), array("d")
+        self.reference.frombytes(reference)
+        program = self.streams.program
+        self.alarms = [LiveAlarm.of(alarm, program.tracker, program.names) for alarm in alarms]
+        self.streams.unpack(self.place, packed, programs)
 
 
 class Out:
-    """Results and events of processing a group."""
+    """Results, events and blocks of the history that processing a group gives."""
 
     def __init__(self) -> None:
-        self.results: list[list[Any]] = []
+        self.results: list[Any] = []
         self.events: list[list[Any]] = []
+        self.blocks: list[tuple[Any, ...]] = []
         self.to_calibrate: list[int] = []
 
-    def event(self, number: int, unit: int, kind: str, detail: dict[str, Any]) -> None:
+    def event(self, number: int, unit: int, kind: str, detail: Mapping[str, Any]) -> None:
         """Note an event."""
         self.events.append([number, unit, wall.time(), kind, detail])

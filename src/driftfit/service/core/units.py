@@ -4,31 +4,79 @@ from __future__ import annotations
 
 import time
 from collections import Counter, OrderedDict
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
+import numpy as np
 
-from driftfit.service.core.journal import Journal, Pending
+from driftfit.engine.kernel import Array
+from driftfit.service.core.journal import Journal, Pending, Rows
+from driftfit.service.core.section import Section
 from driftfit.service.core.unit import Unit
 from driftfit.service.settings.config import UnitSettings
 from driftfit.service.settings.matching import valid_name
-from driftfit.service.sources.samples import Samples, number, seconds
+from driftfit.service.sources.samples import Samples, numbers_of, seconds_of
 
 ROUTES = 200_000
 """Topics whose units are remembered, including those that have none."""
+SAVED = 10.0
+"""Seconds over which the rate of a unit is averaged."""
+
+
+class Gathered:
+    """What arrived for a section in some messages: a list for each column, one message after the other."""
+
+    def __init__(self, settings: UnitSettings) -> None:
+        self.time, self.time_unit = settings.time, settings.time_unit
+        self.places: list[int] = []
+        self.lengths: list[int] = []
+        self.columns: dict[str, list[Any]] = {name: [] for name in settings.columns}
+        self.times: list[Any] = []
+
+    def add(self, place: int, samples: Samples) -> bool:
+        """Add a message; False if it has no signal of the section."""
+        given, count = samples.columns, samples.length
+        if self.columns.keys().isdisjoint(given):
+            return False
+        self.places.append(place)
+        self.lengths.append(count)
+        for name, column in self.columns.items():
+            _extend(column, given.get(name), count)
+        if self.time is not None:
+            _extend(self.times, given.get(self.time), count)
+        return True
+
+    def arrays(self) -> tuple[Array, Array | None, Array]:
+        """(places (N,), times (N,), values (N, 1 + m))."""
+        places = np.repeat(self.places, self.lengths)
+        values = np.column_stack([numbers_of(column) for column in self.columns.values()])
+        return places, None if self.time is None else seconds_of(self.times, self.time_unit), values
+
+
+def _extend(column: list[Any], cells: Any, count: int) -> None:
+    if isinstance(cells, list):
+        column += cells
+    elif count == 1:
+        column.append(cells)
+    else:
+        column += [cells] * count
 
 
 class Units:
     """All units, by number and by topic."""
 
     def __init__(self, settings: tuple[UnitSettings, ...], journal: Journal, most: int) -> None:
+        self.sections = [Section(k, one) for k, one in enumerate(settings)]
         self.settings, self.journal, self.most = settings, journal, most
         self.names: dict[str, int] = {}
         self.refused: Counter[str] = Counter()
         self._known: dict[int, tuple[str, int]] = {}
         self._units: dict[int, Unit] = {}
-        self._routes: OrderedDict[str, tuple[int, ...]] = OrderedDict()
-        self._tokens: dict[int, tuple[float, float]] = {}
+        self._routes: OrderedDict[str, tuple[Unit, ...]] = OrderedDict()
+        self._saved: list[tuple[Array, float]] = [(np.zeros(0), 0.0) for _ in settings]
+        """By section: samples that each unit may still send at once, and the time of that."""
+        self._programs = journal.programs()
         self.since: dict[int, int] = {}
         """Number up to which samples are in the state of a unit that was loaded."""
         for unit, name, section, _, born, _ in journal.units():
@@ -55,24 +103,24 @@ class Units:
         if found is None:
             name, section = self._known[unit]
             stored = self.journal.state(unit)
-            if stored is None:
-                found = Unit(unit, name, self.settings[section])
-            else:
+            found = self._units[unit] = self.sections[section].add(unit, name)
+            if stored is not None:
                 self.since[unit] = stored[0]
-                found = self._revived(unit, name, self.settings[section], stored[1])
-            self._units[unit] = found
+                try:
+                    found.restore(stored[1], self._programs)
+                except Exception as error:  # a state that cannot be read stops its unit, not the others
+                    found.failure = f"its state cannot be read: {error}"[:500]
         return found
 
-    def _revived(self, unit: int, name: str, settings: UnitSettings, state: bytes) -> Unit:
-        try:
-            return Unit.of(unit, name, settings, state)
-        except Exception as error:  # a state that cannot be read stops its unit, not the others
-            found = Unit(unit, name, settings)
-            found.failure, found.live = f"its state cannot be read: {error}"[:500], None
-            return found
+    def note_programs(self, pending: Pending) -> None:
+        """Add to the next transaction what the states of this process are made with."""
+        for tag, about in (one.streams.about() for one in self.sections):
+            if self._programs.get(tag) != about:
+                self._programs[tag] = about
+                pending.programs.append((tag, about))
 
-    def of_topic(self, topic: str, pending: Pending, born: int) -> tuple[int, ...]:
-        """Numbers of the units of a topic; new units are made."""
+    def of_topic(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
+        """The units of a topic; new ones are made."""
         route = self._routes.get(topic)
         if route is None:
             route = self._route(topic, pending, born)
@@ -81,7 +129,7 @@ class Units:
                 self._routes.popitem(last=False)
         return route
 
-    def _route(self, topic: str, pending: Pending, born: int) -> tuple[int, ...]:
+    def _route(self, topic: str, pending: Pending, born: int) -> tuple[Unit, ...]:
         if not valid_name(topic):
             return ()
         found = []
@@ -100,51 +148,55 @@ class Units:
             if self._known[unit][1] != section:
                 self.refused["two sections give one name"] += 1
                 continue
-            found.append(unit)
+            found.append(self.get(unit))
         return tuple(found)
 
     def _new(self, name: str, section: int, topic: str, pending: Pending, born: int) -> int:
         unit = next(reversed(self._known), 0) + 1
-        settings = self.settings[section]
-        made = Unit(unit, name, settings)
-        assert made.live is not None
-        about = {"names": made.live.names, "y": settings.y, "u": settings.u, "parts": settings.match.match(topic),
-                 "model": repr(settings.model), "tracker": repr(settings.tracker)}  # fmt: skip
+        made = self.sections[section].add(unit, name)
+        settings = made.settings
+        about = {"names": made.streams.program.names, "y": settings.y, "u": settings.u,
+                 "parts": settings.match.match(topic), "model": repr(settings.model),
+                 "tracker": repr(settings.tracker)}  # fmt: skip
         pending.units.append((unit, name, section, topic, born, msgspec.json.encode(about).decode()))
         self._known[unit], self.names[name], self._units[unit] = (name, section), unit, made
         self.since[unit] = born
         return unit
 
-    def admitted(self, unit: Unit, samples: Samples) -> tuple[list[float] | None, list[list[float]]]:
-        """The rows of a message that a unit takes; samples that it does not accept are counted."""
-        if not self._paid(unit, samples.length):
-            unit.counts["flood"] += samples.length
-            return None, []
-        settings, columns, count = unit.settings, samples.columns, samples.length
-        if not any(name in columns for name in settings.columns):
-            unit.counts["no signal"] += count
-            return None, []
-        rows = [
-            list(row) for row in zip(*(_numbers(columns.get(name), count) for name in settings.columns), strict=True)
-        ]
-        if settings.time is None:
-            return None, rows
-        cells = columns.get(settings.time)
-        cells = cells if isinstance(cells, list) else [cells] * count
-        return unit.admit([seconds(cell, settings.time_unit) for cell in cells], rows)
+    def admitted(self, messages: Iterable[Samples], pending: Pending, born: int) -> list[Rows]:
+        """The samples of messages that enter the journal; those that units do not accept are counted."""
+        gathered = [Gathered(one) for one in self.settings]
+        for samples in messages:
+            units = self.of_topic(samples.topic, pending, born)
+            if not units:
+                self.refused["no unit for the topic"] += samples.length
+            for unit in units:
+                if not gathered[unit.streams.index].add(unit.place, samples):
+                    unit.rare["no signal"] += samples.length
+        found = []
+        for section, one in zip(self.sections, gathered, strict=True):
+            if one.places:
+                places, times, values = one.arrays()
+                paid = np.repeat(self._paid(section, one), one.lengths)
+                times = None if times is None else times[paid]
+                found.append(section.admit(places[paid], times, values[paid]))
+        return [rows for rows in found if rows is not None]
 
-    def _paid(self, unit: Unit, count: int) -> bool:
-        """Whether a unit keeps to its rate, on average over ten seconds."""
-        now, rate = time.monotonic(), unit.settings.rate
-        left, then = self._tokens.get(unit.number, (10.0 * rate, now))
-        left = min(10.0 * rate, left + (now - then) * rate)
-        paid = left >= count
-        self._tokens[unit.number] = (left - count if paid else left, now)
+    def _paid(self, section: Section, one: Gathered) -> Array:
+        """Which messages are within the rate of their units, on average over `SAVED` seconds."""
+        rate, now = section.streams.settings.rate, time.monotonic()
+        saved, then = self._saved[section.streams.index]
+        most = np.full(section.streams.capacity, SAVED * rate)
+        most[: len(saved)] = np.minimum(SAVED * rate, saved + (now - then) * rate)
+        places, lengths = np.array(one.places), np.array(one.lengths)
+        left = most - np.bincount(places, lengths, len(most))
+        paid = np.ones(len(places), bool)
+        for k in np.flatnonzero(left[places] < 0.0).tolist():  # one message after the other, where a unit has too many
+            place, count = one.places[k], one.lengths[k]
+            paid[k] = most[place] >= count
+            if paid[k]:
+                most[place] -= count
+            else:
+                section.units[place].rare["flood"] += count
+        self._saved[section.streams.index] = np.where(left < 0.0, most, left), now
         return paid
-
-
-def _numbers(cells: Any, count: int) -> list[float]:
-    """A column of a message as numbers."""
-    if isinstance(cells, list):
-        return [cell if type(cell) is float else number(cell) for cell in cells]
-    return [number(cells)] * count

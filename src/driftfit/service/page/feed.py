@@ -15,6 +15,8 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from driftfit.service.control import packed
 from driftfit.service.core.journal import Journal, Names
 
@@ -71,15 +73,15 @@ class Feed:
         now = time.time()
         for _ in range(20):
             groups = self.journal.outcomes(self.at)
-            for group, rows, events in groups:
+            for group, parts, events in groups:
                 self.at = group
-                self.count += len(rows)
-                for row in rows:
-                    unit = row[1]
-                    self.latest[unit] = row
-                    self.seen[unit] = now
-                    if unit in self.watched:
-                        self.watched[unit][0].append(row)
+                self.count += sum(len(part.number) for part in parts)
+                for part in parts:
+                    for row in part.last().rows():
+                        self.latest[row[1]] = row
+                        self.seen[row[1]] = now
+                    for unit, (kept, _) in self.watched.items():
+                        kept.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
                 self.events.extend(events)
             if len(groups) < 64:
                 break
@@ -143,10 +145,10 @@ class Feed:
         rows: deque[list[Any]] = deque(maxlen=RECENT)
         end = self.at
         while at < end and (groups := self.journal.outcomes(at)):
-            for group, results, _ in groups:
+            for group, parts, _ in groups:
                 at = group
-                if group <= end:
-                    rows.extend(one for one in results if one[1] == unit)
+                for part in parts if group <= end else []:
+                    rows.extend(part.some(np.flatnonzero(part.unit == unit)).rows())
         self.watched[unit] = (rows, [time.monotonic()])
 
     async def ask(self, header: dict[str, Any], body: bytes = b"") -> dict[str, Any]:

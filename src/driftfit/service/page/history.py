@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from driftfit.engine.kernel import Array
-from driftfit.service.core.blocks import FIXED, columns_of, extremes_of
+from driftfit.service.core.blocks import FIXED, extremes_of
 from driftfit.service.core.journal import Journal
 
 MOST_ROWS = 2_000_000
@@ -72,6 +72,14 @@ def latest(journal: Journal, unit: int, recent: list[list[Any]], blocks: int = 1
     tail = [row for row in recent if row[0] > end]
     parts += [columns_of(tail)] if tail else []
     return np.vstack(parts) if parts else np.zeros((0, 0))
+
+
+def columns_of(rows: list[list[Any]]) -> Array:
+    """Results as an array (count, 5 + 2 n); where samples have no times their numbers are used."""
+    values = np.array([[_time(row), *row[3:7], *row[8], *row[9]] for row in rows])
+    with np.errstate(invalid="ignore"):
+        values[:, 4] = np.sqrt(values[:, 4])
+    return values
 
 
 def _count(journal: Journal, unit: int, start: float, stop: float) -> int:

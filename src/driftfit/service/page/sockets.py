@@ -13,9 +13,8 @@ from typing import Any
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from driftfit.service.core.blocks import columns_of
 from driftfit.service.page.feed import Feed
-from driftfit.service.page.history import latest
+from driftfit.service.page.history import columns_of, latest
 
 EVERY = 0.4
 """Seconds between two messages."""

@@ -13,9 +13,12 @@ results that it already has. An exception means that the sink is away; the batch
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
+
+from driftfit.service.core.results import Results
 
 
 class Result(NamedTuple):
@@ -50,15 +53,37 @@ class Event(NamedTuple):
     detail: Mapping[str, Any]
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True)
+class Outcome:
     """A batch for a sink."""
 
     group: int
     """Number of the first group in it; a batch that comes again begins with the same group."""
-    results: list[Result]
+    parts: Sequence[Results]
+    """The results in columns, for sinks that take columns."""
     events: list[Event]
+    names: Mapping[int, str]
+    """Names of the units by their numbers in ``parts``."""
     about: Mapping[str, Mapping[str, Any]]
     """By unit: names of parameters, y and u, topic and the parts that its pattern matched."""
+
+    def __len__(self) -> int:
+        """How many results there are."""
+        return sum(len(one.number) for one in self.parts)
+
+    @cached_property
+    def results(self) -> list[Result]:
+        """The results one by one."""
+        return self._listed(self.parts)
+
+    @cached_property
+    def last(self) -> list[Result]:
+        """The last result of each unit."""
+        found = {one.unit: one for part in self.parts for one in self._listed([part.last()])}
+        return list(found.values())
+
+    def _listed(self, parts: Sequence[Results]) -> list[Result]:
+        return [Result(row[0], self.names[row[1]], *row[2:]) for one in parts for row in one.rows()]
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class _Kafka(Writer):
 
     def write(self, batch: Outcome) -> None:
         """Send, and wait until the cluster has it."""
-        units = [one.unit for one in (batch.results if self.options.every_result else _last(batch))]
+        units = [one.unit for one in (batch.results if self.options.every_result else batch.last)]
         keys = [*units, *(one.unit for one in batch.events)]
         for key, (topic, body) in zip(keys, messages(self.options, batch), strict=True):
             event = topic.endswith("/event")
@@ -58,7 +58,3 @@ class _Kafka(Writer):
     def _delivered(self, error: Any, message: Any) -> None:
         if error is not None:
             self.failed.append(str(error))
-
-
-def _last(batch: Outcome) -> list[Any]:
-    return list({one.unit: one for one in batch.results}.values())

@@ -80,8 +80,7 @@ class _Mqtt(Writer):
 
 def messages(options: Any, batch: Outcome) -> Iterator[tuple[str, bytes]]:
     """(topic, payload) of a batch."""
-    results = batch.results if options.every_result else {one.unit: one for one in batch.results}.values()
-    for one in results:
+    for one in batch.results if options.every_result else batch.last:
         plain = {key: _finite(value) for key, value in one._asdict().items()}
         plain |= {"theta": by_name(batch, one.unit, one.theta), "std": by_name(batch, one.unit, one.std)}
         yield topic_of(options.topic, batch, one.unit), msgspec.json.encode(plain)

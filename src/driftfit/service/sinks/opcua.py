@@ -62,7 +62,7 @@ class _Opcua(Writer):
         self._call(self._write(batch))
 
     async def _write(self, batch: Outcome) -> None:
-        for one in {result.unit: result for result in batch.results}.values():
+        for one in batch.last:
             for name, value in _values(one, batch.about[one.unit]["names"]):
                 variable = self.variables.get((one.unit, name))
                 if variable is None:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import polars as pl
 
+from driftfit.service.core.results import ALARM, OK, Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
 TYPES: dict[str, Any] = {
@@ -47,11 +48,20 @@ class _Parquet(Writer):
 
     def write(self, batch: Outcome) -> None:
         """One file, complete or not at all."""
-        if not batch.results:
+        if not len(batch):
             return
         target = self.folder / f"results-{batch.group:016d}.parquet"
         partial = target.with_suffix(".part")
-        pl.DataFrame(batch.results, schema=TYPES, orient="row").write_parquet(partial)
+        pl.concat([table_of(batch, part) for part in batch.parts]).write_parquet(partial)
         with open(partial, "rb") as handle:
             os.fsync(handle.fileno())
         partial.replace(target)
+
+
+def table_of(batch: Outcome, part: Results) -> pl.DataFrame:
+    """Results as a table."""
+    columns = {name: part.values[:, k] for k, name in enumerate(("time", "y", "y_hat", "e", "s"))}
+    given = {"number": part.number, "unit": [batch.names[k] for k in part.unit.tolist()], **columns}
+    given |= {"ok": (part.flags & OK) > 0, "alarm": (part.flags & ALARM) > 0}
+    given |= {"theta": part.theta.tolist(), "std": part.std.tolist()}
+    return pl.DataFrame(given, schema_overrides=TYPES).with_columns(pl.col("time").fill_nan(None)).select(*TYPES)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
+from driftfit.service.core.results import OK, THETA, Results
 from driftfit.service.sinks.contract import Outcome, Sink, Writer
 
 SCHEMA = """
@@ -15,6 +19,8 @@ create table if not exists result (number integer, unit text, time real, y real,
 create table if not exists event (number integer, unit text, at real, kind text, detail text,
     primary key (number, unit, kind)) without rowid;
 """
+
+RESULT = "insert or ignore into result values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 
 
 @dataclass(frozen=True)
@@ -38,9 +44,8 @@ class _Sqlite(Writer):
         """All of the batch, or nothing."""
         self.db.execute("begin immediate")
         try:
-            rows = [(r.number, r.unit, r.time, r.y, r.y_hat, r.e, r.s, r.ok, r.alarm,
-                     named(batch, r.unit, r.theta), named(batch, r.unit, r.std)) for r in batch.results]  # fmt: skip
-            self.db.executemany("insert or ignore into result values (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
+            for part in batch.parts:
+                self.db.executemany(RESULT, rows_of(batch, part))
             events = [(e.number, e.unit, e.at, e.kind, json.dumps(dict(e.detail))) for e in batch.events]
             self.db.executemany("insert or ignore into event values (?, ?, ?, ?, ?)", events)
             self.db.execute("commit")
@@ -53,9 +58,15 @@ class _Sqlite(Writer):
         self.db.close()
 
 
-def named(batch: Outcome, unit: str, values: list[float]) -> str:
-    """Parameters by name, as JSON; null where they are not finite."""
-    return json.dumps(by_name(batch, unit, values))
+def rows_of(batch: Outcome, part: Results) -> Iterator[tuple[Any, ...]]:
+    """Rows of the table ``result``; SQLite stores NaN as NULL."""
+    number, unit, flags, values = (column.tolist() for column in part)
+    encode, n = msgspec.json.Encoder().encode, part.n
+    for k, row in enumerate(values):
+        name = batch.names[unit[k]]
+        names = batch.about[name]["names"]
+        theta, std = (encode(dict(zip(names, row[a : a + n], strict=False))).decode() for a in (THETA, THETA + n))
+        yield (number[k], name, *row[:THETA], flags[k] & OK, flags[k] >> 1, theta, std)
 
 
 def by_name(batch: Outcome, unit: str, values: list[float]) -> dict[str, Any]:

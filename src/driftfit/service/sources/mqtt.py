@@ -15,11 +15,15 @@ from urllib.parse import urlsplit
 from driftfit.service.settings.options import Secret
 from driftfit.service.sources.contract import Reader, Source
 from driftfit.service.sources.samples import LARGEST, Batch, Samples, decode
+from driftfit.service.sources.sparkplug import REBIRTH, Sparkplug, UnknownAliasError, rebirth_topic
 
 MOST = 2_000
 """Messages of one batch."""
 AWAY = 20.0
 """Seconds without a connection after which the source is reported to be away."""
+
+PATIENCE = 30.0
+"""Seconds between two commands to a node to declare its metrics again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,12 +51,16 @@ class Mqtt(Broker, Source):
 
     topic: str
     """Filter with the wildcards + and #; several are separated by spaces."""
+    payload: str = "json"
+    """json, or sparkplug for the messages of Sparkplug B (`driftfit.service.sources.sparkplug`)."""
 
     def check(self) -> None:
-        """The address, the client library, and a level at which the broker waits for acknowledgements or does not."""
+        """The address, the client library, the payload, and a level of acknowledgement that is read."""
         super().check()
         if self.qos not in (0, 1):
             raise ValueError(f"mqtt: qos must be 0 or 1; got {self.qos}.")
+        if self.payload not in ("json", "sparkplug"):
+            raise ValueError(f"mqtt: payload must be json or sparkplug; got {self.payload!r}.")
 
     def open(self, position: Any) -> Reader:
         """Connect; the broker keeps the position."""
@@ -65,6 +73,9 @@ class _Mqtt(Reader):
 
         mqtt = paho()
         self.options = options
+        self.sparkplug = Sparkplug() if options.payload == "sparkplug" else None
+        self.asked: dict[str, float] = {}
+        """When nodes were last asked to declare their metrics again."""
         self.messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
         name = options.client or f"driftfit-{options.name}"
         self.client = mqtt.Client(CallbackAPIVersion.VERSION2, name, clean_session=False, manual_ack=True)
@@ -99,10 +110,24 @@ class _Mqtt(Reader):
             try:
                 if len(message.payload) > LARGEST:
                     raise ValueError
-                samples.append(decode(message.topic, message.payload))
+                read = self._decode(message.topic, message.payload)
+                samples += [] if read is None else [read]
             except ValueError:  # it is counted, and acknowledged like any other: sent again it would not be better
                 refused += 1
         return Batch(samples, lambda: self._acknowledge(found), refused=refused, arrived=arrived)
+
+    def _decode(self, topic: str, payload: bytes) -> Samples | None:
+        """The samples of a message; None if it has none."""
+        if self.sparkplug is None:
+            return decode(topic, payload)
+        try:
+            return self.sparkplug.decode(topic, payload)
+        except UnknownAliasError:  # the birth was before this process
+            command, now = rebirth_topic(topic), time.monotonic()
+            if now - self.asked.get(command, -PATIENCE) >= PATIENCE:
+                self.asked[command] = now
+                self.client.publish(command, REBIRTH)
+            raise
 
     def _acknowledge(self, messages: list[Any]) -> None:
         for message in messages:

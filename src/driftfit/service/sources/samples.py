@@ -17,6 +17,9 @@ from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+
+from driftfit.engine.kernel import Array
 
 MOST_SAMPLES = 10_000
 """Samples of one message."""
@@ -67,7 +70,7 @@ def decode(topic: str, payload: bytes | str) -> Samples:
     lengths = {len(value) for value in data.values() if isinstance(value, list)}
     if len(lengths) > 1:
         raise ValueError("lists of different lengths; one number per sample in each.")
-    return Samples(topic, _bounded(lengths.pop() if lengths else 1), data)
+    return Samples(topic, bounded(lengths.pop() if lengths else 1), data)
 
 
 def _with_nan(payload: bytes | str) -> Any:
@@ -85,11 +88,12 @@ def _of_rows(topic: str, rows: list[dict[str, Cell]]) -> Samples:
     names = {name for row in rows[:MOST_SAMPLES] for name in row}
     if len(names) > MOST_FIELDS:
         raise ValueError(f"{len(names)} fields; at most {MOST_FIELDS} are read.")
-    count = _bounded(len(rows))
+    count = bounded(len(rows))
     return Samples(topic, count, {name: [row.get(name) for row in rows] for name in names})
 
 
-def _bounded(count: int) -> int:
+def bounded(count: int) -> int:
+    """A number of samples that one message may have; ValueError for another."""
     if not 0 < count <= MOST_SAMPLES:
         raise ValueError(f"{count} samples in one message; 1 to {MOST_SAMPLES} are read.")
     return count
@@ -116,3 +120,18 @@ def seconds(cell: Any, scale: float) -> float:
             return number(cell) * scale
         return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
     return number(cell) * scale
+
+
+def numbers_of(cells: list[Any]) -> Array:
+    """Cells as numbers, as `number` gives them."""
+    try:
+        return np.array(cells, float)
+    except (TypeError, ValueError, OverflowError):
+        return np.array([number(cell) for cell in cells])
+
+
+def seconds_of(cells: list[Any], scale: float) -> Array:
+    """Times as seconds, as `seconds` gives them."""
+    if str in set(map(type, cells)):
+        return np.array([seconds(cell, scale) for cell in cells])
+    return numbers_of(cells) * scale

@@ -1,1 +1,1 @@
-"""Parts of the exact smoother: the problem, elimination, two filters that meet, rank."""
+"""Parts of the exact smoother: the problem, elimination from both ends, two filters that meet, rank."""

@@ -12,6 +12,13 @@ by the likelihood L of the record, which integrates theta out (`driftfit.smooth.
 
     q = sum_k p_k q_k,    p_k proportional to L_k exp(-penalty_k)
 
+The smoother is applied to this q, and its variances grow by what the paths theta_k of the single drifts differ from its
+path theta,
+
+    sum_k p_k (theta_k - theta) (theta_k - theta)'
+
+since a slow walk can look as if nothing moved, and the band of a constant would be too narrow.
+
 q_t as estimated was fitted to the record, and its likelihood is too large by an amount that grows with the record; the
 penalty, PRICE + T / SHARE, was found in simulations of constant drift. A record with jumps of several standard
 deviations exceeds it many times.
@@ -26,14 +33,17 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.smooth.parts.elimination import smooth_and_weigh
+from driftfit.smooth.parts.rank import column_scale
 from driftfit.smooth.parts.walk import Walk
 
 JUMP = 10.0
 """q_t above this many times the mean of the others is a jump."""
-SCALES = (1.0 / 9.0, 1.0 / 3.0, 1.0, 3.0)
+SCALES = (1.0 / 3.0, 1.0, 3.0, 9.0)
 PRICE, SHARE = 5.0, 200.0
 """Penalty of the drift as estimated: PRICE + T / SHARE in units of the log-likelihood."""
 ROUNDS = 20
+LEAST = 1e-3
+"""Drifts with a smaller probability do not count in the variances."""
 
 
 def pooled(rate: Array) -> Array:
@@ -52,20 +62,25 @@ def pooled(rate: Array) -> Array:
 
 
 def average_drift(walk: Walk, time: Array) -> Walk:
-    """The walk with the average of the drifts, where ``time`` (T,) are the intervals of drift before each sample.
+    """The walk with the average of the drifts, where ``time`` (T,) are the intervals of drift before each sample, and
+    with the paths of the single drifts.
 
     It is returned unchanged if the likelihood cannot be computed accurately.
     """
     q, span = walk.drift_root**2, time[:, None]
     rate = np.divide(q, span, out=np.zeros_like(q), where=span > 0.0)
     shapes = ((q, PRICE + len(q) / SHARE), (pooled(rate) * span, 0.0))
-    log_p = np.full((len(shapes), len(SCALES)), -np.inf)
+    size = column_scale(walk.phi, walk.weight)
+    paths, log_p = [], np.full((len(shapes), len(SCALES)), -np.inf)
     for k, (one, price) in enumerate(shapes):
         for j, scale in enumerate(SCALES):
-            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)))
+            solved = smooth_and_weigh(walk._replace(drift_root=np.sqrt(scale * one)), size)
             if solved is None:
                 return walk
+            paths.append(solved[0].theta)
             log_p[k, j] = solved[1] - price
     p = np.exp(log_p - log_p.max())
-    share = (p / p.sum()) @ np.array(SCALES)
-    return walk._replace(drift_root=np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0]))
+    p /= p.sum()
+    share, which = p @ np.array(SCALES), np.flatnonzero(p >= LEAST)
+    root = np.sqrt(share[0] * shapes[0][0] + share[1] * shapes[1][0])
+    return walk._replace(drift_root=root, paths=np.stack([paths[k] for k in which]), belief=p.ravel()[which])

@@ -21,13 +21,15 @@ def column_scale(phi: Array, weight: Array) -> Array:
             count += 1
             for i in range(n):
                 top[i] = max(top[i], abs(phi[t, i]))
+    for i in range(n):
+        if top[i] > 0.0:
+            scale[i] = 2.0 ** -max(-1000.0, min(1000.0, np.floor(np.log2(top[i]))))  # exact in the products
     for t in range(T):
         if weight[t] > 0.0:
             for i in range(n):
-                squares[i] += (phi[t, i] / top[i]) ** 2 if top[i] > 0.0 else 0.0
+                squares[i] += (phi[t, i] * scale[i]) ** 2
     for i in range(n):
-        if top[i] > 0.0:
-            scale[i] = top[i] * np.sqrt(squares[i] / count)
+        scale[i] = np.sqrt(squares[i] / count) / scale[i] if top[i] > 0.0 else 1.0
     return scale
 
 

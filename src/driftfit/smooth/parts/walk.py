@@ -42,6 +42,10 @@ class Walk(NamedTuple):
     """(T, n): square roots of the factors of each parameter's drift before each sample; empty if there are none."""
     trend: Array = NONE
     """(T,): intervals of motion along a slope before each sample, if q is the drift of that slope; otherwise empty."""
+    paths: Array = NONE
+    """(K, T, n): paths under other drifts that are possible too; empty if the drift is known."""
+    belief: Array = NONE
+    """(K,): their probabilities."""
 
     @property
     def used(self) -> int:
@@ -125,6 +129,13 @@ def ordered(walk: Walk, by: Any) -> tuple[Walk, Array]:
     drift[:1] = 0.0 if walk.p0 is None else 1.0
     trend = drift.copy() if len(walk.trend) else NONE
     arranged = walk._replace(
-        phi=walk.phi[order], y=walk.y[order], weight=weight[order], drift=drift, drift_root=NONE, trend=trend
+        phi=walk.phi[order],
+        y=walk.y[order],
+        weight=weight[order],
+        drift=drift,
+        drift_root=NONE,
+        trend=trend,
+        paths=NONE,
+        belief=NONE,
     )
     return arranged, order

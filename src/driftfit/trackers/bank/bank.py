@@ -17,8 +17,8 @@ nominal sensor is None), q and p0 are in units of it, unless a ``guess`` of it i
 A sample that is not used changes no weight: the leaves are widened by the changes that may have happened, and depth
 counts used samples. Until there are four residuals (with known noise: full rank, or four samples without a new
 direction) only the first change acts. The tree then grows in the directions that the regressors span, and a later
-direction enters as the exact limit of a wide prior. A bank with changes that forget, with leaves that have their own
-output lags, or with form="sqrt" waits for full rank.
+direction enters as the exact limit of a wide prior. A bank with changes that reset or return to a prior, with leaves
+that have their own output lags, with `FirstFloor` or form="sqrt" waits for full rank.
 
 form="sqrt" keeps factors of the leaves' covariances (`driftfit.trackers.bank.leaves.square_root_form`): the same
 numbers for ordinary data, and no loss of digits or signs for collinear regressors with a wide prior; about twice the
@@ -216,8 +216,10 @@ class Bank(Tracker):
 
     def _frames(self, na: int) -> bool:
         """Whether it may run in the coordinates of its start (`driftfit.trackers.bank.machine.framed`)."""
-        walks = not any(one.forgets for one in self.all_changes)
-        return walks and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
+        anywhere = not any(one.reset or one.kind == "stabilised" for one in self.all_changes)
+        return (
+            anywhere and na == 0 and self.form == "covariance" and not isinstance(self.reduction, reductions.FirstFloor)
+        )
 
     @property
     def chained(self) -> bool:

@@ -13,13 +13,15 @@ export const make = (tag, text, parent, kind) => {
 export const ask = async (path, body) => {
   const options = body === undefined ? {} :
     { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } };
-  const answer = await fetch(path, options);
+  const answer = await fetch(path, options).catch(() => {
+    throw new Error("The service does not answer; the page tries again every few seconds.");
+  });
   if (answer.status === 401) location.href = "/login";
   const said = await answer.json();
   if (!answer.ok) throw new Error(said.error ?? `status ${answer.status}`);
   return said;
 };
-const short = (v) => (v === null || v === undefined ? "–" : Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3)
+const short = (v) => (v === null || v === undefined ? "–" : Number.isInteger(v) ? v.toLocaleString() : Math.abs(v) >= 1e5 || (v && Math.abs(v) < 1e-3)
   ? v.toExponential(2) : v.toPrecision(4));
 
 const state = { unit: null, range: "live", socket: null, samples: null, about: null, user: null, timer: 0 };
@@ -48,6 +50,7 @@ const connect = () => {
   socket.addEventListener("message", (event) => told(JSON.parse(event.data)));
   socket.addEventListener("close", () => {
     link("reconnecting", "bad");
+    at("numbers").textContent = "the service does not answer";
     setTimeout(connect, pause);
     pause = Math.min(2 * pause, 5000);
   });
@@ -202,6 +205,8 @@ const unit = (message) => {
   if (message.missing) { at("model").textContent = "There is no such unit."; return; }
   if (state.range === "live" && message.columns.length && state.about) charts.live(message.columns, state.about);
 };
+const plain = (v) => (typeof v === "number" ? short(v) : Array.isArray(v) ? v.map(plain).join(", ")
+  : v !== null && typeof v === "object" ? Object.entries(v).map(([k, one]) => `${k} ${plain(one)}`).join(", ") : v);
 const events = (found) => {
   const body = at("events").tBodies[0];
   body.replaceChildren();
@@ -213,8 +218,9 @@ const events = (found) => {
       `pill ${["alarm", "failed"].includes(one.kind) ? "bad" : ""}`);
     make("td", who ?? "", tr);
     delete rest.do; delete rest.time;
-    const text = Object.entries(rest).filter(([, v]) => v !== null && String(v) !== "")
-      .map(([k, v]) => `${k} ${typeof v === "number" ? short(v) : typeof v === "object" ? JSON.stringify(v) : v}`);
+    const text = one.kind === "alarm"
+      ? [`${rest.kind}: ${rest.cause} is ${short(rest.statistic)}, limit ${short(rest.limit)}`]
+      : Object.entries(rest).filter(([, v]) => v !== null && String(v) !== "").map(([k, v]) => `${k} ${plain(v)}`);
     make("td", [why, ...text].filter(Boolean).join(", "), tr);
   }
   if (!found.length) make("td", "None yet.", body.insertRow(), "quiet").colSpan = 4;

@@ -81,7 +81,7 @@ export class Charts {
     if (one.second) series.push({ label: one.second, stroke: second, width: one.line ? 1 : 1.2, points: { show: false }, value });
     const plot = new uPlot({
       ...this.size(part), series, bands: [{ series: [2, 1], fill: color("--band") }], scales: { x: { time: dates } },
-      axes: [axis, { ...axis, size: 62 }], cursor: { sync: { key: "unit" }, drag: { x: true, y: false } },
+      axes: [{ ...axis, space: 90 }, { ...axis, size: 62 }], cursor: { sync: { key: "unit" }, drag: { x: true, y: false } },
       legend: { live: true },
     }, one.data, part);
     return { plot, part };

@@ -1,14 +1,15 @@
 """A bank in the coordinates of its start: for offsets that a covariance cannot represent, and unknown directions.
 
 The compiled routine is given x and z in place of phi and theta (`driftfit.trackers.parts.coordinates`) and needs no
-other change: its updates of means and covariances hold in all coordinates, if all changes are random walks and no leaf
-has separate output lags. Change i then adds
+other change: its updates of means and covariances hold in all coordinates, if no change names a value of theta (a
+reset, stabilised forgetting) and no leaf has separate output lags. Change i then adds
 
     M (Q_i + diag(sizes_i r / c)) M'
 
-to a covariance. A regressor outside the span of the earlier ones determines column j of every leaf from its innovation;
-it changes no weight. The covariances of the gap and of the mixture are mapped in the same way: C_j. = -C x and C_jj =
-x' C x + v.
+to a covariance; exponential and directional forgetting are the same in z as in theta, and leave a direction without
+information as it is. A regressor outside the span of the earlier ones determines column j of every leaf from its
+innovation; it changes no weight. The covariances of the gap and of the mixture are mapped in the same way: C_j. = -C x
+and C_jj = x' C x + v.
 
 A bank runs this way if its start is not determined well enough for a covariance when the first residuals are available;
 other banks use phi and theta, at lower cost. Cost per sample: O(n^3) for each change.

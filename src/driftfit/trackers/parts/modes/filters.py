@@ -76,6 +76,11 @@ def project(s: State, l: int) -> None:
                 s.gain[i, k, l] += s.C[j, i, k, l] * s.x[j, l]
         for k in range(K):
             s.h[k, l] += s.x[i, l] * s.gain[i, k, l]
+    for i in range(n):
+        for k in range(K):  # below 0: an absurd sample left no digits of C, and no gain can be trusted
+            s.gain[i, k, l] = s.gain[i, k, l] if s.h[k, l] >= 0.0 else 0.0
+    for k in range(K):
+        s.h[k, l] = max(s.h[k, l], 0.0)
 
 
 @kernel

@@ -1,35 +1,19 @@
-"""Every option of every reduction of a bank, in compiled routines that check their array bounds.
+"""Banks drawn at random, whose arrays are apart in memory, with NaN in between.
 
-Compiled code does not check whether an index is within its array. Here it does: a separate process with its own cache
-compiles the routines with a check at every index, of scalars and of SIMD vectors, which records the line of a violation
-and continues. Arrays are moved apart in the memory of a bank, with NaN in between, so that an address beyond its array
-gives NaN, or is seen to have been written to. Banks are then drawn at random, with every reduction, kind of change,
-sensor, prior and form, one output and two, and with records that have outages, gaps in time, fault codes, repeated
-readings and regressors that begin late; and the tests of banks are run as well.
-Prints every violation with its line, and every bank that was not finite.
-
-Run: python benchmarks/bank_bounds.py [--quick] [--banks N] [--first N] [--tests FILE ..]
-
-Compiling both forms with checks takes some minutes and 4 GB. In pieces: ``--first 500 --banks 250 --tests none`` draws
-banks 500 to 749 and runs no tests; ``--banks 0`` runs the tests alone, all files tests/test_bank*.py or those named.
---quick uses one form and size, few banks and no tests. The exit status is 1 if anything was found.
+An address beyond its array gives NaN, or is seen to have been written to. Every reduction, kind of change, sensor,
+prior and form is drawn, one output and two, and records that have outages, gaps in time, fault codes, repeated readings
+and regressors that begin late.
 """
 
 from __future__ import annotations
 
-import argparse
-import ctypes
 import math
-import os
-import subprocess
-import sys
-import tempfile
 import warnings
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from lab.bounds.checks import Noted
 
 APART = 64
 """Entries between the arrays of a bank."""
@@ -39,54 +23,6 @@ def heavy(y: float, y_hat: float, h: float, r: float, last: float) -> tuple[floa
     """A sensor of one's own, with Laplacian noise."""
     width, far = 2.0 * math.sqrt(h + r), abs(y - y_hat)
     return -math.log(2.0 * width) - far / width, r * max(1.0, far / math.sqrt(r)), y_hat
-
-
-def watch() -> tuple[Any, list[str]]:
-    """Insert checks into all code compiled from now on; returns the array of violations, and the lines of checks."""
-    from llvmlite import ir
-    from numba.core import cgutils
-
-    from driftfit.engine import simd
-
-    noted, sites = (ctypes.c_int64 * 4096)(), []
-    i64 = ir.IntType(64)
-
-    def note(builder: Any, bad: Any, index: Any, size: Any) -> None:
-        place = len(sites)
-        sites.append(line())
-        with cgutils.if_unlikely(builder, bad):
-            first = builder.inttoptr(ir.Constant(i64, ctypes.addressof(noted)), i64.as_pointer())
-            at = 3 * min(place, len(noted) // 3 - 1)
-            for k, value in enumerate((ir.Constant(i64, 1), index, size)):
-                builder.store(value, builder.gep(first, [ir.Constant(i64, at + k)]))
-
-    def line() -> str:
-        frame = sys._getframe(2)
-        while frame is not None:
-            where = getattr(frame.f_locals.get("self"), "loc", None)
-            if where is not None and "driftfit" in str(where.filename):
-                return f"{Path(where.filename).name}:{where.line}"
-            frame = frame.f_back
-        return "?"
-
-    def checked(context: Any, builder: Any, index: Any, size: Any, axis: Any = None) -> None:
-        wide = builder.sext(index, i64) if index.type.width < 64 else index
-        bad = builder.icmp_unsigned(">=", wide, size)
-        note(builder, bad, wide, size)
-
-    def place(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
-        inside = context.make_array(kind)(context, builder, array)
-        rows, columns = (builder.extract_value(inside.shape, k) for k in (0, 1))
-        at = builder.add(builder.mul(row, columns), column)
-        size = builder.mul(rows, columns)
-        last = builder.add(at, ir.Constant(i64, simd.WIDTH - 1))
-        beyond = builder.or_(builder.icmp_signed("<", at, ir.Constant(i64, 0)), builder.icmp_signed(">=", last, size))
-        note(builder, beyond, last, size)
-        return builder.bitcast(builder.gep(inside.data, [at]), simd._VECTOR8.as_pointer())
-
-    cgutils.do_boundscheck = checked
-    simd._place = place
-    return noted, sites
 
 
 def move_apart() -> None:
@@ -126,16 +62,6 @@ def trespassed(lane: Any) -> list[str]:
         if name not in REPORTED and not np.isnan(lane["memory"][after : after + APART]).all():
             said.append(f"written beyond {name}")
     return said
-
-
-def found(noted: Any, sites: list[str]) -> list[str]:
-    """The violations since the last call."""
-    wrong = []
-    for k in range(min(len(sites), len(noted) // 3)):
-        if noted[3 * k]:
-            wrong.append(f"{sites[k]}: index {noted[3 * k + 1]} of {noted[3 * k + 2]}")
-            noted[3 * k] = 0
-    return wrong
 
 
 def drawn(rng: np.random.Generator, form: str, quick: bool) -> tuple[Any, Any, dict[str, Any]]:
@@ -234,12 +160,11 @@ def faults(run: Any) -> list[str]:
     return wrong if proper else [*wrong, "not probabilities"]
 
 
-def fuzz(seeds: range, quick: bool, noted: Any, sites: list[str]) -> int:
+def run_banks(seeds: range, quick: bool, noted: Noted) -> int:
     """Run the banks of these seeds; returns how many had a violation or wrong numbers."""
     from driftfit import track
 
     move_apart()
-
     bad = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -251,49 +176,10 @@ def fuzz(seeds: range, quick: bool, noted: Any, sites: list[str]) -> int:
         each = list(run.values()) if len(model.outputs) > 1 else [run]
         for one in each:
             one.hypotheses.found()
-        wrong = found(noted, sites) + [said for one in each for said in faults(one)]
+        wrong = noted.take() + [said for one in each for said in faults(one)]
         if wrong:
             bad += 1
             print(f"bank {seed}: {bank!r}\n    " + "\n    ".join(wrong), flush=True)
         if (seed + 1) % 10 == 0:
             print(f"banks {seeds[0]} to {seed}, {bad} at fault", flush=True)
     return bad
-
-
-def work(seeds: range, tests: Sequence[str], quick: bool) -> int:
-    """The work of the process with the checks."""
-    noted, sites = watch()
-    bad = 0
-    if seeds:
-        bad = fuzz(seeds, quick, noted, sites)
-        print(f"{len(seeds)} banks, {len(sites)} checks, {bad} banks at fault", flush=True)
-    if not tests:
-        return int(bad > 0)
-    import pytest
-
-    failed = pytest.main(["-q", "-n", "0", "-p", "no:cacheprovider", *tests])
-    wrong = found(noted, sites)
-    print(f"tests of banks: exit status {int(failed)}, {len(wrong)} places out of bounds", *wrong, sep="\n    ")
-    return int(bad > 0 or failed != 0 or bool(wrong))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--banks", type=int, help="how many banks are drawn; 0: none")
-    parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
-    parser.add_argument("--tests", nargs="+", help="files of tests, or none")
-    given = parser.parse_args()
-    banks = (60 if given.quick else 1000) if given.banks is None else given.banks
-    tests = [str(path) for path in sorted((Path(__file__).parents[1] / "tests").glob("test_bank*.py"))]
-    if given.tests is not None or given.quick:
-        tests = [name for name in given.tests or () if name != "none"]
-    if os.environ.get("NUMBA_BOUNDSCHECK") == "1":
-        sys.exit(work(range(given.first, given.first + banks), tests, given.quick))
-    with tempfile.TemporaryDirectory() as cache:
-        checked = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": cache, "NUMBA_OPT": "0"}
-        sys.exit(subprocess.run([sys.executable, *sys.argv], env=checked, check=False).returncode)
-
-
-if __name__ == "__main__":
-    main()

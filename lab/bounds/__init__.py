@@ -1,0 +1,1 @@
+"""Compiled code with a check at every index; see `lab.bounds.commands`."""

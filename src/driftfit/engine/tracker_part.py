@@ -1,0 +1,50 @@
+"""The part of a record that the steps of a tracker see, as a type of its own.
+
+A record begins with the fields of the tracker and those that every record has, which end at the field `EDGE`; those of
+the model follow. The part up to there depends on the tracker, the number of parameters and the lanes only. Steps that
+are compiled for it serve every model with that many parameters, at a third of the time of compiling them again.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from numba import types
+
+from driftfit.engine.kernel import State, kernel
+from driftfit.engine.numba_internals import named_intrinsic
+
+EDGE = "edge"
+"""The field behind the last one that a tracker sees; it holds nothing, and fills a cache line."""
+
+
+@lru_cache(maxsize=256)
+def _part(record: Any) -> Any:
+    """The type of the part; its last field has a name that no record has, for which Numba would take it to be one."""
+    edge = record.fields[EDGE]
+    seen = {name: field for name, field in record.fields.items() if field.offset < edge.offset} | {"end": edge}
+    return types.Record(
+        [(name, {"type": one.type, "offset": one.offset, "alignment": one.alignment}) for name, one in seen.items()],
+        edge.offset + 8 * edge.type.nitems,
+        record.aligned,
+    )
+
+
+def _typed(context: Any, record: Any) -> Any:
+    part = _part(record)
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.bitcast(given[0], context.get_value_type(part))
+
+    return part(record), build
+
+
+tracker_part = named_intrinsic("tracker_part", _typed)
+"""tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
+
+
+@kernel
+def whole_record(s: State) -> State:
+    """All of the record, for steps that read fields of the model."""
+    return s

@@ -1,0 +1,126 @@
+"""Hammerstein-Wiener models of different orders in one compiled driver.
+
+A driver is compiled for one number of parameters and one set of orders. To compare many orders, each model gets the
+size of the largest, with regressors of 0 after its own, and its orders are numbers in the record instead of constants
+of the compiled routines. Bits are the same; a sample takes longer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.kernel import State, floats, kernel, machine, wholes
+from driftfit.models.base import Model
+from driftfit.models.hammerstein_wiener.evaluate_bases import Kind, level_of
+from driftfit.models.hammerstein_wiener.output_curve import refining
+from driftfit.models.hammerstein_wiener.step_memory import (
+    DT,
+    EACH,
+    FACTOR,
+    G_PAST,
+    GIVEN,
+    IDENTITY,
+    INPUTS,
+    LATE,
+    N_OUT,
+    NA,
+    NB,
+    NEXT,
+    NOW,
+    OK,
+    OWN,
+    PREDICTED,
+    SEEN,
+    US,
+    N,
+    Y,
+)
+from driftfit.models.hammerstein_wiener.steps import regress_work
+
+
+@dataclass(frozen=True)
+class AnyOrders(Model):
+    """A model with the number of parameters and the memory of a larger one.
+
+    ``kinds`` are the compiled functions of its bases, that of the output last; ``places`` its orders, and where the
+    arrays in its memory begin.
+    """
+
+    model: Model
+    kinds: tuple[Kind, ...]
+    places: tuple[int, ...]
+    size: int
+    room: int
+
+    def bind(self, inputs: int | Sequence[str]) -> AnyOrders:
+        return self
+
+    @property
+    def m(self) -> int:
+        return self.model.m
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        own = self.model.names
+        return (*own, *(f"absent{i + 1}" for i in range(self.size - len(own))))
+
+    def memory(self) -> Mapping[str, Any]:
+        own = self.model.memory()["blocks"]
+        return {"blocks": np.append(own, np.zeros(self.room - own.size)), "orders": np.array(self.places)}
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self.kinds[:-1], self.kinds[-1])
+
+
+@lru_cache
+def _steps(into: tuple[Kind, ...], out: Kind) -> ModelSteps:
+    """The steps for the compiled bases of the inputs and of the output."""
+    work, refine, count = regress_work(into, out, False), refining(level_of(out)), OWN + EACH * len(into)
+
+    def machine_regress_any(blocks: int, theta: int, orders: int) -> None:
+        work(floats(blocks, 1, 1), wholes(orders, 1, count)[0], floats(theta, 1, 1))
+
+    def machine_push_any(blocks: int, orders: int) -> None:
+        m = floats(blocks, 1, 1)
+        if m[LATE, 0] > 0.0:
+            m[PREDICTED, 0] = refine(m, wholes(orders, 1, count)[0], m[PREDICTED, 0])
+
+    regress_any, push_any = machine(machine_regress_any), machine(machine_push_any)
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        s.blocks[GIVEN, l], s.blocks[Y, l], s.blocks[DT, l] = s.noise[l], s.y[l], s.dt[l]
+        for i in range(s.orders[INPUTS, l]):
+            s.blocks[s.orders[US, l] + i, l] = s.u[i, l]
+        regress_any(s.blocks.ctypes.data, s.theta.ctypes.data, s.orders.ctypes.data)
+        for i in range(s.orders[N, l]):
+            s.phi[i, l] = s.blocks[s.orders[NOW, l] + i, l]
+        at = s.orders[NA, l] + s.orders[NB, l]
+        for k in range(s.orders[N_OUT, l] - 1):
+            s.phi[at + k, l] = s.blocks[s.orders[G_PAST, l] + 1 + k, l]
+        s.y[l], s.dt[l] = s.blocks[Y, l], s.blocks[DT, l]
+        s.noise[l] *= s.blocks[FACTOR, l]
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        s.noise[l] = s.blocks[GIVEN, l]
+        if s.orders[IDENTITY, l] == 0:
+            push_any(s.blocks.ctypes.data, s.orders.ctypes.data)
+        s.y_hat[l] = s.blocks[PREDICTED, l]
+        s.blocks[SEEN, l], s.blocks[OK, l] = s.seen[l], s.ok[l]
+        for i in range(s.orders[N, l]):
+            s.blocks[s.orders[NOW, l] + i, l] = s.blocks[s.orders[NEXT, l] + i, l]
+
+    def ready(L: int) -> None:
+        assert L == 1
+        for routine in (*(one[0] for one in into), out[0], regress_any, push_any):
+            routine.load()
+
+    return ModelSteps(regress, push, ready)

@@ -1,0 +1,298 @@
+"""Equations with hidden states: signals that nobody measures, and the output that shows them.
+
+    x_t = f(x_(t-1), inputs, lags, dt; theta) + w_t        a line for each hidden state
+    y_t = h(x_t, inputs, lags, dt; theta) + v_t            the last line
+
+    StateSpace('''
+        soc = soc[-1] - dt * i / 3600 / theta.capacity
+        v1 = v1[-1] + dt * (theta.R1 * i - v1[-1]) / 20
+        v = 3.2 + 0.9 * soc - theta.R0 * i - v1
+    ''', start={"soc": 0.9, "v1": 0, "capacity": 2, "R1": 0.02, "R0": 0.05})
+
+The text is read as that of an `Equation`, and never evaluated. A name on the left of a line is a hidden state; that of
+the last line is the output. On the right, ``NAME[-1]`` is the state before, and ``NAME`` the state of the
+same sample, in lines after its own. ``dt`` is the interval since the last sample in nominal samples. Equations that do
+not use it are applied once for each nominal sample of a gap, with the inputs held.
+
+`JointKalman` follows theta and x together: they are its parameters, with the states last. Derivatives are computed by
+forward differentiation of the text (dual numbers), through all lines.
+
+Samples that need a missing input are not used; the states move on with the last known one. A missing output is
+replaced by its prediction among the lags, for at most as many samples as the longest lag. Where f or h is not finite
+(the root of a negative number) the states stay, and the sample is not used.
+
+Source: Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.4, for parameters as states; Griewank and
+Walther, Evaluating Derivatives (2008), chapter 3. Cost per sample: that of `JointKalman`.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.settings import input_names, numbers
+from driftfit.models.base import Model
+from driftfit.models.formulas import Formula, Writer, parse, written
+
+TIME = "dt"
+
+
+class System(NamedTuple):
+    """The parts of a set of equations."""
+
+    lines: tuple[Formula, ...]
+    parameters: tuple[str, ...]
+    hidden: tuple[str, ...]
+    inputs: tuple[str, ...]
+    output: str
+    reach: int
+    timed: bool
+    """Whether the equations use dt."""
+
+
+@lru_cache(maxsize=256)
+def system_of(text: str) -> System:
+    """The parts of equations, one a line; ValueError says what in them is not understood."""
+    given = [line.strip() for line in str(text).strip().splitlines() if line.strip()]
+    if not given:
+        raise ValueError("StateSpace: give a line for each hidden state, and one for the output.")
+    lines = tuple(parse(line, known=True) for line in given)
+    left = tuple(line.output for line in lines)
+    if len(set(left)) < len(left) or TIME in left:
+        raise ValueError(f"StateSpace: every line needs a name of its own on the left, not dt; got {', '.join(left)}.")
+    hidden, output = left[:-1], left[-1]
+    parameters: dict[str, None] = {}
+    inputs: dict[str, None] = {}
+    lags = [0]
+    for k, line in enumerate(lines):
+        parameters |= dict.fromkeys(line.parameters)
+        for name, lag in line.lags:
+            if name in hidden and not (lag == 1 or (lag == 0 and hidden.index(name) < k)):
+                raise ValueError(
+                    f"StateSpace: {line.text!r} may use {name}[-1], and {name} only in lines after its own."
+                )
+            if name == output and lag == 0:
+                raise ValueError(f"StateSpace: {output} on the right must have a lag, as {output}[-1].")
+            if name not in hidden and name != TIME:
+                lags.append(lag)
+                inputs |= dict.fromkeys([name] if name != output else [])
+    if not parameters:
+        raise ValueError("StateSpace: the equations have no parameter; write the unknown numbers as theta.NAME.")
+    if both := sorted(set(parameters) & set(hidden)):
+        raise ValueError(f"StateSpace: {', '.join(both)} is the name of a parameter and of a state.")
+    timed = any(name == TIME for line in lines for name, _ in line.lags)
+    return System(lines, tuple(parameters), hidden, tuple(inputs), output, max(lags), timed)
+
+
+@dataclass(frozen=True)
+class StateSpace(Model):
+    """Equations with hidden states, given as text; see `driftfit.models.state_space`. Follow it with `JointKalman`.
+
+    Parameters
+    ----------
+    equations : str
+        A line for each hidden state, and last one for the output.
+    start : mapping from name to number, or a number for all
+        Parameters and states before the first sample; 1 for parameters that are not named, 0 for states. It is the
+        mean of the tracker's prior, unless that has its own.
+    inputs : names or None
+        Columns of u, in order; None: the inputs of the equations, in the order in which they appear.
+
+    Raises
+    ------
+    ValueError
+        If the text is not such a system, ``start`` names nothing in it, or inputs are missing.
+    """
+
+    equations: str
+    start: Any = ()
+    inputs: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        system = system_of(self.equations)
+        if self.inputs is None:
+            self._set("inputs", system.inputs)
+        else:
+            self._set("inputs", input_names("StateSpace", "inputs", self.inputs))
+        if absent := [name for name in system.inputs if name not in self.input_names]:
+            raise ValueError(f"StateSpace: inputs must hold {', '.join(absent)}, which the equations use.")
+        if isinstance(self.start, Mapping | Sequence):
+            given = dict(self.start)
+            if unknown := sorted(set(given) - set(self.names)):
+                raise ValueError(f"StateSpace: start names {', '.join(unknown)}; there are {', '.join(self.names)}.")
+            named = ((name, numbers("StateSpace", "start", value, ndim=0)) for name, value in given.items())
+            self._set("start", tuple(named))
+        else:
+            self._set("start", numbers("StateSpace", "start", self.start, ndim=0))
+
+    def bind(self, inputs: int | Sequence[str]) -> StateSpace:
+        count = inputs if isinstance(inputs, int) else len(inputs)
+        if count != self.m:
+            raise ValueError(f"StateSpace: {self.m} inputs ({', '.join(self.input_names)}), but u has {count} columns.")
+        return self
+
+    @property
+    def system(self) -> System:
+        return system_of(self.equations)
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the states; empty if the equations have none."""
+        return self.system.hidden
+
+    @property
+    def m(self) -> int:
+        return len(self.input_names)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return self.inputs or ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.system.parameters, *self.system.hidden)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return (self.system.output,)
+
+    @property
+    def begins(self) -> Array:
+        """Parameters and states (n,) before the first sample."""
+        if not isinstance(self.start, tuple):
+            return np.full(self.n, float(self.start))
+        given = dict(self.start)
+        return np.array([given.get(name, float(name not in self.hidden)) for name in self.names])
+
+    @property
+    def recursive(self) -> bool:
+        return True
+
+    def memory(self) -> Mapping[str, Any]:
+        depth, n = self.system.reach + 1, self.n
+        return {
+            "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
+            "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0,
+        }  # fmt: skip
+
+    @property
+    def steps(self) -> ModelSteps:
+        return _steps(self.equations, self.input_names)
+
+    def noise_response(self, theta: Array, h: int) -> Array:
+        """1, and NaN after it, because the response depends on the operating point."""
+        response: Array = np.eye(1, h)[0]
+        response[1:] = np.nan
+        return response
+
+
+class _StateWriter(Writer):
+    """Code for the lines of a system: hidden states are variables, as parameters are."""
+
+    def __init__(self, system: System, inputs: tuple[str, ...]) -> None:
+        super().__init__(system.lines[-1], inputs)
+        self.system, self.present = system, {}  # type: ignore[var-annotated]
+
+    def write(self, node: ast.expr) -> tuple[str, dict[int, str]]:
+        if isinstance(node, ast.Attribute):
+            i = self.system.parameters.index(node.attr)
+            return self.let(f"s.point[{i}, l]"), {i: "1.0"}
+        return super().write(node)
+
+    def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
+        if name == TIME:
+            return "s.dt[l]", {}
+        if name in self.system.hidden:
+            if lag == 0 and name in self.present:
+                value, derivatives = self.present[name]
+                return value, dict(derivatives)
+            i = len(self.system.parameters) + self.system.hidden.index(name)
+            return self.let(f"s.point[{i}, l]"), {i: "1.0"}
+        return super().signal(name, lag)
+
+
+class Equations(NamedTuple):
+    """Compiled equations: they read theta and states in s.point, inputs and lags in s.u_lag and s.y_lag."""
+
+    move: Callable[..., Any]
+    """s.next and its derivatives s.slopes, from the states before."""
+    play: Callable[..., Any]
+    """s.next alone."""
+    show: Callable[..., Any]
+    """s.value and its derivatives s.phi, from the states of the sample."""
+    read: Callable[..., Any]
+    """s.value alone."""
+
+
+@lru_cache(maxsize=256)
+def equations_of(text: str, inputs: tuple[str, ...]) -> Equations:
+    """The compiled equations of a system."""
+    system = system_of(text)
+    n = len(system.parameters) + len(system.hidden)
+    writer = _StateWriter(system, inputs)
+    for line in system.lines[:-1]:
+        writer.present[line.output] = writer.write(line.tree)
+    values, slopes = list(writer.lines), []
+    for k, name in enumerate(system.hidden):
+        value, derivatives = writer.present[name]
+        values.append(f"s.next[{k}, l] = {value}")
+        slopes += [f"s.slopes[{k}, {i}, l] = {derivatives.get(i, '0.0')}" for i in range(n)]
+    last = _StateWriter(system, inputs)
+    value, derivatives = last.write(system.lines[-1].tree)
+    output = [*last.lines, f"s.value[l] = {value}"]
+    return Equations(
+        written("move", [*values, *slopes] or ["pass"]),
+        written("play", values or ["pass"]),
+        written("show", [*output, *(f"s.phi[{i}, l] = {derivatives.get(i, '0.0')}" for i in range(n))]),
+        written("read", output),
+    )
+
+
+@lru_cache
+def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
+    """Lags, and whether a sample has all its inputs. What the equations say of it is the tracker's work."""
+    system = system_of(equations)
+    m, n, reach, output = len(inputs), len(system.parameters) + len(system.hidden), system.reach, system.output
+    used = sorted({
+        (inputs.index(name), lag) for line in system.lines for name, lag in line.lags if name in inputs
+    })  # fmt: skip
+    lags = sorted({lag for line in system.lines for name, lag in line.lags if name == output})
+    of_input, with_lag = tuple(j for j, _ in used) or (0,), tuple(lag for _, lag in used) or (0,)
+    own = tuple(lags) or (0,)
+    count, owned = len(used), len(lags)
+
+    @kernel
+    def regress(s: State, l: int) -> None:
+        for i in range(reach, 0, -1):
+            s.y_lag[i, l] = s.y_lag[i - 1, l]
+            for j in range(m):
+                s.u_lag[j, i, l] = s.u_lag[j, i - 1, l]
+                s.u_known[j, i, l] = s.u_known[j, i - 1, l]
+        for j in range(m):
+            known = abs(s.u[j, l]) < LARGEST
+            s.u_known[j, 0, l] = 1.0 if known else 0.0
+            s.u_lag[j, 0, l] = s.u[j, l] if known else s.u_lag[j, min(1, reach), l]
+        complete = True
+        for k in range(count):
+            complete = complete & (s.u_known[of_input[k], with_lag[k], l] > 0.0)
+        for k in range(owned):
+            complete = complete & (abs(s.y_lag[own[k], l]) < LARGEST)
+        for i in range(n):
+            s.phi[i, l] = 1.0 if complete else np.nan
+
+    @kernel
+    def push(s: State, l: int) -> None:
+        seen = s.seen[l] > 0.0
+        known = (s.valid[l] > 0.0) & (s.without[l] < reach)
+        s.without[l] = 0.0 if seen else s.without[l] + 1.0
+        s.y_lag[0, l] = s.y[l] if seen else (s.y_hat[l] if known else np.nan)
+
+    return ModelSteps(regress, push)

@@ -1,0 +1,189 @@
+"""The units of a section [[unit]]: what arrives is sorted, judged and run for all of them at once.
+
+Samples with times wait until the newest time of their unit is ``hold_back`` after them, and are then processed in the
+order of their times (`driftfit.run.states.late`). What is late, repeated, without a time, or far in the future is
+counted and does not enter the journal (`Section.admit`). What the journal has is processed in the lanes of tiles
+(`driftfit.run.states.advance`), so the states are those of `track` on the journal's rows, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import time as wall
+
+import numpy as np
+
+from driftfit.data.known import INTERVAL, NOISE, Known
+from driftfit.data.record import Records
+from driftfit.engine.kernel import Array
+from driftfit.run.live.interventions import HELD
+from driftfit.run.live.rule import FROZEN
+from driftfit.run.states import late
+from driftfit.run.states.advance import Advanced, advance
+from driftfit.service.core.blocks import Blocks
+from driftfit.service.core.journal import Rows
+from driftfit.service.core.results import ALARM, OK, THETA, Results
+from driftfit.service.core.streams import SAMPLES, USED, Streams
+from driftfit.service.core.unit import Out, Unit
+from driftfit.service.settings.config import UnitSettings
+
+AHEAD = 86_400.0
+"""A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
+sample late."""
+REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
+"""How samples are counted that do not enter the journal."""
+
+
+class Section:
+    """All units of a section."""
+
+    def __init__(self, index: int, settings: UnitSettings) -> None:
+        self.streams = Streams(index, settings)
+        self.units: list[Unit] = []
+        """By their places."""
+        self.blocks = Blocks(THETA + 2 * self.streams.program.model.n)
+
+    def add(self, number: int, name: str) -> Unit:
+        """A new unit."""
+        unit = Unit(number, name, self.streams, self.streams.add(number))
+        if len(self.units) == self.blocks.capacity:
+            self.blocks.grow(self.streams.capacity)
+        self.units.append(unit)
+        return unit
+
+    def admit(self, places: Array, time: Array | None, values: Array) -> Rows | None:
+        """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
+        if time is None:
+            order = np.argsort(places, kind="stable")
+        else:
+            self._refuse("time in the future", places, far := self._too_far(places, time))
+            kept = np.flatnonzero(~far)
+            order, fate = self.streams.waiting.judge(places[kept], time[kept], self.streams.newest)
+            order = kept[order]
+            for code, name in REFUSED.items():
+                self._refuse(name, places[kept], fate == code)
+        if not len(order):
+            return None
+        time = None if time is None else time[order]
+        return Rows(self.streams.index, self.streams.numbers[places[order]], time, values[order])
+
+    def _too_far(self, places: Array, time: Array) -> Array:
+        """Which times are too far in the future: after a gap of more than a day, beyond the newest and this clock."""
+        now = wall.time()
+        far = time > np.fmax(self.streams.newest[places], now) + AHEAD
+        for place in np.unique(places[far]).tolist():
+            newest = max(now, float(np.nan_to_num(self.streams.newest[place], nan=-math.inf)))
+            own = np.flatnonzero(places == place)
+            for k in own[np.argsort(time[own])].tolist():
+                far[k] = time[k] > newest + AHEAD
+                newest = newest if far[k] or math.isnan(time[k]) else max(newest, time[k])
+        return np.asarray(far)
+
+    def _refuse(self, name: str, places: Array, which: Array) -> None:
+        for place in places[which].tolist():
+            self.units[place].rare[name] += 1
+
+    def process(self, first: int, rows: Rows, out: Out, done: Array | None = None) -> None:
+        """Process samples of the journal, the first of which has the number ``first``.
+
+        ``done`` (N,) says which of them are in the stored states already.
+        """
+        number = first + np.arange(rows.length)
+        places = self.streams.places(rows.unit)
+        if done is not None:
+            rows, number, places = rows.some(~done), number[~done], places[~done]
+        np.add.at(self.streams.counted[:, SAMPLES], places, 1)
+        failed = np.array([bool(self.units[place].failure) for place in np.unique(places).tolist()])
+        if failed.any():
+            fine = ~failed[np.unique(places, return_inverse=True)[1]]
+            rows, number, places = rows.some(fine), number[fine], places[fine]
+        time, values = rows.time, rows.values
+        if time is not None:  # numbers of samples are exact as floats
+            every = np.column_stack([number, values])
+            places, time, every = self.streams.waiting.take(places, time, every, self.streams.newest)
+            number, values = every[:, 0].astype(np.int64), every[:, 1:]
+        if len(places):
+            self._run(places, time, self._within(places, values), number, out)
+
+    def _within(self, places: Array, values: Array) -> Array:
+        """Values, NaN where they are outside their ranges."""
+        low, high = self.streams.limits[places, :, 0], self.streams.limits[places, :, 1]
+        outside = (values < low) | (values > high)
+        if not outside.any():
+            return values
+        for row, column in np.argwhere(outside).tolist():
+            self.units[places[row]].rare[f"{self.streams.settings.columns[column]} outside its limits"] += 1
+        return np.where(outside, math.nan, values)
+
+    def _run(self, places: Array, time: Array | None, values: Array, number: Array, out: Out) -> None:
+        """Update the states by samples that are sorted by place; if that fails, unit by unit."""
+        first = np.flatnonzero(np.append(True, places[1:] != places[:-1]))
+        length = np.diff(np.append(first, len(places)))
+        own = places[first]
+        known = self._known(places, own, first, time)
+        collected = any(alarm.rule.kind in FROZEN for k in own.tolist() for alarm in self.units[k].alarms)
+        records = Records(tuple(own.tolist()), first, length, values[:, 0], values[:, 1:], Known(known), time)
+        try:
+            found = advance(
+                [self.streams.program] * len(own),
+                records,
+                self.streams.words[own],
+                self.streams.begun[own],
+                1,
+                collected,
+            )
+        except Exception as error:  # whatever it is, the other units continue
+            if len(own) == 1:
+                self.units[own[0]].fail(int(number[0]), error, out)
+                return
+            for a, b in zip(first.tolist(), (first + length).tolist(), strict=True):
+                part = slice(a, b)
+                self._run(places[part], None if time is None else time[part], values[part], number[part], out)
+            return
+        self.streams.words[own], self.streams.begun[own] = found.states(), True
+        if time is not None:
+            self.streams.last[own] = time[first + length - 1]
+        self._tell(found, Rows(self.streams.index, places, time, values), known[:, NOISE], number, out)
+
+    def _known(self, places: Array, own: Array, first: Array, time: Array | None) -> Array:
+        """What is known of the samples (N, 3), or of all of them (1, 3)."""
+        held = self.streams.held[places]
+        known = np.ones((1 if time is None and not held.any() else len(places), 3))
+        if time is not None:
+            before = np.roll(time, 1)
+            before[first] = np.where(np.isnan(self.streams.last[own]), time[first], self.streams.last[own])
+            gaps = self.streams.clock.between(before, time)
+            gaps[first[np.isnan(self.streams.last[own])]] = 1.0
+            known[:, INTERVAL] = gaps
+        if held.any():
+            known[held] = HELD
+        return known
+
+    def _tell(self, found: Advanced, rows: Rows, noise: Array, number: Array, out: Out) -> None:
+        """Pass on results; ``rows`` have places for units."""
+        places, records = rows.unit, found.records
+        with np.errstate(invalid="ignore"):
+            std = np.sqrt(found.column("var"))
+        time = np.full(len(places), math.nan) if rows.time is None else rows.time
+        heads = np.column_stack([time, rows.values[:, 0], *(found.column(name) for name in ("y_hat", "e", "s"))])
+        values = np.concatenate([heads, found.column("theta"), std], axis=1)
+        flags = (found.column("ok") > 0.0).astype(np.uint8) * np.uint8(OK)
+        np.add.at(self.streams.counted[:, USED], places, flags)
+        lanes = None
+        for k, place in enumerate(places[records.first].tolist()):
+            unit = self.units[place]
+            if unit.calibrated and not unit.alarms:
+                continue
+            lanes = found.lanes() if lanes is None else lanes
+            part = slice(int(records.first[k]), int(records.first[k] + records.length[k]))
+            own = None if rows.time is None else rows.time[part]
+            if unit.alarms:
+                job, lane = lanes[k]
+                factors = np.broadcast_to(noise, len(places))[part]
+                on = unit.watch(job.out[: len(factors)], lane, factors, own, number[part], out)
+                flags[part] |= np.array(on, np.uint8) * np.uint8(ALARM)
+            if not unit.calibrated:
+                unit.remember(own, rows.values[part], out)
+        results = Results(number, self.streams.numbers[places], flags, values)
+        out.results.append(results)
+        out.blocks += self.blocks.add(places, results)

@@ -1,0 +1,308 @@
+"""The Kalman filter of parameters that are sums of components, each with its law (`driftfit.trackers.laws.law`).
+
+    theta_t = H x_t,    x_t = F(dt) x_(t-1) + w_t,  w_t ~ N(0, Q(dt) d);    y_t = phi_t' H x_t + v_t
+
+    predict   x <- F x;  C <- F C F' + Q
+    correct   h = H' phi;  e = y - h' x;  s = h' C h + r / w;  x <- x + C h e / s;  C <- C - C h h' C / s
+
+F has a block for each component: 1, exp(-dt / time), a shear, or a rotation. theta and P = H C H' are what the result
+shows.
+
+The start is diffuse in the components whose variance is not known, x_0 = c + delta: x and C are those for delta = 0,
+and A = dx / d delta and the information M about delta are computed beside them (de Jong 1991),
+
+    A <- F A;   a = A' h;   M <- M + a a' / s;   m <- m + a e / s;   A <- A - C h a' / s
+
+until M, in the units of its own diagonal, can be inverted: then x <- x + A M^-1 m and C <- C + A M^-1 A'. What no
+regressor has reached stays free, and holds up nothing else. Until then std is inf for the parameters that depend on
+it.
+
+Source: Harvey (1989), section 3.2; de Jong, The diffuse Kalman filter, Annals of Statistics 19 (1991). Departure:
+delta is taken in as soon as it is determined. Cost per sample: O(N^2) for N components, O(N^3) at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.drivers import TrackerSteps
+from driftfit.engine.kernel import (
+    Array,
+    State,
+    cubes,
+    exp,
+    floats,
+    kernel,
+    log,
+    machine,
+    nothing,
+    packed,
+    shared,
+    wholes,
+)
+from driftfit.trackers.laws.law import COSINE, DECAY, KIND, LEVEL, NOISE, OWNER, RATE, ROWS, SLOPE, VISIBLE
+from driftfit.trackers.parts.diffuse import LEFT
+from driftfit.trackers.parts.varying_drift import read_drift
+
+DETERMINED = 1e-9
+"""Smallest pivot of the information about delta, in the units of its diagonal, with which it is taken in."""
+
+LOG_2_PI = 1.8378770664093453
+
+H, G, B, W, WORK = range(5)
+"""Rows of ``work``: h, C h, a, and the solution of L w = m."""
+
+TIME, DRIFT, Y, OK, R, Y_HAT, E, S, TOTAL, NOW = range(10)
+"""Entries of ``now``: the interval, the factor of the drift, the output, whether it is used, the noise variance; the
+results; and -2 times the logarithm of the likelihood of what delta took."""
+
+(AT_LAW, AT_ROOT, AT_X, AT_C, AT_A, AT_M, AT_INFO, AT_FREE, AT_PHI, AT_THETA, AT_P, AT_VAR, AT_L, AT_WORK, AT_NOW,
+ AT_F, ADDRESSES) = range(17)  # fmt: skip
+
+
+def state(table: Array, theta0: Array, p0: Array | None, laws: Mapping[int, Any]) -> Mapping[str, Any]:
+    """Fields before the first sample; ``laws`` by the place of their parameter."""
+    n, N = len(theta0), table.shape[1]
+    x, C, free = np.zeros(N), np.zeros((N, N)), np.ones(N)
+    first = [int(np.argmax(table[OWNER] == i)) for i in range(n)]
+    x[first] = theta0
+    if p0 is not None:
+        C[np.ix_(first, first)] = p0
+        free[first] = 0.0
+    for k in np.flatnonzero(table[KIND] == DECAY):
+        C[k, k], free[k] = table[NOISE, k], 0.0
+        mean = laws[int(table[OWNER, k])].mean
+        if mean is not None:
+            level = first[int(table[OWNER, k])]
+            x[level], C[level], C[:, level], free[level] = mean, 0.0, 0.0, 0.0
+    shown = (table[OWNER] == np.arange(n)[:, None]) * table[VISIBLE]
+    return {
+        "theta": shown @ x, "P": shown @ C @ shown.T, "law": table, "x": x, "C": C, "A": np.diag(free),
+        "M": np.zeros((N, N)), "information": np.zeros(N), "free": free, "L": np.zeros((N, N)),
+        "work": np.zeros((WORK, N)), "now": np.zeros(NOW), "drift_root": np.ones(n), "F": np.ones(N),
+    }  # fmt: skip
+
+
+@shared
+def forward(law: Array, X: Array, dt: float) -> None:
+    """X <- F X."""
+    for k in range(len(X)):
+        kind = law[KIND, k]
+        if kind == DECAY:
+            keep = exp(-dt * law[RATE, k])
+            for c in range(X.shape[1]):
+                X[k, c] *= keep
+        elif kind == LEVEL:
+            for c in range(X.shape[1]):
+                X[k, c] += dt * X[k + 1, c]
+        elif kind == COSINE:
+            cos, sin = np.cos(dt * law[RATE, k]), np.sin(dt * law[RATE, k])
+            for c in range(X.shape[1]):
+                one, other = X[k, c], X[k + 1, c]
+                X[k, c], X[k + 1, c] = cos * one + sin * other, cos * other - sin * one
+
+
+@shared
+def turn_over(X: Array) -> None:
+    """X <- X'."""
+    for i in range(len(X)):
+        for j in range(i):
+            X[i, j], X[j, i] = X[j, i], X[i, j]
+
+
+@shared
+def spread(law: Array, root: Array, C: Array, dt: float, drift: float) -> None:
+    """C <- C + Q(dt)."""
+    for k in range(len(C)):
+        i, kind, noise = int(law[OWNER, k]), law[KIND, k], law[NOISE, k]
+        own = noise * root[i] * root[i] * drift
+        if kind == DECAY:
+            keep = exp(-dt * law[RATE, k])
+            C[k, k] += own * (1.0 - keep * keep)
+        elif kind == SLOPE:
+            C[k, k] += own * dt
+            C[k - 1, k] += own * dt * dt
+            C[k, k - 1] += own * dt * dt
+            C[k - 1, k - 1] += own * dt * dt * dt
+        else:
+            C[k, k] += own * dt
+
+
+@shared
+def measure(law: Array, x: Array, C: Array, phi: Array, work: Array, now: Array) -> None:
+    """h, C h, y_hat, e, and s as if delta were known."""
+    N = len(C)
+    y_hat, variance = 0.0, 0.0
+    for k in range(N):
+        work[H, k] = phi[int(law[OWNER, k])] * law[VISIBLE, k]
+        y_hat += work[H, k] * x[k, 0]
+    for k in range(N):
+        g = 0.0
+        for j in range(N):
+            g += C[k, j] * work[H, j]
+        work[G, k] = g
+        variance += work[H, k] * g
+    now[Y_HAT], now[E], now[S] = y_hat, now[Y] - y_hat, variance + now[R]
+
+
+@shared
+def correct_state(x: Array, C: Array, work: Array, now: Array) -> None:
+    gain = now[OK] / now[S]
+    for i in range(len(C)):
+        k = gain * work[G, i]
+        x[i, 0] += k * now[E]
+        for j in range(i):
+            C[i, j] -= k * work[G, j]
+            C[j, i] = C[i, j]
+        C[i, i] = max(C[i, i] - k * work[G, i], LEFT * C[i, i])
+
+
+@shared
+def inform(A: Array, M: Array, information: Array, free: Array, work: Array, now: Array) -> bool:
+    """Take the sample as information about delta; returns whether y depends on it."""
+    N, reached = len(A), False
+    for d in range(N):
+        a = 0.0
+        if free[d] > 0.0:
+            for k in range(N):
+                a += A[k, d] * work[H, k]
+        work[B, d] = a
+        reached = reached or a != 0.0
+    if reached and now[OK] > 0.0:
+        for d in range(N):
+            information[d] += work[B, d] * now[E] / now[S]
+            for c in range(N):
+                M[d, c] += work[B, d] * work[B, c] / now[S]
+                A[d, c] -= work[G, d] * work[B, c] / now[S]
+        now[TOTAL] += LOG_2_PI + log(now[S]) + now[E] * now[E] / now[S]
+    return reached
+
+
+@shared
+def factor(M: Array, L: Array, scale: Array) -> bool:
+    """L, the lower Cholesky factor of M in the units of its diagonal, where that is not 0; whether M is regular."""
+    N = len(M)
+    for i in range(N):
+        scale[i] = 1.0 / np.sqrt(M[i, i]) if M[i, i] > 0.0 else 0.0
+        for j in range(i + 1):
+            total = M[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if scale[i] > 0.0 and total < DETERMINED:
+                    return False
+                L[i, i] = np.sqrt(total) if scale[i] > 0.0 else 1.0
+            else:
+                L[i, j] = total / L[j, j]
+    return True
+
+
+@shared
+def settle(x: Array, C: Array, A: Array, M: Array, information: Array, free: Array, L: Array, work: Array) -> float:
+    """Take in delta, as far as regressors have reached it; returns -2 log likelihood of it, and 0 if it has to wait."""
+    N, scale, w, total = len(M), work[B], work[W], 0.0
+    if not factor(M, L, scale):
+        return 0.0
+    for d in range(N):
+        t = information[d] * scale[d]
+        for c in range(d):
+            t -= L[d, c] * w[c]
+        w[d] = t / L[d, d]
+        total += (2.0 * (log(L[d, d]) - log(scale[d])) - LOG_2_PI if scale[d] > 0.0 else 0.0) - w[d] * w[d]
+    for i in range(N):  # row i of A M^-1/2, in the place of the columns of A that are taken in
+        for d in range(N):
+            if scale[d] > 0.0:
+                t = A[i, d] * scale[d]
+                for c in range(d):
+                    t -= L[d, c] * A[i, c] if scale[c] > 0.0 else 0.0
+                A[i, d] = t / L[d, d]
+    for i in range(N):
+        for d in range(N):
+            if scale[d] > 0.0:
+                x[i, 0] += A[i, d] * w[d]
+                for j in range(i + 1):
+                    C[i, j] += A[i, d] * A[j, d]
+                    C[j, i] = C[i, j]
+    for d in range(N):
+        if scale[d] > 0.0:
+            free[d], information[d] = 0.0, 0.0
+            for i in range(N):
+                A[i, d], M[i, d], M[d, i] = 0.0, 0.0, 0.0
+    return total
+
+
+@shared
+def show(law: Array, x: Array, C: Array, A: Array, theta: Array, P: Array, var: Array) -> None:
+    """theta = H x, P = H C H', and inf where theta depends on delta."""
+    n, N = len(theta), len(C)
+    for i in range(n):
+        theta[i] = 0.0
+        for j in range(n):
+            P[i, j] = 0.0
+    for k in range(N):
+        i = int(law[OWNER, k])
+        theta[i] += law[VISIBLE, k] * x[k, 0]
+        for j in range(N):
+            P[i, int(law[OWNER, j])] += law[VISIBLE, k] * law[VISIBLE, j] * C[k, j]
+    for i in range(n):
+        var[i] = P[i, i]
+    for k in range(N):
+        for d in range(N):
+            if law[VISIBLE, k] * A[k, d] != 0.0:
+                var[int(law[OWNER, k])] = np.inf
+
+
+@machine
+def machine_sample(fields: int, n: int, N: int, L: int, l: int) -> None:
+    """Prediction and correction of lane l of L, and what is shown of it."""
+    at = wholes(fields, 1, ADDRESSES)
+    law, now = cubes(at[0, AT_LAW], ROWS, N, L)[:, :, l], floats(at[0, AT_NOW], NOW, L)[:, l]
+    x, C = cubes(at[0, AT_X], N, 1, L)[:, :, l], cubes(at[0, AT_C], N, N, L)[:, :, l]
+    A, work = cubes(at[0, AT_A], N, N, L)[:, :, l], cubes(at[0, AT_WORK], WORK, N, L)[:, :, l]
+    M, information = cubes(at[0, AT_M], N, N, L)[:, :, l], floats(at[0, AT_INFO], N, L)[:, l]
+    free, dt = floats(at[0, AT_FREE], N, L)[:, l], now[TIME]
+    if dt > 0.0:
+        forward(law, x, dt)
+        forward(law, A, dt)
+        forward(law, C, dt)
+        turn_over(C)
+        forward(law, C, dt)
+        spread(law, floats(at[0, AT_ROOT], n, L)[:, l], C, dt, now[DRIFT])
+    measure(law, x, C, floats(at[0, AT_PHI], n, L)[:, l], work, now)
+    reached = inform(A, M, information, free, work, now)
+    correct_state(x, C, work, now)
+    if reached:
+        now[S] = np.inf
+        taken = settle(x, C, A, M, information, free, cubes(at[0, AT_L], N, N, L)[:, :, l], work)
+        if taken != 0.0:
+            now[TOTAL] += taken
+            for k in range(N):  # the factors of the diffuse likelihood, whose logarithms add up to the total
+                cubes(at[0, AT_F], N, 1, L)[k, 0, l] = exp(now[TOTAL] / N)
+    theta, var = floats(at[0, AT_THETA], n, L)[:, l], floats(at[0, AT_VAR], n, L)[:, l]
+    show(law, x, C, A, theta, cubes(at[0, AT_P], n, n, L)[:, :, l], var)
+
+
+@kernel
+def predict(s: State, l: int) -> None:
+    """The routine of the correction begins with the time update."""
+    s.now[TIME, l], s.now[DRIFT, l] = s.dt[l], s.drift[l]
+
+
+@kernel
+def correct(s: State, l: int) -> None:
+    N, L = s.x.shape
+    s.now[Y, l], s.now[OK, l], s.now[R, l] = s.y[l], s.ok[l], s.r[l] * s.noise[l]
+    fields = packed((
+        s.law.ctypes.data, s.drift_root.ctypes.data, s.x.ctypes.data, s.C.ctypes.data, s.A.ctypes.data,
+        s.M.ctypes.data, s.information.ctypes.data, s.free.ctypes.data, s.phi.ctypes.data, s.theta.ctypes.data,
+        s.P.ctypes.data, s.var.ctypes.data, s.L.ctypes.data, s.work.ctypes.data, s.now.ctypes.data, s.F.ctypes.data,
+    ))  # fmt: skip
+    machine_sample(fields, s.theta.shape[0], N, L, l)
+    s.y_hat[l], s.e[l], s.s[l] = s.now[Y_HAT, l], s.now[E, l], s.now[S, l]
+
+
+STEPS = TrackerSteps(predict, correct, nothing, read_extra=read_drift, machines=(machine_sample,))
+"""`nothing` is the report: the correction has written the variances."""

@@ -1,0 +1,156 @@
+"""A prior learned from a fleet: `pool(fleet)`.
+
+    theta_i ~ N(mean, cov)          the parameters of unit i at its first sample
+    y_i     from the model of the fleet with theta_i, and the drift and noise of its tracker
+
+Each unit was tracked from no knowledge, so its record says N(t_i, P_i) of theta_i, the smoothed first sample,
+and nothing of the record is lost (models are linear and Gaussian given the regressors). Mean and covariance maximise
+
+    L = sum_i log N(t_i; mean, cov + P_i) - 1/2 log det sum_i (cov + P_i)^-1         (restricted likelihood)
+
+over a triangular root of cov, by quasi-Newton steps with the exact gradient. With K_i = cov (cov + P_i)^-1 and V the
+variance of the estimated mean,
+
+    theta_i | all records ~ N(mean + K_i (t_i - mean), cov - K_i cov + (I - K_i) V (I - K_i)')
+
+The result shrinks each unit towards the others, by as much as its own record leaves open and no more; units with short
+records gain most. ``tracker`` starts from N(mean, cov + V), the prediction for a unit that the fleet does not have yet.
+
+Use it for units of one make. It assumes that theta_i are normal about one mean: look at ``theta`` for groups. The
+uncertainty of cov itself is left out: with forty units bands of 95 % cover some 90 %.
+
+Source: Harville, Maximum likelihood approaches to variance component estimation, J. American Statistical Association 72
+(1977); Laird and Ware, Random-effects models for longitudinal data, Biometrics 38 (1982). Cost: O(units n^3) for each
+of some thirty iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import plain, warn
+from driftfit.run.result import Track
+from driftfit.smooth.smoothed import Smoothed
+from driftfit.trackers.kalman import Kalman
+
+
+@dataclass(frozen=True, eq=False)
+class Pooled:
+    """The prior of a fleet, and each unit under it.
+
+    Attributes
+    ----------
+    names, keys : tuples
+        Names of the parameters, and the units that were used.
+    mean, cov : (n,), (n, n)
+        The distribution of theta_i over units.
+    theta, std : (units, n)
+        Parameters of each unit at its first sample, given its own record and the fleet.
+    own : (units, n)
+        The same given its own record alone.
+    tracker : Kalman
+        The fleet's tracker, to start a new unit.
+    loglik : float
+        The maximised restricted log-likelihood L, without its constant.
+    """
+
+    names: tuple[str, ...]
+    keys: tuple[Hashable, ...]
+    mean: Array
+    cov: Array
+    theta: Array
+    std: Array
+    own: Array
+    tracker: Kalman
+    loglik: float
+
+    def __repr__(self) -> str:
+        spread = ", ".join(
+            f"{name} {mean:.4g} +- {std:.2g}"
+            for name, mean, std in zip(self.names, self.mean, self.spread, strict=True)
+        )
+        return f"Pooled prior of {len(self.keys)} units: {spread}"
+
+    @property
+    def spread(self) -> Array:
+        """Standard deviation of each parameter over units, (n,)."""
+        spread: Array = np.sqrt(np.diag(self.cov))
+        return spread
+
+
+def pool(fleet: Mapping[Hashable, Track]) -> Pooled:
+    """The prior that the units of a fleet share.
+
+    Parameters
+    ----------
+    fleet : Fleet, or mapping from key to Track
+        Runs of one model with `Kalman`, each from the diffuse start (p0=None).
+
+    Raises
+    ------
+    ValueError
+        If units have another tracker than one such Kalman, or fewer than n + 2 of them determine all parameters.
+    """
+    runs = dict(fleet.items())
+    first = next(iter(runs.values()), None)
+    tracker = None if first is None else first.tracker
+    if first is None or not isinstance(tracker, Kalman) or tracker.p0 is not None:
+        raise ValueError(f"pool: track the fleet with Kalman from the diffuse start (p0=None); got {tracker!r}.")
+    if any(one.tracker != tracker or one.names != first.names for one in runs.values()):
+        raise ValueError("pool: all units must have one model and one tracker.")
+    n, found = len(first.names), {}
+    for key, run in runs.items():
+        smoothed = Smoothed.of(run, "cov")
+        P = smoothed.cov(0)
+        if np.isfinite(P).all() and np.diag(P).min() > 0.0:
+            found[key] = smoothed.theta[0], P
+    if len(found) < n + 2:
+        raise ValueError(
+            f"pool: {len(found)} of {len(runs)} units determine all {n} parameters; at least {n + 2} are needed."
+        )
+    if len(found) < len(runs):
+        warn(f"pool: {len(runs) - len(found)} of {len(runs)} units do not determine all parameters, and are left out.")
+    t, P = (np.array(part) for part in zip(*found.values(), strict=True))
+    mean, cov, V, loglik = maximised(t, P)
+    K = cov @ np.linalg.inv(cov + P)
+    theta = mean + np.einsum("iab,ib->ia", K, t - mean)
+    left = np.eye(n) - K
+    var = np.einsum("iaa->ia", cov - K @ cov + left @ V @ left.transpose(0, 2, 1))
+    started = replace(tracker, theta0=plain(mean), p0=plain(0.5 * (cov + V + (cov + V).T)))
+    std = np.sqrt(np.maximum(var, 0.0))
+    return Pooled(first.names, tuple(found), mean, cov, theta, std, t, started, loglik)
+
+
+def maximised(t: Array, P: Array) -> tuple[Array, Array, Array, float]:
+    """(mean, cov, variance of mean, L) from estimates t (units, n) and their covariances P (units, n, n)."""
+    from scipy import optimize  # a fifth of a second to import
+
+    n = t.shape[1]
+    unit = np.sqrt(np.mean(np.einsum("iaa->ia", P), axis=0) + np.var(t, axis=0))
+    t, P, lower = t / unit, P / np.outer(unit, unit), np.tril_indices(n)
+
+    def parts(x: Array) -> tuple[float, Array, Array, Array, Array]:
+        """-L, its gradient, mean, cov, V for the entries of a triangular root."""
+        root = np.zeros((n, n))
+        root[lower] = x
+        cov = root @ root.T
+        W = np.linalg.inv(cov + P)
+        V = np.linalg.inv(W.sum(axis=0))
+        mean = V @ np.einsum("iab,ib->a", W, t)
+        Wo = np.einsum("iab,ib->ia", W, t - mean)
+        logs = np.sum(np.linalg.slogdet(W)[1]) + np.linalg.slogdet(V)[1]
+        loss = 0.5 * (np.einsum("ia,ia->", Wo, t - mean) - logs)
+        slope = W.sum(axis=0) - Wo.T @ Wo - np.sum(W @ V @ W, axis=0)
+        return float(loss), (slope @ root)[lower], mean, cov, V
+
+    start = np.linalg.cholesky(np.cov(t.T).reshape(n, n) + 1e-6 * np.eye(n))[lower]
+    found = optimize.minimize(
+        lambda x: parts(x)[:2], start, jac=True, method="L-BFGS-B", options={"ftol": 1e-14, "gtol": 1e-7}
+    )
+    loss, _, mean, cov, V = parts(found.x)
+    scale = np.outer(unit, unit)
+    return mean * unit, cov * scale, V * scale, -loss - (len(t) - 1) * float(np.sum(np.log(unit)))

@@ -1,0 +1,1 @@
+"""Between discrete and continuous time."""

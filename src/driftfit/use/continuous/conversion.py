@@ -1,0 +1,169 @@
+"""The system behind a run in continuous time, and back, with bands.
+
+    y_t = z^-k B(z) / A(z) u_t      <->      y(t) = B(s) / A(s) u(t - delay),   delay = (k - 1) dt
+
+for inputs that are held between samples (zero-order hold). With companion matrices of the same order n,
+
+    expm([[F, g], [0, 0]] dt) = [[Phi, gamma], [0, 1]]        logm goes back
+
+A discrete pole p is exp(s dt): it needs p > 0 or a complex pair, and 0 <= w dt < pi for the logarithm to be the right
+one. Standard deviations follow by the delta method (`driftfit.use.delta_method`), on joint covariances, so that there
+and back again is where it began.
+
+Source: Astrom and Wittenmark, Computer-Controlled Systems (1997), section 2.4. Cost: O(n^4) for one sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from driftfit.engine.kernel import Array
+from driftfit.engine.settings import numbers
+from driftfit.use.delta_method import jacobian
+from driftfit.use.system import Followed, Response, input_of, linear, taken
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """B(p) / A(p), A = p^n + a_1 p^(n-1) + .., B = b_1 p^(n-1) + .. + b_n, with p = s or z, and a delay.
+
+    Attributes
+    ----------
+    a, b : (n,)
+        Coefficients.
+    cov : (2 n, 2 n)
+        Covariance of (a, b); NaN where it is not known.
+    delay : float
+        In the unit of dt; in discrete time whole samples times dt.
+    dt : float or None
+        Time between samples; None for continuous time.
+    """
+
+    a: Array
+    b: Array
+    cov: Array
+    delay: float
+    dt: float | None = None
+
+    @property
+    def a_std(self) -> Array:
+        std: Array = np.sqrt(np.diag(self.cov)[: len(self.a)])
+        return std
+
+    @property
+    def b_std(self) -> Array:
+        std: Array = np.sqrt(np.diag(self.cov)[len(self.a) :])
+        return std
+
+    def _mapped(self, f: Any) -> tuple[Array, Array]:
+        """f of (a, b), and its covariance."""
+        x = np.concatenate([self.a, self.b])
+        J = jacobian(lambda rows: np.array([f(row) for row in rows]), x[None], np.sqrt(np.abs(np.diag(self.cov)))[None])
+        return f(x), J[0] @ self.cov @ J[0].T
+
+    def time_constants(self) -> Response:
+        """1 / |s| of every pole of a continuous system, the slowest first, with their standard deviations."""
+        if self.dt is not None:
+            raise ValueError("time_constants: convert to continuous time first.")
+        n = len(self.a)
+        value, cov = self._mapped(lambda x: np.sort(1.0 / np.abs(np.roots(np.append(1.0, x[:n]))))[::-1])
+        return Response(value, np.sqrt(np.diag(cov)))
+
+    def discrete(self, dt: float) -> Transfer:
+        """The system for inputs held over dt; ValueError if it is discrete already."""
+        step = float(numbers("discrete", "dt", dt, ndim=0, low=0.0, strict=True))
+        if self.dt is not None:
+            raise ValueError("discrete: this system is in discrete time.")
+        n = len(self.a)
+        x, cov = self._mapped(lambda x: _sampled(x[:n], x[n:], step))
+        return Transfer(x[:n], x[n:], cov, self.delay, step)
+
+    def continuous(self) -> Transfer:
+        """The system whose samples these are; ValueError if there is none, or it is continuous already."""
+        if self.dt is None:
+            raise ValueError("continuous: this system is in continuous time.")
+        n, step = len(self.a), self.dt
+        x, cov = self._mapped(lambda x: _between(x[:n], x[n:], step))
+        return Transfer(x[:n], x[n:], cov, self.delay)
+
+
+def _matrices(a: Array, b: Array) -> tuple[Array, Array]:
+    """Observable companion form: x' = F x + g u, y = x_1."""
+    F = np.diag(np.ones(len(a) - 1), 1)
+    F[:, 0] = -a
+    return F, b
+
+
+def _polynomials(F: Array, g: Array) -> Array:
+    """(a, b) of x' = F x + g u, y = x_1."""
+    n = len(g)
+    a = np.poly(F)[1:]
+    out = np.array([1.0, *np.zeros(n - 1)])
+    # B = sum_k p^(n-1-k) sum_j a_j C F^(k-j) g
+    markov = [g[0] if k == 0 else float(out @ np.linalg.matrix_power(F, k) @ g) for k in range(n)]
+    full = np.append(1.0, a)
+    b = [sum(full[j] * markov[k - j] for j in range(k + 1)) for k in range(n)]
+    return np.concatenate([a, b]).real
+
+
+def _sampled(a: Array, b: Array, dt: float) -> Array:
+    from scipy import linalg
+
+    F, g = _matrices(a, b)
+    n = len(a)
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[:n, n] = F * dt, g * dt
+    moved = linalg.expm(whole)
+    return _polynomials(moved[:n, :n], moved[:n, n])
+
+
+def _between(a: Array, b: Array, dt: float) -> Array:
+    from scipy import linalg
+
+    Phi, gamma = _matrices(a, b)
+    n = len(a)
+    poles = np.linalg.eigvals(Phi)
+    if np.any((np.abs(poles.imag) < 1e-12) & (poles.real <= 1e-12)):
+        raise ValueError(
+            f"continuous: a pole at {poles.real.min():.3g} is the sample of no continuous system; sample faster, or "
+            "take a lower order."
+        )
+    whole = np.eye(n + 1)
+    whole[:n, :n], whole[:n, n] = Phi, gamma
+    moved = linalg.logm(whole).real / dt
+    return _polynomials(moved[:n, :n], moved[:n, n])
+
+
+def transfer(run: Followed, dt: float = 1.0, input: int | str = 0, at: int = -1) -> Transfer:
+    """The system of one sample from one input, in discrete time with its covariance; `Transfer.continuous` converts it.
+
+    Raises
+    ------
+    ValueError
+        For a model without transfer functions, or one whose output depends on the present input (nk = 0).
+    """
+    model, j = linear(run), input_of(run, input)
+    step = float(numbers("transfer", "dt", dt, ndim=0, low=0.0, strict=True))
+    theta, cov = taken(run, at)
+    B, A = model.transfers(theta)[1][j]
+    size = B.shape[-1]
+    delay = int(np.argmax(np.append(B[0] != 0.0, True)))
+    if delay == 0 or size <= delay:
+        raise ValueError(
+            "transfer: the output must depend on past inputs only, and on one of them; use nk of at least 1."
+        )
+    n = max(A.shape[-1] - 1, size - delay)
+
+    def coefficients(rows: Array) -> Array:
+        b, a = model.transfers(rows)[1][j]
+        found = np.zeros((len(rows), 2 * n))
+        found[:, : a.shape[-1] - 1] = a[:, 1:]
+        found[:, n : n + size - delay] = b[:, delay:]
+        return found
+
+    J = jacobian(coefficients, theta, np.sqrt(np.abs(np.einsum("tii->ti", cov))))[0]
+    x = coefficients(theta)[0]
+    return Transfer(x[:n], x[n:], J @ cov[0] @ J.T, (delay - 1) * step, step)

@@ -1,0 +1,261 @@
+"""What more is known of parameters: laws, constraints, a prior from the fleet; against dense and sampled twins."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import norm
+from support import damaged, same
+
+from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Law, Live, Regression, check_tracker, pool, track, tune
+from driftfit.use.constraints.constrained import Constrained
+from driftfit.use.constraints.half_spaces import half_space
+from driftfit.use.constraints.truncated import cut, moments
+
+LAWS = {"theta1": Law.returns(time=20, std=0.5), "theta2": Law.season(12, harmonics=2, q=1e-5)}
+TRACKER = Kalman(q=1e-4, r=0.04, laws=LAWS)
+
+
+def data(T=150, seed=0):
+    rng = np.random.default_rng(seed)
+    u = rng.normal(size=(T, 2))
+    theta = np.c_[1.0 + 0.3 * rng.normal(size=T), 2.0 + 0.5 * np.cos(2.0 * np.pi * np.arange(T) / 12)]
+    return np.sum(theta * u, axis=1) + 0.2 * rng.normal(size=T), u
+
+
+def dense(y, u, dt, drift, kappa=1e7):
+    """The same two laws, written as one dense state space with a wide prior: m1, d1, m2, c, c*, C, C*."""
+    H = np.array([[1, 1, 0, 0, 0, 0, 0], [0, 0, 1, 1, 0, 1, 0]], dtype=float)
+    x, P, found = np.zeros(7), np.diag([kappa, 0.25, *[kappa] * 5]), []
+    for t in range(len(y)):
+        F, Q, keep = np.eye(7), np.zeros(7), np.exp(-dt[t] / 20.0)
+        F[1, 1], Q[1], Q[2], Q[3:] = keep, 0.25 * (1.0 - keep**2), 1e-4 * dt[t], 1e-5 * dt[t]
+        for k in (1, 2):
+            c, s = np.cos(2.0 * np.pi * k * dt[t] / 12), np.sin(2.0 * np.pi * k * dt[t] / 12)
+            F[2 * k + 1 : 2 * k + 3, 2 * k + 1 : 2 * k + 3] = [[c, s], [-s, c]]
+        x, P = F @ x, F @ P @ F.T + np.diag(Q) * drift[t]
+        h = H.T @ u[t]
+        if np.isfinite(y[t]):
+            K = P @ h / (h @ P @ h + 0.04)
+            x, P = x + K * (y[t] - h @ x), (np.eye(7) - np.outer(K, h)) @ P @ (np.eye(7) - np.outer(K, h)).T
+            P += 0.04 * np.outer(K, K)
+        found.append((H @ x, np.sqrt(np.diag(H @ P @ H.T))))
+    return (np.array(part) for part in zip(*found, strict=True))
+
+
+def test_laws_against_a_dense_twin_with_uneven_times_drift_and_missing_outputs():
+    y, u = data()
+    rng = np.random.default_rng(1)
+    dt, drift = rng.choice([1.0, 0.5, 3.0], 150), rng.choice([1.0, 0.0, 20.0], 150)
+    y[rng.random(150) < 0.1] = np.nan
+    dt[0] = 1.0
+    run = track(Regression(2), TRACKER, y, u, time=np.cumsum(dt), dt=1.0, drift=drift)
+    theta, std = dense(y, u, dt, drift)
+    np.testing.assert_allclose(run.theta[15:], theta[15:], atol=1e-5)
+    np.testing.assert_allclose(run.std[15:], std[15:], rtol=1e-5)
+    assert np.isinf(run.std[3]).any()
+
+
+def test_walks_are_the_kalman_filter_and_trends_are_second_differences():
+    y, u = data()
+    walk = track(Regression(2), Kalman(q=1e-3, r=0.04, laws={"theta1": Law.walk(1e-3)}), y, u)
+    plain = track(Regression(2), Kalman(q=1e-3, r=0.04), y, u)
+    np.testing.assert_allclose(walk.theta[2:], plain.theta[2:], rtol=1e-10)
+    np.testing.assert_allclose(walk.std, plain.std, rtol=1e-10)
+    assert walk.loglik == pytest.approx(plain.loglik, rel=1e-12)
+    trend = Kalman(q=0.0, r=1.0, laws={name: Law.trend(1e-4) for name in ("theta1", "theta2")})
+    np.testing.assert_allclose(
+        track(Regression(2), trend, y, u).theta[5:], track(Regression(2), FLS(1e4, differences=2), y, u).theta[5:],
+        rtol=1e-9,
+    )  # fmt: skip
+
+
+def test_laws_live_in_lanes_in_files_and_in_other_units():
+    y, u = data()
+    y, _ = damaged(y, u[:, 0])
+    u = np.where(np.arange(150)[:, None] == 70, np.nan, u)
+    run = track(Regression(2), TRACKER, y, u)
+    live = Live(Regression(2), TRACKER)
+    for t in range(150):
+        if t == 75:
+            live = Live.from_bytes(live.to_bytes())
+        live.update(y[t], u[t])
+        assert same(live.theta, run.theta[t])
+    fleet = track(Regression(2), TRACKER, np.stack([y] * 33), np.stack([u] * 33), by="row")
+    assert all(same(fleet[k].theta, run.theta) and same(fleet[k].std, run.std) for k in (0, 32))
+    laws = {"theta1": Law.returns(time=20, std=0.5e-6), "theta2": Law.season(12, harmonics=2, q=1e-17)}
+    other = track(Regression(2), Kalman(q=1e-16, r=0.04, laws=laws), y, 1e6 * u)
+    np.testing.assert_allclose(1e6 * other.theta[12:], run.theta[12:], rtol=1e-6)
+
+
+def test_the_promises_of_a_tracker_hold_with_laws():
+    broken = check_tracker(Kalman(q=1e-6, r=0.01, laws={"theta1": Law.season(24)}), Regression(1))
+    assert [one for one in broken if not one.startswith("It does not follow")] == []  # its record is that of an ARX
+
+
+def test_a_known_mean_attracts_and_an_idle_input_holds_up_nothing():
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(300, 2))
+    u[:200, 1] = 0.0
+    y = u @ [2.5, 1.0] + 0.2 * rng.normal(size=300)
+    y[100:150] = np.nan
+    run = track(Regression(2), Kalman(q=0.0, r=0.04, laws={"theta1": Law.returns(5, 1.0, mean=2.0)}), y, u)
+    assert run.theta[149, 0] == pytest.approx(2.0, abs=1e-3)
+    assert run.std[149, 0] == pytest.approx(1.0, abs=1e-3)
+    assert np.isinf(run.std[199, 1])
+    assert run.theta[-1, 1] == pytest.approx(1.0, abs=0.1)
+    assert np.isfinite(run.loglik)
+
+
+def test_interventions_move_the_level():
+    live = Live(Regression(2), TRACKER)
+    for y, u in zip(*data(), strict=True):
+        live.update(y, u)
+    theta = live.theta
+    live.reset("theta1", theta=5.0)
+    live.reset("theta2", p=1.0)
+    assert live.theta == pytest.approx([5.0, theta[1]])
+    live.update(np.nan, [1.0, 1.0])
+    assert live.theta[0] == pytest.approx(5.0, abs=0.1)
+    assert live.std[1] > 0.9
+
+
+def test_what_does_not_fit_a_law_is_refused():
+    for laws, message in (
+        ({"b": Law.trend(1.0)}, "name 'b', which is no parameter"), ({"theta1": 3.0}, "must map names"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            track(Regression(2), Kalman(q=0.0, r=1.0, laws=laws), *data())
+    for make, message in (
+        (lambda: Law.season(4, harmonics=2), "half a circle"), (lambda: Law("returns"), "needs time, std"),
+        (lambda: Law.trend(-1.0), "at least 0"), (lambda: Kalman(q=np.eye(2), r=1.0, laws=LAWS), "must be"),
+        (lambda: track(Regression(2), TRACKER, *data()).smooth(), "has laws"),
+        (lambda: track(Regression(2), TRACKER, *data()).ahead(2), "laws by which theta moves"),
+        (lambda: tune(Regression(2), Kalman(laws=LAWS), *data()), "laws"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            make()
+    again = Kalman.from_settings(json.loads(json.dumps(TRACKER.settings())))
+    assert again == TRACKER == eval(repr(TRACKER))
+    assert hash(again) == hash(TRACKER)
+
+
+def test_cut_gaussians_against_sampled_ones():
+    names, rng = ("a", "b", "b[u]"), np.random.default_rng(0)
+    within = [half_space(text, names) for text in ("b >= 0", "0 <= a + b[u] <= 1", "2*a - b <= 0.5")]
+    root = rng.normal(size=(3, 3))
+    mu, S = np.array([0.2, -0.5, 0.3]), root @ root.T
+    x = rng.multivariate_normal(mu, S, size=1_000_000)
+    x = x[np.all([(x @ one.g >= one.low) & (x @ one.g <= one.high) for one in within], axis=0)]
+    mean, cov, _, _ = cut(mu[None], S[None], within)
+    np.testing.assert_allclose(mean[0], x.mean(axis=0), atol=0.03 * x.std())
+    np.testing.assert_allclose(np.sqrt(np.diag(cov[0])), x.std(axis=0), rtol=0.03)
+    # a half-line far in the tail: mean 1 / a beyond it, where the naive formula has lost all digits
+    mean, var = moments(np.array([0.0, 1e6]), np.array([np.inf, np.inf]))
+    np.testing.assert_allclose(mean, [np.sqrt(2.0 / np.pi), 1e6 + 1e-6], rtol=1e-12)
+    np.testing.assert_allclose(var, [1.0 - 2.0 / np.pi, 1e-12], rtol=1e-9)
+
+
+def test_bands_within_a_bound_cover_and_never_leave_it():
+    """Parameters from the prior that is cut, and their posterior: bands cover what they say, also beside the bound."""
+    rng = np.random.default_rng(0)
+    b = abs(0.3 * rng.normal(size=4000))
+    u = rng.normal(size=(4000, 8))
+    P = 1.0 / (1.0 / 0.09 + np.sum(u**2, axis=1))
+    free = P * np.sum(u * (b[:, None] * u + rng.normal(size=(4000, 8))), axis=1)
+    inside = Constrained(("b",), (half_space("b >= 0", ("b",)),), free[:, None], P[:, None, None])
+    low, high = inside.band()
+    assert (low >= 0.0).all()
+    assert np.mean((low[:, 0] < b) & (b < high[:, 0])) == pytest.approx(0.95, abs=0.01)
+    error, before = (np.sqrt(np.mean((one - b) ** 2)) for one in (inside.theta[:, 0], free))
+    assert error < 0.85 * before
+    assert np.mean(inside.prob) == pytest.approx(np.mean(norm.cdf(free / np.sqrt(P))), rel=1e-9)
+
+
+def test_planes_condition_and_streams_say_what_records_say():
+    y, u = data()
+    run = track(Regression(2), RLS(1.0), y, u)
+    inside = run.constrain("theta1 + theta2 == 3")
+    np.testing.assert_allclose(inside.theta[5:].sum(axis=1), 3.0, rtol=1e-12)
+    weights = run.cov(-1).sum(axis=1) / run.cov(-1).sum()
+    np.testing.assert_allclose(inside.theta[-1], run.theta[-1] - weights * (run.theta[-1].sum() - 3.0), rtol=1e-9)
+    assert np.isinf(inside.std[0]).any()
+    assert np.isnan(inside.prob[0]).all()
+    live = Live(Regression(2), RLS(1.0))
+    for one, row in zip(y, u, strict=True):
+        live.update(one, row)
+    np.testing.assert_allclose(live.constrain("theta1 + theta2 == 3").theta[0], inside.theta[-1], rtol=1e-12)
+    both = run.constrain("0 <= theta1 <= 0.5", "theta1 + theta2 <= 2")
+    assert both.theta[-1, 0] < 0.5
+    assert "theta1 + theta2 <= 2" in repr(both)
+    assert both.prob[-1, 0] < 0.01
+    assert both.cov(-1).shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("theta1", "is no constraint"), ("theta1 >=", "is no constraint"), ("theta1 * theta2 >= 0", "not linear"),
+        ("b >= 0", "not linear"), ("1 <= theta1 <= 0", "nothing meets"), ("0 <= theta1 <= theta2", "one sum"),
+        ("theta1 != 0", "must compare"), ("theta1 >= theta1", "one sum"), ("__import__('os') >= 0", "not linear"),
+    ],
+)  # fmt: skip
+def test_what_is_no_constraint_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        track(Regression(2), RLS(1.0), *data()).constrain(text)
+
+
+def test_constraints_need_a_covariance_and_a_text():
+    run = track(ARX(1, 1), AugmentedFLS(1.0), *(one[:, 0] if one.ndim > 1 else one for one in data()))
+    with pytest.raises(ValueError, match="has no covariance"):
+        run.constrain("a1 >= 0")
+    with pytest.raises(ValueError, match="at least one"):
+        track(Regression(2), RLS(1.0), *data()).constrain()
+
+
+def fleet_of(count, T, seed, tracker=None):
+    rng = np.random.default_rng(seed)
+    units = rng.multivariate_normal([1.0, 2.0], [[0.04, 0.01], [0.01, 0.01]], size=count)
+    u = rng.normal(size=(count, T, 2))
+    y = np.einsum("itk,ik->it", u, units) + 0.5 * rng.normal(size=(count, T))
+    return units, y, u, track(Regression(2), tracker or Kalman(q=0.0, r=0.25), y, u, by="row")
+
+
+def test_a_prior_of_a_fleet_is_the_maximum_and_each_unit_its_posterior():
+    units, y, u, fleet = fleet_of(40, 12, 0)
+    pooled = pool(fleet)
+    P, t = np.array([fleet[k].cov(-1) for k in pooled.keys]), pooled.own
+
+    def loss(x):
+        root = np.array([[x[0], 0.0], [x[1], x[2]]])
+        W = np.linalg.inv(root @ root.T + P)
+        V = np.linalg.inv(W.sum(axis=0))
+        off = t - V @ np.einsum("iab,ib->a", W, t)
+        total = np.linalg.slogdet(W)[1].sum() - np.einsum("ia,iab,ib->", off, W, off) + np.linalg.slogdet(V)[1]
+        return -0.5 * total
+
+    best = minimize(loss, [0.2, 0.05, 0.1], method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9})
+    assert pooled.loglik == pytest.approx(-best.fun, abs=1e-4)
+    prior = Kalman(q=0.0, r=0.25, theta0=pooled.mean, p0=pooled.cov)
+    again = track(Regression(2), prior, y, u, by="row")
+    np.testing.assert_allclose([again[k].theta[-1] for k in pooled.keys], pooled.theta, atol=1e-9)
+    error = [np.sqrt(np.mean((one - units) ** 2, axis=0)) for one in (pooled.theta, pooled.own)]
+    assert (error[0] < [0.9, 0.6] * error[1]).all()
+    assert pooled.spread == pytest.approx([0.2, 0.1], abs=0.06)
+
+
+def test_pooling_with_drift_in_other_units_and_what_is_refused():
+    _, y, u, fleet = fleet_of(30, 40, 1, Kalman(q=1e-4, r=0.25))
+    pooled = pool(fleet)
+    scaled = track(Regression(2), Kalman(q=1e-10, r=0.25), y, 1e3 * u, by="row")
+    np.testing.assert_allclose(1e3 * pool(scaled).mean, pooled.mean, rtol=1e-5)
+    np.testing.assert_allclose(1e6 * pool(scaled).cov, pooled.cov, rtol=0.02, atol=1e-4)
+    u[3, :, 1] = 0.0
+    with pytest.warns(UserWarning, match="1 of 30 units"):
+        part = pool(track(Regression(2), Kalman(q=1e-4, r=0.25), y, u, by="row"))
+    assert 3 not in part.keys
+    with pytest.raises(ValueError, match="diffuse start"):
+        pool(track(Regression(2), RLS(1.0), y[:5], u[:5], by="row"))
+    with pytest.raises(ValueError, match="at least 4 are needed"):
+        pool(track(Regression(2), Kalman(q=0.0, r=1.0), y[:2], u[:2], by="row"))
