@@ -128,7 +128,7 @@ def likelihoods(s: State, l: int) -> float:
             far = s.e_k[k, l] * s.e_k[k, l] * s.inverse[j, k, l] - nearest
             p = s.prior[k, l] * s.nu_prior[j, l] * np.sqrt(s.inverse[j, k, l]) * exp(-0.5 * far)
             s.joint[j, k, l] = p * (s.rare[l] if k == TOP else 1.0)
-    return nearest
+    return nearest  # type: ignore[no-any-return]
 
 
 @kernel
