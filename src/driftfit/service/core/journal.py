@@ -37,12 +37,13 @@ create table if not exists result (first integer primary key, count integer, at 
 create table if not exists program (tag blob primary key, about text);
 create table if not exists snapshot (unit integer primary key, number integer, state blob);
 create table if not exists block (unit integer, first integer, last integer, start real, stop real, count integer,
-    rows blob, extremes blob, primary key (unit, first)) without rowid;
+    rows blob, extremes blob, primary key (unit, first));
 create table if not exists event (id integer primary key, number integer, unit integer, at real, kind text,
     detail text);
 create index if not exists event_of_unit on event (unit, id);
 create table if not exists position (name text primary key, value text);
 """
+PRAGMAS = ("page_size=8192", "journal_mode=wal", "synchronous=full", "wal_autocheckpoint=2000", "temp_store=memory")
 FORMAT = "2"
 RESULTS_FROM, NEEDED_FROM = "results from", "needed from"
 """Keys of ``meta``: of `Journal.first_without_results` and `Journal.first_needed`."""
@@ -113,7 +114,7 @@ class Journal:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=10.0)
         self.path.chmod(0o600)
-        for line in ("journal_mode=wal", "synchronous=full", "wal_autocheckpoint=4000", "temp_store=memory"):
+        for line in PRAGMAS:
             self.db.execute(f"pragma {line}")
         self.db.executescript(SCHEMA)
         self.db.execute("insert or ignore into meta values ('format', ?)", (FORMAT,))
