@@ -33,9 +33,9 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it does other work."""
-PACE = 0.01
-"""Seconds from one transaction to the next at least: with single samples in a message the fixed cost of a group, about
-a millisecond, would otherwise be most of the work."""
+PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 8.0
+"""Seconds from one transaction to the next at least, and at least so many times what the last one took of the
+processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
 RETRY = 1.0
 """Seconds between two attempts to write the journal."""
 
@@ -112,9 +112,10 @@ class Engine:
     def run(self) -> None:
         """Work until `stop`."""
         while not self._stop.is_set():
-            begun = time.monotonic()
+            begun, used = time.monotonic(), time.thread_time()
             self.step(IDLE)
-            self._stop.wait(begun + PACE - time.monotonic())
+            pace = min(max(PACE, SHARE * (time.thread_time() - used)), SLOWEST_PACE)
+            self._stop.wait(begun + pace - time.monotonic())
         if not self.problem:  # otherwise nothing more may be written: sources send again what was not acknowledged
             self.step(0.0)
             self._store_states(everything=True)
