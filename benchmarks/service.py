@@ -36,7 +36,7 @@ from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
-from driftfit.service.supervisor import keep_what_is_loaded
+from driftfit.service.supervisor import cut_the_tail
 from driftfit.service.threads import SinkThread, SourceThread
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -291,7 +291,7 @@ def served(broker, folder, messages, size, units, rate=1_000_000, sink="sqlite")
     for thread in (*runners, worker):
         thread.start()
     time.sleep(1.0)
-    keep_what_is_loaded()
+    cut_the_tail()
     sender, before = send(broker, messages, size, units, rate), one.samples
     while one.samples == before:
         time.sleep(0.01)

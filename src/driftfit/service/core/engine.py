@@ -33,7 +33,7 @@ BUDGET = 0.02
 """Seconds of one transaction that may go into storing states."""
 IDLE = 0.25
 """Seconds that the engine waits for samples before it does other work."""
-PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 8.0
+PACE, SLOWEST_PACE, SHARE = 0.01, 0.025, 5.0
 """Seconds from one transaction to the next at least, and at least so many times what the last one took of the
 processor: the fixed cost of a group, about a millisecond, would otherwise be most of the work."""
 KEPT = 16
