@@ -26,12 +26,18 @@ class Advanced:
         """A field of the output at every sample of every series, (N,) or (N, n)."""
         shape = self.jobs[0].out[name].shape[1:-1]
         into = np.empty((len(self.records.y), int(np.prod(shape))))
-        for job in self.jobs:
-            lanes = np.flatnonzero(job.live)
-            series = job.lanes[lanes]
-            field = job.out[name].reshape(len(job.out), -1, len(job.lanes))
-            _natural(field, lanes, self.records.first[series], self.records.length[series], into)
+        self.columns([name], into)
         return into.reshape(-1, *shape)
+
+    def columns(self, names: Sequence[str], into: Array) -> None:
+        """Write fields of the output side by side at every sample of every series, ``into`` (N, k)."""
+        for job in self.jobs:
+            lanes, L = np.flatnonzero(job.live), len(job.lanes)
+            series, fields = job.lanes[lanes], [job.out.dtype.fields[name] for name in names]
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at, *_ in fields]
+            words = job.out.view(np.float64).reshape(len(job.out), -1)
+            first, length = self.records.first[series], self.records.length[series]
+            _natural(words, np.concatenate(begin), lanes, first, length, into)
 
     def lanes(self) -> list[tuple[Job, int]]:
         """The job and the lane of each series."""
@@ -70,10 +76,9 @@ def advance(
 
 
 @Driver
-def _natural(field: Array, lanes: Array, first: Array, length: Array, into: Array) -> None:
-    """Copy lanes of a field (T, k, L) to their rows of (N, k)."""
+def _natural(words: Array, begin: Array, lanes: Array, first: Array, length: Array, into: Array) -> None:
+    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows of (N, k)."""
     for j in range(len(lanes)):
-        l = lanes[j]
         for t in range(length[j]):
-            for i in range(field.shape[1]):
-                into[first[j] + t, i] = field[t, i, l]
+            for i in range(len(begin)):
+                into[first[j] + t, i] = words[t, begin[i] + lanes[j]]
