@@ -6,7 +6,7 @@ from scipy import signal
 
 from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
 from driftfit.models.polynomial import FORGOTTEN
-from driftfit.models.polynomial_steps import SETTLING
+from driftfit.models.polynomials.steps import SETTLING
 from driftfit.run.program import Program
 from driftfit.smooth.problem import replay
 
