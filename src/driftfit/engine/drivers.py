@@ -125,7 +125,8 @@ class TrackerSteps(NamedTuple):
     ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
-    With ``doubts`` the model weighs lags that the tracker doubts. Steps see the fields of the tracker and those that
+    With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
+    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that
     every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
     with ``reads_model`` they see those of the model too. ``outlined`` steps are compiled apart from the drivers, which
     call them (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes
@@ -142,6 +143,7 @@ class TrackerSteps(NamedTuple):
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
+    instruments: bool = False
     reads_model: bool = False
     outlined: bool = False
     note: Step = nothing
