@@ -189,6 +189,9 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
+    if opened:
+        places = tile.dtype.fields or {}
+        tile[EDGE][0, 0] = places[opened[0][0]][1] - places[EDGE][1]
     return tile
 
 

@@ -42,6 +42,7 @@ from __future__ import annotations
 from typing import Any
 
 from driftfit.engine.kernel import kernel
+from driftfit.engine.tracker_part import open_at
 from driftfit.trackers.bank.table import COUNTS, MATRIX, NUMBER, VECTOR, Table
 
 (
@@ -123,13 +124,13 @@ table_at = TABLE.at
 @kernel
 def report_at(s: Any) -> int:
     """Where the field `report` begins, the first of those whose length is no part of the compiled type."""
-    return s.report.ctypes.data  # type: ignore[no-any-return]
+    return open_at(s)  # type: ignore[no-any-return]
 
 
 @kernel
 def memory_at(s: Any) -> int:
     """Where the field `memory` begins, behind the report."""
-    return s.report.ctypes.data + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
+    return open_at(s) + 8 * s.theta.shape[1] * s.table[REPORT_AT, 2, 0]  # type: ignore[no-any-return]
 
 
 @kernel

@@ -283,4 +283,4 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), reads_model=True)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
