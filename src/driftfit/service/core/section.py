@@ -30,8 +30,8 @@ from driftfit.service.settings.config import UnitSettings
 AHEAD = 86_400.0
 """A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
 sample late."""
-COLUMNS = ("y_hat", "e", "s", "theta", "var")
-"""Fields of a tracker's output, in the order of the results."""
+COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
+"""Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
 """How samples are counted that do not enter the journal."""
 
@@ -167,11 +167,13 @@ class Section:
         values = np.empty((len(places), self.blocks.columns))
         values[:, TIME] = math.nan if rows.time is None else rows.time
         values[:, Y] = rows.values[:, 0]
-        found.columns(COLUMNS, values[:, Y_HAT:])
+        given = np.empty((len(places), values.shape[1] - Y_HAT + 1))
+        found.columns(COLUMNS, given)
+        values[:, Y_HAT:] = given[:, :-1]
         std = values[:, THETA + self.streams.program.model.n :]
         with np.errstate(invalid="ignore"):
             np.sqrt(std, out=std)
-        flags = (found.column("ok") > 0.0).astype(np.uint8) * np.uint8(OK)
+        flags = (given[:, -1] > 0.0).astype(np.uint8) * np.uint8(OK)
         np.add.at(self.streams.counted[:, USED], places, flags)
         lanes = None
         for k, place in enumerate(places[records.first].tolist()):
