@@ -69,6 +69,11 @@ def sort_out(series: Array, time: Array, waited: Array, newest: Array, hold: Any
     return Fates(order, fate, after)
 
 
+def ended(fate: Array, over: Array) -> Array:
+    """Fates (N,) where rows are of a series that is ``over`` (N,): what waits is released, since nothing else comes."""
+    return np.where((fate == WAITING) & over, RELEASED, fate)
+
+
 class HoldBack:
     """The rows of many series that wait, each with a time and numbers.
 
