@@ -178,3 +178,28 @@ def test_small_residuals_in_a_row_are_no_reason_for_narrow_bands(kind, most, lea
         inside.append(np.nanmean((np.abs(y - run.prediction) < 1.96 * run.innovation_std)[BURN:]))
     assert np.sqrt(np.mean(squares)) < most  # levels below the present noise: 0.095 and 0.14
     assert np.mean(inside) > least  # 0.76 and 0.89
+
+
+def jump_of_one(seed):
+    """Estimates and truth after one of three parameters has jumped, at sample 400 of 600."""
+    rng = np.random.default_rng([17, seed])
+    u, theta = rng.normal(size=(600, 3)), np.tile(rng.normal(size=3), (600, 1))
+    theta[400:, 1] += 1.5
+    y = np.sum(u * theta, axis=1) + 0.3 * rng.normal(size=600)
+    return (track(Regression(3), AdaptiveKalman(), y, u).theta - theta)[405:440]
+
+
+def test_the_jump_of_one_parameter_makes_the_others_no_less_certain():
+    off = np.array([jump_of_one(seed) for seed in range(8)])
+    jumped, others = np.sqrt(np.mean(off[..., 1] ** 2)), np.sqrt(np.mean(off[..., [0, 2]] ** 2))
+    assert others < 0.05
+    assert jumped < 0.22
+
+
+def test_what_never_changes_is_expected_to_change_less_often():
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(6000, 3))
+    run = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] + 0.3 * rng.normal(size=6000), u)
+    jumps = track(Regression(3), AdaptiveKalman(), u @ [1.0, -0.5, 2.0] * (1.0 + np.arange(6000) // 100 % 2), u)
+    assert run.state["calm"] < 0.5
+    assert jumps.state["calm"] == 1.0

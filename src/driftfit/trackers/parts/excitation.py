@@ -20,7 +20,7 @@ import numpy as np
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.outlying_readings import FIRST
 
-MEMORY = 200.0
+MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
 DULL = 1e-4
 """A square below this share of the mean square counts as no excitation."""
