@@ -1,8 +1,12 @@
 """Spark: batch and streams give what `track` gives on one machine, bit for bit, also after a crash."""
 
+import importlib
 import os
+import re
+import textwrap
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -17,6 +21,8 @@ from driftfit.bridges.spark.session import missing
 if reason := missing():
     pytest.skip(reason, allow_module_level=True)
 
+PAGE = Path(__file__).parent.parent / "docs" / "spark.md"
+
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning:pyspark", "ignore::ResourceWarning")
 
 
@@ -26,7 +32,8 @@ def session():
         warnings.simplefilter("ignore")
         found = spark.session(
             "local[2]", spark__sql__shuffle__partitions="2", spark__ui__enabled="false", spark__driver__memory="1g",
-            spark__python__unix__domain__socket__enabled="true",
+            spark__python__unix__domain__socket__enabled="true", spark__sql__codegen__wholeStage="false",
+            spark__driver__extraJavaOptions="-XX:TieredStopAtLevel=1 -XX:+UseSerialGC",  # half the CPU of short jobs
         )  # fmt: skip
         found.sparkContext.setLogLevel("OFF")
         yield found
@@ -206,3 +213,25 @@ def test_a_stream_with_keyed_state_gives_what_the_sorted_table_gives(session, tm
     expired = found.filter(pl.col("failed") == "silent for too long").select("unit", "state").rows()
     assert [unit for unit, _ in expired] == ["0", "1", "2"]
     assert {unit: state[24:] for unit, state in expired} == packed(fleet)
+
+
+def test_the_chapter_is_followed_word_by_word(session, tmp_path, monkeypatch, capsys):
+    """Its first section, from the Parquet file to the table that it shows."""
+    monkeypatch.chdir(tmp_path)
+    chapter = PAGE.read_text().split("\n## ")[1]
+    blocks = re.findall(r"(?:^    .*\n|^\n)+", re.sub(r"```.*?```", "", chapter, flags=re.S), re.M)
+    code = "".join(textwrap.dedent(one) for one in blocks if re.match(r"\s*(import|from) ", one))
+    exec(compile(code, PAGE.name, "exec"), {})
+    (table,) = re.findall(r"```text\n(.*?)```", chapter, re.S)
+    assert capsys.readouterr().out.split() == table.split()
+
+
+def test_benchmarks_run_quickly(session, capsys):
+    """The costs in small, and a stream whose driver and worker are killed in the middle of a batch."""
+    for name in ("spark", "spark_kill"):
+        importlib.import_module(f"benchmarks.{name}").main(True)
+    printed = capsys.readouterr().out
+    assert "500 units" in printed
+    assert printed.count("killed the ") == 2
+    for what in ("lost", "doubled", "results that differ", "states that differ"):
+        assert re.search(rf"^ *{what} +0$", printed, re.M)

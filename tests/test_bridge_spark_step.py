@@ -231,3 +231,14 @@ def test_what_is_missing_is_said(monkeypatch, tmp_path):
     assert "needs PySpark 4; this is 3.5.1" in missing()
     monkeypatch.setitem(sys.modules, "pyspark", None)
     assert missing() == "driftfit.bridges.spark needs PySpark: pip install driftfit[spark]"
+
+
+def test_a_table_without_a_usable_unit_gives_reasons():
+    rows = pl.DataFrame({"unit": ["a", None], "t": [None, 1.0], "y": [1.0, 1.0], "u": [1.0, 1.0]})
+    for kind in ("samples", "summary", "verdict", "states"):
+        _, found = pieces_of(rows.with_columns(pl.col("t").cast(pl.Float64)), task_of(), kind)
+        assert found["failed"].to_list() == ["no row has a time", "rows without a unit"]
+    stream = ByHand()
+    stream.batch(rows)
+    assert stream.found["failed"][0]["failed"].to_list() == ["rows without a unit"]
+    assert stream.found["late"][0]["failed"].to_list() == ["without a time"]

@@ -153,6 +153,8 @@ def _processor(unit: Unit, names: Sequence[str], span: float | None) -> Any:
             yield from rows_for(key, found)
 
         def handleExpiredTimer(self, key: Any, timerValues: Any, expiredTimerInfo: Any) -> Iterator[Any]:  # noqa: N802
+            if not self.state.exists():
+                return
             before, now = bytes(self.state.get()[0]), timerValues.getCurrentWatermarkInMs()
             if tuple(key) in self.came:
                 self.set(before, now)
