@@ -266,7 +266,7 @@ def in_span(s: State, l: int) -> None:
             enter_bank(s, column, l)
             if not outside:
                 e, v = s.y[l] - s.y_hat[l], s.s[l]
-                floats(report_at(s), s.report.shape[0], s.theta.shape[1])[0, l] = -0.5 * (
+                floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
                     log(2.0 * np.pi * v) + e * e / v
                 )
     else:
