@@ -319,8 +319,9 @@ def _advance(tracker: TrackerSteps) -> Any:
         return advance
 
     def start(s: State) -> None:
+        alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
+            if alone or s.root[l] > 0:
                 begin(s, l)
             else:
                 predict(s, l)
