@@ -347,8 +347,9 @@ class Receiver(http.server.BaseHTTPRequestHandler):
     got, answers = [], []
 
     def do_POST(self):
-        body = json.loads(self.rfile.read(int(self.headers["content-length"])))
-        self.got.append((self.headers["idempotency-key"], body))
+        body = self.rfile.read(int(self.headers["content-length"])).decode()
+        read = json.loads(body) if self.headers["content-type"] == "application/json" else body
+        self.got.append((self.headers["idempotency-key"], read, self.headers["title"]))
         self.send_response(self.answers.pop(0) if self.answers else 200)
         self.end_headers()
 
@@ -377,7 +378,7 @@ def test_webhook_tries_again(tmp_path, monkeypatch):
     server.shutdown()
     server.server_close()
     engine.close()
-    assert len({key for key, _ in Receiver.got}) == 1
+    assert len({key for key, *_ in Receiver.got}) == 1
     assert Receiver.got[-1][1]["unit"] == "a"
     assert runner.failures == 2
     with pytest.raises(ValueError, match="without a password"):

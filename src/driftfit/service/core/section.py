@@ -18,6 +18,7 @@ from driftfit.data.record import Records
 from driftfit.engine.kernel import Array
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
 from driftfit.service.core.blocks import Blocks
@@ -52,6 +53,17 @@ class Section:
             self.blocks.grow(self.streams.capacity)
         self.units.append(unit)
         return unit
+
+    def prepare(self) -> None:
+        """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
+        for count in (1, FEWEST) if len(self.units) >= FEWEST else (1,):
+            trial = Section(self.streams.index, self.streams.settings)
+            for k in range(count):
+                trial.add(k, "")
+            number = np.arange(count, dtype=np.int32)
+            time = None if self.streams.settings.time is None else np.zeros(count)
+            values = np.zeros((count, len(self.streams.settings.columns)))
+            trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
     def admit(self, places: Array, time: Array | None, values: Array) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
