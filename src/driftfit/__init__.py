@@ -10,6 +10,7 @@ from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.continuous.process import process_model
+from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
@@ -80,6 +81,7 @@ __all__ = [
     "Change",
     "Chebyshev",
     "ConformalFactor",
+    "ContinuousTransfer",
     "DataWarning",
     "DeadZone",
     "Decide",
