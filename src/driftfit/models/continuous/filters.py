@@ -231,6 +231,8 @@ def _inputs(o: Orders) -> tuple[Any, Step]:
                 s.driven[j, l] = 1.0
             s.last[j, l] = u if known else s.last[j, l]
             advance(s, j, 0, s.last[j, l], 0.0, l)
+            for i in range(2 * n):
+                s.chain[j, i, l] = s.chain[j, i, l] if abs(s.chain[j, i, l]) < LARGEST else 0.0
             complete = complete & known
         return complete
 
