@@ -55,6 +55,7 @@ from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.laws.law import Law
+from driftfit.trackers.particle_filter import ParticleFilter
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
@@ -103,6 +104,7 @@ __all__ = [
     "Model",
     "OutputError",
     "Outputs",
+    "ParticleFilter",
     "PiecewiseLinear",
     "Polynomial",
     "PolynomialModel",
