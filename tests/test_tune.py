@@ -311,6 +311,8 @@ def test_a_profile_stays_within_the_range_of_the_others():
         return 5e3 * (points[:, 1] - 300.0 * points[:, 0]) ** 2 + 0.5 * points[:, 0] ** 2
 
     knobs = Knobs(low, high, np.zeros(2, bool), False, None, None, ("a", "b"), np.arange(2), lambda x: x)
-    found = Search(Counted(valley), knobs, np.zeros(2))
+    f = Counted(valley)
+    f(np.zeros((1, 2)))
+    found = Search(f, knobs, np.zeros(2))
     assert found.ridge(0)[1] == pytest.approx(300.0, rel=1e-3)
     assert found.profile(0, 0.95)[0] < 0.0 < found.profile(0, 0.95)[1]

@@ -85,8 +85,8 @@ class PolynomialModel(Model):
     Raises
     ------
     ValueError
-        If an order is negative, the numbers of inputs disagree, the point does not have the length of theta, or there
-        is nothing to estimate.
+        If an order is negative, the numbers of inputs disagree, the point has another length than theta, or there is
+        nothing to estimate.
     """
 
     na: int = 0
