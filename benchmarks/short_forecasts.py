@@ -40,7 +40,7 @@ def main() -> None:
             y = signal.lfilter([0.0, 1.0], plant, u) + signal.lfilter(numerator, denominator, e)
             fleet = track(model, RLS(1.0), y[:, :T], u[:, :T], by="row")
             inside = np.zeros(H)
-            for k, run in enumerate(fleet[key] for key in fleet.keys()):
+            for k, run in enumerate(fleet[key] for key in fleet):
                 ahead = run.forecast(H, u[k, T:])
                 inside += np.abs(y[k, T:] - ahead.y_hat) < 1.96 * ahead.y_std
             share = inside / records
