@@ -123,11 +123,12 @@ class TrackerSteps(NamedTuple):
     ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
-    With ``doubts`` the model weighs lags that the tracker doubts. Steps see the fields of the tracker and those that
-    every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
-    with ``reads_model`` they see those of the model too. ``outlined`` steps are compiled apart from the drivers, which
-    call them (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes
-    before all of them and may write what they change later.
+    With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
+    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that every record has but
+    for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`); with ``reads_model`` they
+    see those of the model too. ``outlined`` steps are compiled apart from the drivers, which call them
+    (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes before all of
+    them and may write what they change later.
     """
 
     predict: Step
@@ -140,6 +141,7 @@ class TrackerSteps(NamedTuple):
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
+    instruments: bool = False
     reads_model: bool = False
     outlined: bool = False
     note: Step = nothing
@@ -186,8 +188,7 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
         for name, value in start.items():
             tile[name][0, ..., l] = value
     if opened:
-        places = tile.dtype.fields or {}
-        tile[BOUNDARY][0, 0] = places[opened[0][0]][1] - places[BOUNDARY][1]
+        tile[BOUNDARY][0, 0] = tile[opened[0][0]].ctypes.data - tile[BOUNDARY].ctypes.data
     return tile
 
 
