@@ -88,6 +88,11 @@ def _all_in_order(series: Array, time: Array, newest: Array) -> Array | None:
     return None if (time <= before).any() else ends
 
 
+def ended(fate: Array, over: Array) -> Array:
+    """Fates (N,) where rows are of a series that is ``over`` (N,): what waits is released, since nothing else comes."""
+    return np.where((fate == WAITING) & over, RELEASED, fate)
+
+
 class HoldBack:
     """The rows of many series that wait, each with a time and numbers.
 
