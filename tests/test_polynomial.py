@@ -4,9 +4,23 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from driftfit import ARMAX, ARX, OE, RLS, AdaptiveKalman, BoxJenkins, InstrumentalVariables, Kalman, Live, track
+from driftfit import (
+    ARMAX,
+    ARX,
+    OE,
+    RLS,
+    AdaptiveKalman,
+    Bank,
+    BoxJenkins,
+    Change,
+    InstrumentalVariables,
+    Kalman,
+    Live,
+    Sensor,
+    track,
+)
 from driftfit.models.polynomial import FORGOTTEN
-from driftfit.models.polynomial_steps import SETTLING
+from driftfit.models.polynomials.steps import SETTLING
 from driftfit.run.program import Program
 from driftfit.smooth.problem import replay
 
@@ -230,3 +244,15 @@ def test_gains_and_responses_of_transfer_functions():
     for verb in (lambda: run.simulate(u[:5], y=y[:2]), run.long_run):
         with pytest.raises(ValueError, match=r"from rest|is for ARX"):
             verb()
+
+
+def test_a_frozen_sensor_repeats_readings_and_not_what_is_left_of_them():
+    """The regression of a model that is linearised at every sample has another output: the reading less a shift."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=400)
+    y = 20.0 + signal.lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=400)
+    y[200:220] = y[199]
+    sensors = [Sensor.nominal(r=0.0025), Sensor.frozen(0.01)]
+    bank = Bank([Change(q=1e-6)], sensors, (None, [[0.98, 0.02], [0.05, 0.95]]), p0=10.0)
+    found = track(OE(1, 1, offset=True), bank, y, u).hypotheses.found()
+    assert [(event.span.first, event.span.last) for event in found if event.span.first > 180] == [(200, 219)]

@@ -179,7 +179,7 @@ def test_a_node_of_sparkplug_is_asked_for_its_birth(tmp_path):
     node.loop_start()
     url = f"mqtt://127.0.0.1:{broker.port}"
     reader = Mqtt("plant", url=url, topic="spBv1.0/plant/+/#", payload="sparkplug").open(None)
-    until(lambda: reader.client.is_connected() and node.is_connected())
+    until(lambda: reader.read(0.01) or (reader.client.is_connected() and node.is_connected()))
     time.sleep(0.3)  # both have subscribed
     node.publish("spBv1.0/plant/DDATA/edge/7", field(1, 900) + metric(30.0, alias=1), qos=1)
     found = []

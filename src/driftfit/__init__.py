@@ -9,6 +9,7 @@ from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.continuous.process import process_model
 from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
@@ -30,7 +31,6 @@ from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curv
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
-from driftfit.models.process import process_model
 from driftfit.models.regression import Regression
 from driftfit.models.state_space import StateSpace
 from driftfit.results import Track

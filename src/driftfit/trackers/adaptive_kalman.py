@@ -306,6 +306,7 @@ class AdaptiveKalman(Tracker):
             store_for_smoother=store_for_smoother,
             machines=(*FRAME, machine_weights),
             doubts=True,
+            outlined=True,
         )
 
     def regression(self, fields: Mapping[str, Array], phi: Array, y: Array) -> tuple[Array, Array]:

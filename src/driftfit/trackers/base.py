@@ -50,8 +50,11 @@ class Tracker(Settings, ABC):
     required: ClassVar[tuple[str, ...]] = ()
     width: ClassVar[int] = 32
     outputs: ClassVar[tuple[str, ...]] = ()
-    replaces: ClassVar[tuple[str, ...]] = ()
-    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's."""
+    replaces: ClassVar[tuple[str, ...]] = ("shift",)
+    """Fields of the model's memory whose start the tracker gives; all its other names must differ from the model's.
+    ``shift`` is common to all: what the model subtracted from y, for trackers that judge readings
+    (`driftfit.trackers.parts.resolution`).
+    """
     weighs: ClassVar[bool] = False
     """Whether it weighs hypotheses, and so has ``run.hypotheses``."""
     smoother_fields: ClassVar[tuple[str, ...]] = ()

@@ -37,12 +37,12 @@ class Counted:
     """An objective that stores every point at which it was evaluated."""
 
     def __init__(self, objective: Objective) -> None:
-        self._objective = objective
+        self.objective = objective
         self.points: list[Array] = []
         self.values: list[Array] = []
 
     def __call__(self, points: Array) -> Array:
-        values = self._objective(points)
+        values = self.objective(points)
         self.points.append(points)
         self.values.append(values)
         return values

@@ -28,12 +28,20 @@ class Advanced:
         """A field of the driver's output at every sample: (N, ..), or (N, ny, ..) of several outputs."""
         shape, ny = self.jobs[0].out[name].shape[1:-1], self.records.ny
         into = np.empty((len(self.records.y), ny, int(np.prod(shape))))
-        for job in self.jobs:
-            lanes = np.flatnonzero(job.live)
-            series, output = np.divmod(job.lanes[lanes], ny)
-            field = job.out[name].reshape(len(job.out), -1, len(job.lanes))
-            _natural(field, lanes, self.records.first[series], self.records.length[series], output, into)
+        self.columns([name], into)
         return into.reshape(-1, *((ny,) if self.records.outputs else ()), *shape)
+
+    def columns(self, names: Sequence[str], into: Array) -> None:
+        """Write fields of the output at every sample side by side ``into`` (N, k), or (N, ny, k) of several outputs."""
+        into = into[:, None] if into.ndim == 2 else into
+        for job in self.jobs:
+            lanes, L = np.flatnonzero(job.live), len(job.lanes)
+            series, output = np.divmod(job.lanes[lanes], self.records.ny)
+            fields = [job.out.dtype.fields[name] for name in names]
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at, *_ in fields]
+            words = job.out.view(np.float64).reshape(len(job.out), -1)
+            first, length = self.records.first[series], self.records.length[series]
+            _natural(words, np.concatenate(begin), lanes, first, length, output, into)
 
     def lanes(self) -> list[tuple[Job, int]]:
         """The job and the lane of each program."""
@@ -73,10 +81,9 @@ def advance(
 
 
 @Driver
-def _natural(field: Array, lanes: Array, first: Array, length: Array, output: Array, into: Array) -> None:
-    """Copy lanes of a field (T, k, L) to their rows and outputs of (N, ny, k)."""
+def _natural(words: Array, begin: Array, lanes: Array, first: Array, length: Array, output: Array, into: Array) -> None:
+    """Copy lanes of an output (T, words), whose fields ``begin`` (k,) at these words, to their rows of (N, ny, k)."""
     for j in range(len(lanes)):
-        l = lanes[j]
         for t in range(length[j]):
-            for i in range(field.shape[1]):
-                into[first[j] + t, output[j], i] = field[t, i, l]
+            for i in range(len(begin)):
+                into[first[j] + t, output[j], i] = words[t, begin[i] + lanes[j]]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.kernel import Array
+from driftfit.engine.kernel import Array, Driver
 from driftfit.service.core.results import TIME, Results, S
 
 SIZE = 64
@@ -31,6 +31,11 @@ class Blocks:
         """Units for which there is room."""
         return len(self._count)
 
+    @property
+    def columns(self) -> int:
+        """Numbers of a result."""
+        return int(self._values.shape[2])
+
     def grow(self, capacity: int) -> None:
         """Make room for more units."""
         more = capacity - len(self._count)
@@ -42,49 +47,66 @@ class Blocks:
 
     def add(self, places: Array, results: Results) -> list[tuple[Any, ...]]:
         """Add results, sorted by place (N,); the rows of the table ``block`` for the blocks that they complete."""
-        values, found = history_of(results), []
-        new = np.flatnonzero(np.append(True, places[1:] != places[:-1]))
-        at = self._count[places] + np.arange(len(places)) - np.repeat(new, np.diff(np.append(new, len(places))))
-        for turn in range(int(at.max()) // SIZE + 1):
-            now = np.flatnonzero(at // SIZE == turn)
-            here, number = places[now], results.number[now]
-            self._values[here, at[now] - turn * SIZE] = values[now]
-            begun = here[self._count[here] == 0]
-            self._first[begun], self._last[begun] = np.iinfo(np.int64).max, 0
-            np.minimum.at(self._first, here, number)
-            np.maximum.at(self._last, here, number)
-            np.add.at(self._count, here, 1)
-            full = np.unique(here[self._count[here] == SIZE])
-            if full.size:
-                owner = dict(zip(here.tolist(), results.unit[now].tolist(), strict=True))
-                found += self._rows(full, [owner[place] for place in full.tolist()])
-        return found
+        most = len(places) // SIZE + np.count_nonzero(places[1:] != places[:-1]) + 1
+        rows = np.empty((most, SIZE, self.columns))
+        extremes, about = np.empty((most, 3, self.columns)), np.zeros((most + 1, 3), np.int64)
+        kept = (self._values, self._count, self._first, self._last)
+        _add(*results, places, *kept, rows, extremes, about)
+        owners, first, last = about[: about[-1, 0]].T.tolist()
+        return [
+            (unit, a, b, *rows[k, :: SIZE - 1, TIME].tolist(), SIZE, rows[k].tobytes(), extremes[k].tobytes())
+            for k, (unit, a, b) in enumerate(zip(owners, first, last, strict=True))
+        ]
 
     def flush(self, place: int, unit: int) -> list[tuple[Any, ...]]:
         """The row of the table ``block`` for what a unit has so far; none if it has nothing."""
-        return self._rows(np.array([place]), [unit]) if self._count[place] else []
-
-    def _rows(self, places: Array, units: list[int]) -> list[tuple[Any, ...]]:
-        """The blocks at places with equal counts, which become empty."""
-        count = int(self._count[places[0]])
-        values = self._values[places, :count]
-        extremes, first, last = extremes_of(values), self._first[places].tolist(), self._last[places].tolist()
-        self._count[places] = 0
-        start, stop = (values[:, k, TIME].tolist() for k in (0, -1))
-        return [
-            (*about, count, values[k].tobytes(), extremes[k].tobytes())
-            for k, about in enumerate(zip(units, first, last, start, stop, strict=True))
-        ]
+        count = int(self._count[place])
+        if not count:
+            return []
+        self._count[place] = 0
+        values, (first, last) = self._values[place, :count], (int(one[place]) for one in (self._first, self._last))
+        start, stop = values[0, TIME].item(), values[-1, TIME].item()
+        return [(unit, first, last, start, stop, count, values.tobytes(), extremes_of(values).tobytes())]
 
 
-def history_of(results: Results) -> Array:
-    """The columns of the history (N, 5 + 2 n); where samples have no times their numbers are used."""
-    values = results.values.copy()
-    untimed = np.isnan(values[:, TIME])
-    values[untimed, TIME] = results.number[untimed]
-    with np.errstate(invalid="ignore"):
-        values[:, S] = np.sqrt(values[:, S])
-    return values
+@Driver
+def _add(
+    number: Array, unit: Array, flags: Array, given: Array, places: Array, values: Array, count: Array, first: Array,
+    last: Array, rows: Array, extremes: Array, about: Array,
+) -> None:  # fmt: skip
+    """Copy results to the blocks of their places; what is complete is moved to ``rows``, with (unit, first, last).
+
+    How many blocks that are is written into the last row of ``about``. Where samples have no times their numbers are
+    used; variances of innovations become standard deviations.
+    """
+    complete = 0
+    for i in range(len(number)):
+        p = places[i]
+        k = count[p]
+        for c in range(given.shape[1]):
+            values[p, k, c] = given[i, c]
+        if np.isnan(values[p, k, TIME]):
+            values[p, k, TIME] = number[i]
+        values[p, k, S] = np.sqrt(values[p, k, S])
+        first[p] = min(number[i], first[p]) if k else number[i]
+        last[p] = max(number[i], last[p]) if k else number[i]
+        count[p] = k + 1
+        if k + 1 < SIZE:
+            continue
+        rows[complete] = values[p]
+        for c in range(given.shape[1]):
+            low, high, total, fine = np.inf, -np.inf, 0.0, 0
+            for t in range(SIZE):
+                x = values[p, t, c]
+                if np.isfinite(x):
+                    low, high, total, fine = min(low, x), max(high, x), total + x, fine + 1
+            extremes[complete, 0, c] = low if fine else np.nan
+            extremes[complete, 1, c] = high if fine else np.nan
+            extremes[complete, 2, c] = total / fine if fine else np.nan
+        about[complete, 0], about[complete, 1], about[complete, 2] = unit[i], first[p], last[p]
+        count[p] = 0
+        complete += 1
+    about[-1, 0] = complete
 
 
 def extremes_of(values: Array) -> Array:

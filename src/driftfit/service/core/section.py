@@ -22,7 +22,7 @@ from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
 from driftfit.service.core.blocks import Blocks
 from driftfit.service.core.journal import Rows
-from driftfit.service.core.results import ALARM, OK, THETA, Results
+from driftfit.service.core.results import ALARM, OK, THETA, TIME, Y_HAT, Results, Y
 from driftfit.service.core.streams import SAMPLES, USED, Streams
 from driftfit.service.core.unit import Out, Unit
 from driftfit.service.settings.config import UnitSettings
@@ -30,6 +30,8 @@ from driftfit.service.settings.config import UnitSettings
 AHEAD = 86_400.0
 """A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
 sample late."""
+COLUMNS = ("y_hat", "e", "s", "theta", "var")
+"""Fields of a tracker's output, in the order of the results."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
 """How samples are counted that do not enter the journal."""
 
@@ -162,11 +164,13 @@ class Section:
     def _tell(self, found: Advanced, rows: Rows, noise: Array, number: Array, out: Out) -> None:
         """Pass on results; ``rows`` have places for units."""
         places, records = rows.unit, found.records
+        values = np.empty((len(places), self.blocks.columns))
+        values[:, TIME] = math.nan if rows.time is None else rows.time
+        values[:, Y] = rows.values[:, 0]
+        found.columns(COLUMNS, values[:, Y_HAT:])
+        std = values[:, THETA + self.streams.program.model.n :]
         with np.errstate(invalid="ignore"):
-            std = np.sqrt(found.column("var"))
-        time = np.full(len(places), math.nan) if rows.time is None else rows.time
-        heads = np.column_stack([time, rows.values[:, 0], *(found.column(name) for name in ("y_hat", "e", "s"))])
-        values = np.concatenate([heads, found.column("theta"), std], axis=1)
+            np.sqrt(std, out=std)
         flags = (found.column("ok") > 0.0).astype(np.uint8) * np.uint8(OK)
         np.add.at(self.streams.counted[:, USED], places, flags)
         lanes = None

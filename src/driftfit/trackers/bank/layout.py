@@ -58,11 +58,13 @@ is another than that of one nominal interval, PARTED that leaves are continued a
 WAITING, READY = 0, -1
 (
     IN_Y, IN_NOISE, IN_DT, IN_TIME, IN_OK, IN_SEEN, R, FADE, LEAST, LAST, Y_HAT, S2, EVIDENCE, WINDOW, KEPT,
-    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SIZE,
-) = range(22)  # fmt: skip
+    SQUARES, TIMES, LIMIT, ELAPSED, MOST, FREEDOM, SHIFT, READING, LOWEST, HIGHEST, DOUBTS, SIZE,
+) = range(27)  # fmt: skip
 """Numbers of the present sample: what comes in, and what goes out. MOST is the largest mean square that a leaf's own
 prediction may have in its output lags (`driftfit.trackers.bank.leaves.lags`). FREEDOM is that of an estimated noise
-variance before the tree grows: the residuals until then; inf for a variance that is given.
+variance before the tree grows: the residuals until then; inf for a variance that is given. The reading is y + SHIFT
+(`driftfit.trackers.parts.resolution`). READING is the last one that counted, LAST the same less the present shift;
+LOWEST and HIGHEST are the limits of all that counted. DOUBTS is the recent number of refused samples within them.
 """
 NEVER = 1e9
 """Levels since the last change of a leaf that has none, or more."""
