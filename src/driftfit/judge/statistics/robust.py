@@ -24,10 +24,15 @@ INSIDE = 0.9733
 
 def median(x: Array) -> float:
     """Median of finite values x (N,), N > 0; a quarter of the time of NumPy's, which is general."""
-    half = len(x) // 2
-    ordered = np.partition(x, half)
-    above = float(ordered[half])
-    return above if len(x) % 2 else 0.5 * (above + float(ordered[:half].max()))
+    return float(medians(x))
+
+
+def medians(x: Array) -> Array:
+    """Medians over the last axis of finite values x (.., N), N > 0."""
+    N = x.shape[-1]
+    ordered = np.partition(x, N // 2, axis=-1)
+    above = ordered[..., N // 2]
+    return np.asarray(above if N % 2 else 0.5 * (above + ordered[..., : N // 2].max(axis=-1)))
 
 
 def deviation(x: Array) -> float:

@@ -51,10 +51,12 @@ from driftfit.trackers.bank.layout import (
     FADE,
     FAULTS,
     HEAD,
-    LAST,
+    HIGHEST,
     LEAVES,
     LIMIT,
+    LOWEST,
     MOST_REPORTED,
+    READING,
     ROW,
     SETTLED,
     SIZE,
@@ -284,7 +286,8 @@ class Bank(Tracker):
         P0 = np.zeros((n, n)) if self.p0 is None else matrix("Bank", "p0", self.p0, n) * unit
         theta0 = vector("Bank", "theta0", self.theta0, n)
         sample, counters = np.zeros(SIZE), np.zeros(COUNT, int)
-        sample[LAST], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[READING], sample[R], sample[LIMIT] = np.nan, 1.0, nominal.limit or np.inf
+        sample[LOWEST], sample[HIGHEST] = np.inf, -np.inf
         sample[FADE] = 1.0 if nominal.memory is None else 1.0 - 1.0 / nominal.memory
         count, squares = (nominal.nu, nominal.nu) if guessed else (0.0, 0.0)
         squares *= nominal.guess or 0.0

@@ -21,6 +21,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, kernel
 from driftfit.trackers.parts.outlying_readings import FIRST
+from driftfit.trackers.parts.resolution import reading
 
 MEMORY = 50.0
 """Memory of the mean square of a regressor, in samples."""
@@ -61,7 +62,8 @@ def bounded(square: float, mean: float, count: float) -> float:
 def learn_scales(s: State, l: int) -> None:
     """Update the mean squares of the regressors, over samples at which they were excited, and of y."""
     s.seen_samples[l] += s.ok[l]
-    square = bounded(s.y[l] * s.y[l], s.power[l], s.seen_samples[l])
+    y = reading(s, l)
+    square = bounded(y * y, s.power[l], s.seen_samples[l])
     active = s.ok[l] if square > DULL * s.power[l] else 0.0
     s.power[l] += active * (square - s.power[l]) / min(max(s.seen_samples[l], 1.0), MEMORY)
     for i in range(s.theta.shape[0]):

@@ -16,6 +16,7 @@ from driftfit.trackers.bank.layout import (
     ALIKE,
     CHAINED,
     CLOCK,
+    DOUBTS,
     ELAPSED,
     ENTERS,
     EVIDENCE,
@@ -25,6 +26,7 @@ from driftfit.trackers.bank.layout import (
     FREEDOM,
     GROUPS,
     HELD,
+    HIGHEST,
     IMPOSSIBLE,
     IN_DT,
     IN_NOISE,
@@ -36,14 +38,17 @@ from driftfit.trackers.bank.layout import (
     LAST,
     LEAVES,
     LIMIT,
+    LOWEST,
     MOST,
     OPEN,
     PARENTS,
     PARTED,
+    READING,
     REFUSED,
     S2,
     SAMPLE_HEAD,
     SETTLED,
+    SHIFT,
     STORED,
     TAKEN,
     TREE_LEVELS,
@@ -95,6 +100,9 @@ from driftfit.trackers.bank.reducing.selection import (
 
 FAULTS_IN_A_ROW = 3
 """So many samples in a row, at most, are taken for fault codes."""
+DOUBTED, FORGOTTEN = 3.0, 0.98
+"""So many recent samples with an ordinary reading, at most; and the share of this number that is left after a sample
+that counts."""
 
 
 @shared
@@ -380,11 +388,15 @@ def let_pass(t: Any, L: int) -> None:
 @shared
 def refused(sample: Array, counters: Array) -> bool:
     """Whether a sample is so far from the forecast that it is taken for a fault code, and counts as missing. A value
-    that persists is not a fault code.
+    that persists is not a fault code; and where readings within the range of earlier ones are often far from their
+    forecasts, it is the forecasts that are wrong.
     """
-    far = sample[IN_Y] - sample[Y_HAT]
-    if counters[REFUSED] < FAULTS_IN_A_ROW and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
+    far, y = sample[IN_Y] - sample[Y_HAT], sample[IN_Y] + sample[SHIFT]
+    usual = sample[LOWEST] <= y <= sample[HIGHEST]
+    patient = counters[REFUSED] < FAULTS_IN_A_ROW and (sample[DOUBTS] < DOUBTED or not usual)
+    if patient and far * far > sample[LIMIT] * sample[LIMIT] * sample[S2]:
         sample[IN_OK], sample[IN_SEEN] = 0.0, 0.0
+        sample[DOUBTS] += 1.0 if usual else 0.0
         counters[REFUSED] += 1
         counters[FAULTS] += 1
         counters[AGAIN] = 1
@@ -419,8 +431,6 @@ def advance(t: Any) -> None:
         variance_factor(t, t.scratch, 0, L)
         widen(t.gap, weighted(t.leaves, L, t.scratch, 0), t.cov)
     sample[WINDOW] = marginals(t, L)
-    if sample[IN_SEEN] > 0.0:
-        sample[LAST] = sample[IN_Y]
 
 
 @shared
@@ -450,10 +460,20 @@ def note(t: Any, window: float) -> None:
         ring[row, SAMPLE_HEAD + e] = lag_prob[len(lag_prob) - 1, e]
 
 
+@shared
+def remember_reading(sample: Array) -> None:
+    """Update what is known of the readings, after a sample."""
+    if sample[IN_SEEN] > 0.0:
+        y = sample[IN_Y] + sample[SHIFT]
+        sample[READING], sample[DOUBTS] = y, FORGOTTEN * sample[DOUBTS]
+        sample[LOWEST], sample[HIGHEST] = min(sample[LOWEST], y), max(sample[HIGHEST], y)
+
+
 @machine
 def bank(address: int) -> None:
     """Process one sample, given the table of a bank. A sample refused as a fault code is processed again as missing."""
     t = table_at(address)
+    t.sample[LAST] = t.sample[READING] - t.sample[SHIFT]
     counters, head = t.counters, t.report
     begun = counters[SETTLED] == 1
     counters[AGAIN] = 1 if begun else 0
@@ -468,5 +488,6 @@ def bank(address: int) -> None:
             t.root[row, 0] = t.leaves[row, 0]
         head[0], head[1], head[2], head[3] = lone_density(t.sample), 0.0, 1.0, 1.0
     t.sample[ELAPSED] += t.sample[IN_DT]
+    remember_reading(t.sample)
     summary(t.lag_prob, t.newest)
     note(t, head[1])

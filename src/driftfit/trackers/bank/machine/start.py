@@ -12,8 +12,6 @@ from driftfit.trackers.bank.layout import (
     EXPANDED,
     GROUPS,
     IN_SEEN,
-    IN_Y,
-    LAST,
     LEAST,
     LEAVES,
     NEVER,
@@ -58,7 +56,6 @@ def wait(t: Any) -> None:
     y_hat = t.leaves[WEIGHT, :1]
     y_hat[0] = sample[Y_HAT] if abs(sample[Y_HAT]) < np.inf else 0.0
     push(t, 1, sample[IN_SEEN] > 0.0, y_hat, np.inf)
-    sample[LAST] = sample[IN_Y] if sample[IN_SEEN] > 0.0 else sample[LAST]
     counters[CLOCK] += 1
     if counters[SETTLED] == READY:
         begin(t, sample[TIMES], max(sample[SQUARES], sample[LEAST] * sample[TIMES]))

@@ -31,6 +31,7 @@ from driftfit.trackers.bank.layout import (
     S2,
     SAMPLE_AT,
     SETTLED,
+    SHIFT,
     SIZE,
     SQUARES,
     THETA_AT,
@@ -44,7 +45,7 @@ from driftfit.trackers.bank.layout import (
 from driftfit.trackers.bank.leaves.lags import PLAUSIBLE
 from driftfit.trackers.bank.leaves.own_sensor import own_address
 from driftfit.trackers.bank.machine.advance import bank
-from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, read_framed, write_walks
+from driftfit.trackers.bank.machine.framed import FRAMED, begin_framed, enter_bank, outgrown, read_framed, write_walks
 from driftfit.trackers.bank.machine.grow import FLOOR
 from driftfit.trackers.bank.machine.late_direction import begin_within, point_along
 from driftfit.trackers.parts.coordinates import FRAME, unseen_variance, whiten_within
@@ -185,7 +186,7 @@ def run(s: State, l: int) -> None:
 def hand_over(s: State, l: int) -> None:
     """Write the numbers of this sample for the compiled routine."""
     s.sample[IN_Y, l], s.sample[IN_NOISE, l], s.sample[IN_DT, l] = s.y[l], s.noise[l], s.dt[l]
-    s.sample[IN_TIME, l] = s.dt[l] * s.drift[l]
+    s.sample[IN_TIME, l], s.sample[SHIFT, l] = s.dt[l] * s.drift[l], s.shift[l]
     s.sample[IN_OK, l], s.sample[IN_SEEN, l] = s.ok[l], s.seen[l]
     s.sample[R, l], s.sample[LEAST, l] = s.r[l], max(FLOOR * s.power[l] + 1e-300, s.coarse[l])
     s.sample[ENTERS, l] = 0.0
@@ -246,20 +247,28 @@ def read(s: State, l: int) -> None:
 @kernel
 def in_span(s: State, l: int) -> None:
     """Process one sample of a tree that began before the regressors spanned everything, or in the coordinates of the
-    start; a sample outside the span changes no weight.
+    start; a sample that enters a column changes no weight.
     """
     column, y_hat, framed = whiten_within(s, s.phi.ctypes.data, l), prediction(s, l), s.framed[l] > 0
     if framed:
         write_walks(s, l)
     hand_over(s, l)
+    outside = column >= 0
+    if framed and not outside and s.ok[l] > 0.0:
+        column = outgrown(s, l)
     if column >= 0:
         s.sample[ENTERS, l] = point_along(s, column, l) if s.ok[l] > 0.0 and not framed else 0.0
         s.sample[IN_OK, l] = 0.0
     run(s, l)
     if column >= 0:
-        s.y_hat[l], s.s[l] = y_hat, np.inf
+        s.y_hat[l], s.s[l] = y_hat if outside else s.sample[Y_HAT, l], np.inf if outside else s.sample[S2, l]
         if s.ok[l] > 0.0:
             enter_bank(s, column, l)
+            if not outside:
+                e, v = s.y[l] - s.y_hat[l], s.s[l]
+                floats(report_at(s), s.table[REPORT_AT, 2, 0], s.theta.shape[1])[0, l] = -0.5 * (
+                    log(2.0 * np.pi * v) + e * e / v
+                )
     else:
         s.y_hat[l], s.s[l] = s.sample[Y_HAT, l], s.sample[S2, l]
         s.ok[l], s.seen[l] = s.sample[IN_OK, l], s.sample[IN_SEEN, l]
@@ -295,4 +304,4 @@ def take_known(s: State, known: Array, t: int, l: int) -> None:
             column += 1
 
 
-STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), reads_model=True)
+STEPS = TrackerSteps(nothing, correct, report, begin, keep, take_known, machines=(*FRAME, *FRAMED), outlined=True)
