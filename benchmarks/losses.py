@@ -1,8 +1,9 @@
 """Why rows of the accuracy scoreboard beat AdaptiveKalman: its error with a part taken out, over its error.
 
 "one ratio" puts the ratio of the scenario on every rung of the common ladder and takes the ladders of single parameters
-away (without drift: closes the ways up), so that nothing has to be learned about it; "one noise level" leaves the outliers only; "groups" tells it which parameter is
-fast. Medians over the twenty scored runs. Run: python -m benchmarks.losses
+away (without drift: closes the ways up), so that nothing has to be learned about it; "one noise level" leaves the
+outliers only; "groups" tells it which parameter is fast. Medians over the twenty scored runs. Run:
+python -m benchmarks.losses
 """
 
 from collections.abc import Iterator

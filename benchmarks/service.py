@@ -36,6 +36,7 @@ from driftfit.service.core.engine import Engine
 from driftfit.service.settings.config import parse
 from driftfit.service.sources.incoming import INCOMING, decoded
 from driftfit.service.sources.samples import Batch, decode
+from driftfit.service.supervisor import cut_the_tail
 from driftfit.service.threads import SinkThread, SourceThread
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -198,8 +199,9 @@ def mqtt(options, folder):
         broker = Broker(folder)
         *_, found, _ = served(broker, folder / f"at{rate}", rate // 4, 20, options.units, rate // 20)
         broker.process.terminate()
-        what = f"mqtt at {rate} samples/s in messages of 20: p50, p99 (ms)"
-        say(what, f"{found['p50'] * 1e3:.1f} {found['p99'] * 1e3:.1f}")
+        for name, key in (("result", ""), ("sink", "sink ")):
+            what = f"mqtt at {rate} samples/s in messages of 20, to {name}: p50, p99 (ms)"
+            say(what, f"{found[f'{key}p50'] * 1e3:.1f} {found[f'{key}p99'] * 1e3:.1f}")
 
 
 def line(what, count, found, stages=None):
@@ -289,17 +291,20 @@ def served(broker, folder, messages, size, units, rate=1_000_000, sink="sqlite")
     for thread in (*runners, worker):
         thread.start()
     time.sleep(1.0)
+    cut_the_tail()
     sender, before = send(broker, messages, size, units, rate), one.samples
     while one.samples == before:
         time.sleep(0.01)
     begun, cpu, first = time.perf_counter(), time.process_time(), clocks()
-    one.latencies.clear()
+    for each in (one, *runners[1:]):
+        each.latencies.clear()
     while time.perf_counter() - begun < 300 and (
         one.samples - before < messages * size or any(sink.count < messages * size for sink in runners[1:])
     ):
         time.sleep(0.01)
     last = clocks()
-    found = time.perf_counter() - begun, time.process_time() - cpu, one.status()
+    status = one.status() | {f"sink {key}": value for sink in runners[1:] for key, value in sink.status().items()}
+    found = time.perf_counter() - begun, time.process_time() - cpu, status
     for runner in runners:
         runner.stop()
     one.stop()

@@ -21,7 +21,7 @@ from driftfit import (
     track,
 )
 from driftfit.models.polynomial import FORGOTTEN
-from driftfit.models.polynomial_steps import SETTLING
+from driftfit.models.polynomials.steps import SETTLING
 from driftfit.run.program import Program
 from driftfit.smooth.problem import replay
 

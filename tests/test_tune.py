@@ -7,6 +7,8 @@ from driftfit import ARX, FLS, RLS, AugmentedFLS, Kalman, Regression, frontier, 
 from driftfit.models.regression import Regression as Base
 from driftfit.systems.drift import RandomWalk, paths
 from driftfit.systems.time_varying import EXAMPLES, example
+from driftfit.tune.parametrisation import Knobs
+from driftfit.tune.search import Counted, Search
 
 
 def walks(seed, std=(0.1, 0.1), noise=0.5, T=200):
@@ -302,3 +304,20 @@ def test_an_arx_model_with_lags_that_are_filled():
     y[100:103] = np.nan
     tuned = tune(ARX(1, 1), Kalman(), y, u)
     assert tuned.noise == pytest.approx(0.01, rel=3.3 * np.sqrt(2.0 / 490))  # the variance of a mean of squares
+
+
+def test_a_profile_stays_within_the_range_of_the_others():
+    """A flat ridge leads far outside: 300 decades of q are infinite."""
+    low, high = np.array([-5.0, -5.0]), np.array([5.0, 5.0])
+
+    def valley(points):
+        assert (points >= low).all()
+        assert (points <= high).all()
+        return 5e3 * (points[:, 1] - 300.0 * points[:, 0]) ** 2 + 0.5 * points[:, 0] ** 2
+
+    knobs = Knobs(low, high, np.zeros(2, bool), False, None, None, ("a", "b"), np.arange(2), lambda x: x)
+    f = Counted(valley)
+    f(np.zeros((1, 2)))
+    found = Search(f, knobs, np.zeros(2))
+    assert found.ridge(0)[1] == pytest.approx(300.0, rel=1e-3)
+    assert found.profile(0, 0.95)[0] < 0.0 < found.profile(0, 0.95)[1]

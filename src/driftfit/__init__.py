@@ -9,6 +9,8 @@ from driftfit.judge.structures.live_selection import LiveSelection
 from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.continuous.process import process_model
+from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
@@ -30,7 +32,6 @@ from driftfit.models.hammerstein_wiener.results.shared_curves import shared_curv
 from driftfit.models.hammerstein_wiener.trackers.extended_kalman import ExtendedKalman
 from driftfit.models.hammerstein_wiener.trackers.output_error import OutputError
 from driftfit.models.polynomial import ARMAX, OE, BoxJenkins, PolynomialModel
-from driftfit.models.process import process_model
 from driftfit.models.regression import Regression
 from driftfit.models.state_space import StateSpace
 from driftfit.results import Track
@@ -54,6 +55,7 @@ from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.laws.law import Law
+from driftfit.trackers.particle_filter import ParticleFilter
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
@@ -80,6 +82,7 @@ __all__ = [
     "Change",
     "Chebyshev",
     "ConformalFactor",
+    "ContinuousTransfer",
     "DataWarning",
     "DeadZone",
     "Decide",
@@ -101,6 +104,7 @@ __all__ = [
     "Model",
     "OutputError",
     "Outputs",
+    "ParticleFilter",
     "PiecewiseLinear",
     "Polynomial",
     "PolynomialModel",

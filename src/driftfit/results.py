@@ -24,6 +24,7 @@ from driftfit.smooth.shared_theta import SmoothedShared
 from driftfit.smooth.smoothed import Smoothed
 from driftfit.trackers.bank.results.decided_path import EventSmoothed
 from driftfit.trackers.bank.results.results import Hypotheses
+from driftfit.tune.refine import refine
 from driftfit.use import simulate, system
 from driftfit.use.constraints.constrained import Constrained, constrain
 from driftfit.use.continuous.conversion import Transfer, transfer
@@ -168,6 +169,10 @@ class Track(result.Track, Exported, public=True):
     ) -> Crossing:
         """When a parameter or the output crosses a limit, with an interval; see `driftfit.use.crossing`."""
         return crossing(self._single("crossing"), what, below=below, above=above, horizon=horizon, u=u, level=level)
+
+    def refine(self, passes: int = 20, drifting: bool = False) -> Track:
+        """Estimate off line: the record again, linearised where the estimate settles (`driftfit.tune.refine`)."""
+        return refine(self, passes, drifting)
 
     def constrain(self, *constraints: str) -> Constrained:
         """theta known to be within bounds or on planes, as "b1 >= 0", "0 <= a1 + a2 <= 1", "b1 + b2 == 1".

@@ -169,7 +169,7 @@ def files_of(program: Program, what: str, fixed_rate: bool) -> dict[str, str]:
         what=what, version=__version__, n=made.start["theta"].shape[1], m=m, names=names, fields=_fields(made),
         known=FIXED_RATE if fixed_rate else KNOWN,
     )  # fmt: skip
-    source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps.doubts)))
+    source = SOURCE.format(what=what) + _source(made, set(program.model.memory_for(program.steps)))
     readme = README.format(
         what=what, names=names, doubles=made.layout(8).itemsize, singles=made.layout(4).itemsize,
         ops=_said(made.entry.operations), ordinary=_after_the_start(made),

@@ -88,7 +88,7 @@ def translation(program: Program, fixed_rate: bool = False) -> Translation:
     """Translate the steps of a model and a tracker."""
     tile = program.tile()
     steps = program.steps
-    update = drivers(program.model.steps_for(steps.doubts), steps).update.function
+    update = drivers(program.model.steps_for(steps), steps).update.function
     u = Value("array", "u", shape=(program.model.m,), strides=(1,))
     factors = () if fixed_rate else FACTORS
     constant = frozenset(fields(tile)) - {*factors, *RESULTS, *program.tracker.settings()}

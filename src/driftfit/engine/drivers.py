@@ -26,7 +26,8 @@ import numba
 import numpy as np
 from numba import types
 
-from driftfit.engine.kernel import Array, Driver, State, Step, kernel
+from driftfit.engine.kernel import Array, Driver, State, Step, kernel, nothing
+from driftfit.engine.outlined import outlined
 from driftfit.engine.tracker_part import EDGE, tracker_part, whole_record
 
 WIDTH = 32
@@ -124,9 +125,12 @@ class TrackerSteps(NamedTuple):
     ``outputs`` name from the record ``s`` to the stored record ``o``. ``read_extra(s, known, t, l)`` reads the extra
     columns of ``known``, those after interval, noise and drift, for trackers that take more factors.
     ``store_for_smoother(o, s, l)`` copies the tracker's ``smoother_fields`` when a run is replayed for a smoother.
-    With ``doubts`` the model weighs lags that the tracker doubts. Steps see the fields of the tracker and those that
+    With ``doubts`` the model weighs lags that the tracker doubts; with ``instruments`` a model that has its own writes
+    them to s.zeta (n,), a field of the tracker. Steps see the fields of the tracker and those that
     every record has but for ``u``, so that they are compiled once for all models (`driftfit.engine.tracker_part`);
-    with ``reads_model`` they see those of the model too.
+    with ``reads_model`` they see those of the model too. ``outlined`` steps are compiled apart from the drivers, which
+    call them (`driftfit.engine.outlined`): for trackers that take so long that a call costs nothing. ``note`` comes
+    before all of them and may write what they change later.
     """
 
     predict: Step
@@ -139,7 +143,10 @@ class TrackerSteps(NamedTuple):
     machines: tuple[Any, ...] = ()
     instead: tuple[tuple[Any, Any], ...] = ()
     doubts: bool = False
+    instruments: bool = False
     reads_model: bool = False
+    outlined: bool = False
+    note: Step = nothing
 
 
 def _common(n: int) -> dict[str, Any]:
@@ -182,6 +189,9 @@ def make_tile(n: int, m: int, model: Mapping[str, Any], trackers: Sequence[Mappi
     for l, start in enumerate(starts):
         for name, value in start.items():
             tile[name][0, ..., l] = value
+    if opened:
+        places = tile.dtype.fields or {}
+        tile[EDGE][0, 0] = places[opened[0][0]][1] - places[EDGE][1]
     return tile
 
 
@@ -309,8 +319,9 @@ def _advance(tracker: TrackerSteps) -> Any:
         return advance
 
     def start(s: State) -> None:
+        alone = s.theta.shape[1] == 1  # a constant, for which there is no code of the others
         for l in range(s.theta.shape[1]):
-            if s.root[l] > 0:
+            if alone or s.root[l] > 0:
                 begin(s, l)
             else:
                 predict(s, l)
@@ -341,13 +352,14 @@ def drivers(model: ModelSteps, tracker: TrackerSteps, keep: str = "std") -> Driv
     one sample of a tile of one lane with u (m,), ``update_one`` the same for a single float u (`Drivers.updater`); both
     take what is known from the fields ``interval``, ``noise`` and ``drift`` of the record and return (y_hat, e, s, ok).
     """
-    regress, push, ready = model
+    ready = model.ready
     ready(1)
     for machine in tracker.machines:
         machine.load()
     driver = partial(Driver, instead=tracker.instead)
     part = whole_record if tracker.reads_model else tracker_part
-    sample = _sample(regress, push, _advance(tracker), part)
+    advance = _advance(tracker)
+    sample = _sample(model, tracker.note, outlined(advance) if tracker.outlined else advance, part)
     keep_more = covariance if keep == "cov" else nothing_more
     run = _run(driver, sample, tracker.read_extra, _stored(tracker.store, keep_more), part)
 
@@ -373,8 +385,9 @@ def _stored(store: Any, keep_more: Any) -> Any:
     return stored
 
 
-def _sample(regress: Step, push: Step, advance: Any, part: Any) -> Any:
+def _sample(model: ModelSteps, note: Step, advance: Any, part: Any) -> Any:
     """One sample of all lanes, whose signals and known factors are in the record."""
+    regress, push, _ = model
 
     @kernel
     def sample(s: State) -> None:
@@ -382,6 +395,7 @@ def _sample(regress: Step, push: Step, advance: Any, part: Any) -> Any:
         for l in range(L):
             regress(s, l)
             clean(s, l)
+            note(part(s), l)
         advance(part(s))
         for l in range(L):
             push(s, l)

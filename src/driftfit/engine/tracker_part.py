@@ -10,13 +10,16 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from numba import types
 
 from driftfit.engine.kernel import State, kernel
 from driftfit.engine.numba_internals import named_intrinsic
 
 EDGE = "edge"
-"""The field behind the last one that a tracker sees; it holds nothing, and fills a cache line."""
+"""The field behind the last one that a tracker sees, which fills a cache line. It holds the distance in bytes to the
+open fields, which are at the end of the record, if there are any.
+"""
 
 
 @lru_cache(maxsize=256)
@@ -42,6 +45,12 @@ def _typed(context: Any, record: Any) -> Any:
 
 tracker_part = named_intrinsic("tracker_part", _typed)
 """tracker_part(s): the same memory as s, of which only the fields of the tracker and the common ones can be named."""
+
+
+@kernel
+def open_at(s: State) -> int:
+    """The address of the first of the open fields of a record, of whose part a step sees."""
+    return s.end.ctypes.data + np.int64(s.end[0, 0])  # type: ignore[no-any-return]
 
 
 @kernel

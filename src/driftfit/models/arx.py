@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import LARGEST, ModelSteps
+from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, State, Step, kernel
 from driftfit.engine.settings import input_names, one_of, output_names, whole
 from driftfit.models.base import Model
@@ -179,11 +179,13 @@ class ARX(Model):
     def steps(self) -> ModelSteps:
         return _steps(self.na, self.lags, self.intercept)
 
-    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
-        return {**self.memory(), **no_doubts(len(self.outputs), self.na)} if doubts and self.na > 0 else self.memory()
+    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
+        if not (tracker.doubts and self.na > 0):
+            return self.memory()
+        return {**self.memory(), **no_doubts(len(self.outputs), self.na)}
 
-    def steps_for(self, doubts: bool) -> ModelSteps:
-        return _steps(self.na, self.lags, self.intercept, True) if doubts and self.na > 0 else self.steps
+    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
+        return _steps(self.na, self.lags, self.intercept, True) if tracker.doubts and self.na > 0 else self.steps
 
     @property
     def apply(self) -> Step | None:
@@ -341,8 +343,8 @@ class JointARX(ARX):
     def steps(self) -> ModelSteps:
         return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs))
 
-    def steps_for(self, doubts: bool) -> ModelSteps:
-        doubts = doubts and self.na > 0
+    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
+        doubts = tracker.doubts and self.na > 0
         return _joint_steps(self.na, self.lags, self.intercept, len(self.outputs), doubts)
 
     def play(self, theta: Array, y: Array, u: Array, noise: Array, span: tuple[Any, Any]) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.drivers import ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
 from driftfit.engine.settings import Settings
 
@@ -95,12 +95,17 @@ class Model(Settings, ABC):
     def steps(self) -> ModelSteps:
         """The compiled ``regress`` and ``push``."""
 
-    def memory_for(self, doubts: bool) -> Mapping[str, Any]:
-        """`memory` for a tracker that marks readings as outliers (`TrackerSteps.doubts`), or for one that does not."""
+    @property
+    def instruments(self) -> bool:
+        """Whether, with a tracker that asks for them (`TrackerSteps.instruments`), it writes instruments to s.zeta."""
+        return False
+
+    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
+        """`memory` with a tracker that marks readings as outliers, or needs instruments; see `TrackerSteps`."""
         return self.memory()
 
-    def steps_for(self, doubts: bool) -> ModelSteps:
-        """`steps` with such a tracker, or without."""
+    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
+        """`steps` with such a tracker."""
         return self.steps
 
     @property
@@ -191,6 +196,10 @@ class Model(Settings, ABC):
     def settling(self) -> float:
         """Number of first samples whose regressors are poor, because they depend on theta, and should be forgotten."""
         return 0.0
+
+    def held_at(self, theta: Array) -> Model | None:
+        """This model with its linearisation held at theta (n,), so that a run is a linear regression; None without."""
+        return None
 
     @property
     def recursive(self) -> bool:

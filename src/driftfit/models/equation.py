@@ -43,6 +43,7 @@ from driftfit.engine.settings import input_names, numbers
 from driftfit.models.arx import GAP
 from driftfit.models.base import Model
 from driftfit.models.formulas import Formula, check_inputs, compiled, parse
+from driftfit.models.functions import equation_text
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -55,8 +56,9 @@ class Equation(Model):
 
     Parameters
     ----------
-    equation : str
-        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``.
+    equation : str, or a function
+        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``; or a plain Python function of u, theta and y that returns
+        the output, and has its name (`driftfit.models.functions`).
     start : mapping from parameter to number, or a number for all
         Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
         ``theta0`` and ``p0``.
@@ -69,11 +71,13 @@ class Equation(Model):
         If the text is not such an equation, ``start`` names what is no parameter, or inputs are missing.
     """
 
-    equation: str
+    equation: Any
     start: Any = 1.0
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        if callable(self.equation):
+            self._set("equation", equation_text(self.equation))
         formula = parse(self.equation)
         if self.inputs is None:
             self._set("inputs", formula.inputs)

@@ -19,7 +19,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, exp, kernel, log
 
-LONGEST = 2000
+LONGEST = 20000
 """Characters of a formula."""
 FUNCTIONS = {
     "abs": 1, "cos": 1, "exp": 1, "log": 1, "max": 2, "min": 2, "sin": 1, "sqrt": 1, "tanh": 1,

@@ -24,7 +24,7 @@ parameters that drift. In contrast to least squares in an `ARX` model they are n
 covariance is that of the prediction error estimate.
 
 theta' is theta with the zeros of C and F_j drawn towards 0 while one of them is unstable. Signals that are absurd
-beside the readings (`driftfit.models.polynomial_steps.BEYOND`), which a theta that one reading spoiled computes, are
+beside the readings (`driftfit.models.polynomials.steps.BEYOND`), which a theta that one reading spoiled computes, are
 not used: e and v are bounded, and w begins anew, from y if there is one input. The start needs care, because
 the gradient with respect to F is 0 at theta = 0, and e means nothing before A and B are known: the first 4 n usable
 samples are a pseudolinear regression (psi is the regression vector itself; for one input, w is y without its
@@ -50,12 +50,13 @@ from typing import Any
 
 import numpy as np
 
-from driftfit.engine.drivers import ModelSteps
+from driftfit.engine.drivers import LARGEST, ModelSteps, TrackerSteps
 from driftfit.engine.kernel import Array, Step
-from driftfit.engine.settings import input_names, whole
+from driftfit.engine.settings import input_names, numbers, whole
 from driftfit.models.base import Model
 from driftfit.models.linearised import MEMORY
-from driftfit.models.polynomial_steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
+from driftfit.models.polynomials.instruments import MORE, instrumental_steps
+from driftfit.models.polynomials.steps import EACH, OWN, Places, U, Y, places, steps, taking_inputs
 
 FORGOTTEN = 40.0
 """Samples for each parameter that a tracker without drift should forget again: those of the start, ten times over."""
@@ -78,11 +79,14 @@ class PolynomialModel(Model):
         columns.
     offset : bool
         Add the constant c as the last parameter.
+    point : (n,) or None
+        Hold the linearisation at this theta, as one iteration of `Track.refine` does; None: it is at the last estimate.
 
     Raises
     ------
     ValueError
-        If an order is negative, the numbers of inputs disagree, or there is nothing to estimate.
+        If an order is negative, the numbers of inputs disagree, the point has another length than theta, or there is
+        nothing to estimate.
     """
 
     na: int = 0
@@ -93,6 +97,7 @@ class PolynomialModel(Model):
     nk: int | tuple[int, ...] = 1
     inputs: int | tuple[str, ...] | None = None
     offset: bool = False
+    point: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         kind, counts = type(self).__name__, set()
@@ -123,6 +128,12 @@ class PolynomialModel(Model):
             )
         if self.inputs is not None and self.n == 0:
             raise ValueError(f"{kind}: there is nothing to estimate; give an order of at least 1.")
+        if self.point is not None:
+            self._set("point", numbers(kind, "point", self.point, ndim=1))
+            if self.inputs is not None and len(self.point) != self.n:
+                raise ValueError(
+                    f"{kind}: point must have {self.n} entries, {', '.join(self.names)}; got {self.point!r}."
+                )
 
     def bind(self, inputs: int | Sequence[str]) -> PolynomialModel:
         count = inputs if isinstance(inputs, int) else len(inputs)
@@ -169,6 +180,8 @@ class PolynomialModel(Model):
 
     @property
     def settling(self) -> float:
+        if self.point is not None:
+            return 0.0
         return FORGOTTEN * self.n if self.nc or self.nd or any(nf for _, nf, _ in self.orders) else 0.0
 
     @property
@@ -194,17 +207,38 @@ class PolynomialModel(Model):
         past[[Y, *(OWN + EACH * j + U for j in range(self.m))]] = np.nan
         return {
             "signals": past,
-            "point": np.zeros(self.n),
+            "point": np.zeros(self.n) if self.point is None else np.array(self.point),
             "damped": np.zeros(self.n),
             "recursion": np.zeros((2, self._depth)),
             "last_input": np.zeros(max(self.m, 1)),
             "extent": np.zeros(1 + self.m),
             **MEMORY,
+            "usable": 0.0 if self.point is None else LARGEST,
         }
 
     @property
     def steps(self) -> ModelSteps:
-        return steps(self._places)
+        return steps(self._places, self.point is not None)
+
+    @property
+    def instruments(self) -> bool:
+        return self.na == 0 and any(nf for _, nf, _ in self.orders)
+
+    def memory_for(self, tracker: TrackerSteps) -> Mapping[str, Any]:
+        memory = self.memory()
+        if not (tracker.instruments and self.instruments):
+            return memory
+        rows = np.zeros((len(memory["signals"]) + MORE * self.m, self._depth))
+        rows[: len(memory["signals"])] = memory["signals"]
+        return {**memory, "signals": rows, "followed": memory["point"]}
+
+    def steps_for(self, tracker: TrackerSteps) -> ModelSteps:
+        if not (tracker.instruments and self.instruments):
+            return self.steps
+        return instrumental_steps(self._places, self.point is not None)
+
+    def held_at(self, theta: Array) -> PolynomialModel:
+        return replace(self, point=tuple(np.asarray(theta, dtype=float).tolist()))
 
     @property
     def apply(self) -> Step | None:

@@ -65,7 +65,7 @@ class Program:
         if (self.model.hidden is not None) != self.tracker.follows_states:
             raise ValueError(
                 f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
-                "followed by JointKalman, which moves its hidden states and follows nothing else."
+                "followed by JointKalman or ParticleFilter, which move its hidden states and follow nothing else."
             )
 
     def __reduce__(self) -> Any:
@@ -97,7 +97,7 @@ class Program:
         if self.output is None:
             return self.tracker_start
         own = self.model if self.alone is None else self.alone.model
-        return {**own.memory_for(self.steps.doubts), **self.tracker_start}
+        return {**own.memory_for(self.steps), **self.tracker_start}
 
     @cached_property
     def tracker_start(self) -> State:
@@ -167,7 +167,7 @@ class Program:
         keep = "std" if keep == "theta" else keep
         found = self._drivers.get((keep, steps))
         if found is None:
-            found = drivers(self.model.steps_for(self.steps.doubts), self.steps if steps is None else steps, keep)
+            found = drivers(self.model.steps_for(self.steps), self.steps if steps is None else steps, keep)
             self._drivers[keep, steps] = found
         return found
 
@@ -295,7 +295,7 @@ def tile_of(programs: Sequence[Program], states: Sequence[State] = ()) -> Array:
 def _started(programs: Sequence[Program]) -> Array:
     model = programs[0].model
     starts = {one: one.start for one in programs}
-    memory = model.memory_for(programs[0].steps.doubts)
+    memory = model.memory_for(programs[0].steps)
     tracker = programs[0].tracker
     if both := sorted((set(memory) & set(programs[0].tracker_start)) - set(tracker.replaces)):
         raise ValueError(

@@ -20,6 +20,14 @@ with the noise: the inputs themselves, and the outputs of an auxiliary model ins
 that is driven by the inputs alone, and follows theta at a distance. The first 10 n samples are used as in least
 squares, to have an auxiliary model; their bias fades with the memory.
 
+`OE` and `BoxJenkins`, and models in continuous time, have instruments of their own, filtered so that the estimate is
+efficient if the model of the noise is right: refined instrumental variables
+(`driftfit.models.polynomials.instruments`). The covariance is then
+
+    C <- C - C zeta zeta' C / (1 / w + zeta' C zeta)
+
+as for the method of the source, in which G is the same in the limit.
+
 Use it if the residuals of `RLS` are correlated (`Track.diagnose`), and the inputs do not depend on past outputs: under
 feedback they are correlated with the noise too. The estimate has a larger variance than least squares. `std`
 treats the noise as white. A model without past outputs has its regressors as instruments, which is exponential `RLS`.
@@ -28,8 +36,8 @@ There is no smoother: this is not the estimate of a random walk.
 A sample with 1 / w + phi' G zeta below one half of 1 / w is not learned from: G would more than double in a direction,
 which happens where instruments and regressors have nothing in common.
 
-Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapter 6 (the auxiliary model, and its filter);
-Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
+Source: Young, Recursive Estimation and Time-Series Analysis (2011), chapters 6 (the auxiliary model, and its filter)
+and 7; Soderstrom and Stoica, Instrumental Variable Methods for System Identification (1983), chapter 6. Departures: the
 diffuse start and the cap of `RLS`; the limit of x; the skipped samples; C in the place of the variance matrix of white
 noise in a constant system. Cost per sample: O(n^2), about three times `RLS`.
 """
@@ -44,7 +52,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from driftfit.engine.drivers import TrackerSteps
-from driftfit.engine.kernel import Array, State, kernel
+from driftfit.engine.kernel import Array, State, Step, kernel, nothing
 from driftfit.engine.settings import covariance, matrix, numbers, vector
 from driftfit.models.base import Model
 from driftfit.trackers import rls
@@ -57,6 +65,7 @@ from driftfit.trackers.parts.diffuse import (
     knowing,
     knowing_nothing,
     prediction,
+    product_with,
     symmetric_product,
 )
 from driftfit.trackers.parts.resolution import resolution, resolve
@@ -99,30 +108,51 @@ def weigh_instruments(s: State, l: int) -> float:
 
 
 @kernel
-def learn(s: State, l: int) -> None:
-    n = s.theta.shape[0]
-    noise, y_hat = s.noise[l], prediction(s, l)
-    v = symmetric_product(s, l) + noise  # s.g = C phi
-    common = noise + weigh_instruments(s, l)
-    e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise)
-    gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
-    for i in range(n):
-        k = gain * s.f[i, l]
-        s.theta[i, l] += k * e
-        for j in range(n):
-            s.G[i, j, l] -= k * s.b[j, l]
-        for j in range(i):
-            k_j = gain * s.f[j, l]
-            s.P[i, j, l] -= k * s.g[j, l] + s.g[i, l] * k_j - k * k_j * v_used
-        left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
-        s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
-    s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
-    learn_variance(s, l)
+def instrument(s: State, i: int, l: int) -> float:
+    """zeta_i."""
+    return s.zeta[i, l]  # type: ignore[no-any-return]
 
 
 @lru_cache
-def steps(na: int) -> TrackerSteps:
-    """The steps for models whose first na regressors are past outputs."""
+def learning(refined: bool) -> Step:
+    """The correction; with refined instruments the covariance is that of least squares on them."""
+    product = product_with(instrument) if refined else symmetric_product
+
+    @kernel
+    def learn(s: State, l: int) -> None:
+        n = s.theta.shape[0]
+        noise, y_hat = s.noise[l], prediction(s, l)
+        v = product(s, l) + noise  # s.g = C phi, or C zeta
+        common = noise + weigh_instruments(s, l)
+        e, learned = s.y[l] - y_hat, (s.ok[l] > 0.0) & (common >= LEAST * noise)
+        gain, v_used = (1.0 / common if learned else 0.0), (v if learned else 0.0)
+        along = 1.0 / v if learned else 0.0
+        for i in range(n):
+            k = gain * s.f[i, l]
+            s.theta[i, l] += k * e
+            for j in range(n):
+                s.G[i, j, l] -= k * s.b[j, l]
+            k = along * s.g[i, l] if refined else k
+            for j in range(i):
+                k_j = along * s.g[j, l] if refined else gain * s.f[j, l]
+                s.P[i, j, l] -= k * s.g[j, l] + s.g[i, l] * k_j - k * k_j * v_used
+            left = s.P[i, i, l] - (2.0 * k * s.g[i, l] - k * k * v_used)
+            s.P[i, i, l] = max(left, LEFT * s.P[i, i, l])
+        s.y_hat[l], s.e[l], s.s[l] = y_hat, e, v
+        learn_variance(s, l)
+
+    step: Step = learn
+    return step
+
+
+@kernel
+def count(s: State, l: int) -> None:
+    s.learned[l] += s.ok[l]
+
+
+@lru_cache
+def auxiliary(na: int) -> tuple[Any, Any]:
+    """The instruments of models whose first na regressors are past outputs, and the step of the auxiliary model."""
 
     @kernel
     def instruments(s: State, l: int) -> None:
@@ -150,6 +180,15 @@ def steps(na: int) -> TrackerSteps:
         if na > 0:
             s.x_lag[0, l] = s.x[l]
 
+    return instruments, follow
+
+
+@lru_cache
+def steps(na: int | None) -> TrackerSteps:
+    """The steps for models whose first na regressors are past outputs; None: for those with their own instruments."""
+    instruments, follow = (count, nothing) if na is None else auxiliary(na)
+    learn = learning(na is None)
+
     @kernel
     def correct(s: State, l: int) -> None:
         resolve(s, l)
@@ -167,12 +206,14 @@ def steps(na: int) -> TrackerSteps:
                 s.G[j, i, l] = s.P[i, j, l]
         follow(s, l)
 
-    return TrackerSteps(forget, correct, folded, begin, machines=MACHINES)
+    return TrackerSteps(forget, correct, folded, begin, machines=MACHINES, instruments=na is None)
 
 
 @dataclass(frozen=True)
 class InstrumentalVariables(Tracker):
-    """Recursive instrumental variables for ARX models in coloured noise, with an auxiliary model and forgetting.
+    """Recursive instrumental variables for models in coloured noise, with an auxiliary model and forgetting.
+
+    For ARX; for OE and BoxJenkins they are refined instrumental variables (RIV, SRIV).
 
     Parameters
     ----------
@@ -247,12 +288,17 @@ class InstrumentalVariables(Tracker):
         return steps(0)
 
     def steps_for(self, model: Model) -> TrackerSteps:
+        if model.instruments:
+            return steps(None)
         if model.output_lags is None:
             raise ValueError(
                 f"InstrumentalVariables: {type(model).__name__} does not say which of its regressors are past outputs "
-                "(`Model.output_lags`), so they cannot be replaced by instruments; use ARX."
+                "(`Model.output_lags`), so they cannot be replaced by instruments; use ARX, OE or BoxJenkins."
             )
         return steps(model.output_lags)
+
+    def state_for(self, model: Model) -> Mapping[str, Any]:
+        return {**self.state(model.n), "discounted": model.settling}
 
     def widen(self, lane: Mapping[str, Array], p: Array) -> None:
         super().widen(lane, p)

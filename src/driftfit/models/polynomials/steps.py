@@ -1,6 +1,7 @@
 """The compiled steps of `driftfit.models.polynomial`: the signals behind a prediction, and its gradient.
 
-Each function makes the kernels for one set of orders, which are constants, so that every loop is unrolled.
+`driftfit.models.polynomials.instruments` puts other regressors in the place of the gradient. Each function makes the
+kernels for one set of orders, which are constants, so that every loop is unrolled.
 """
 
 from __future__ import annotations
@@ -127,9 +128,7 @@ def stable(s: State, first: int, order: int, sign: float, l: int) -> bool:
 
 @kernel
 def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
-    """s.point is theta in the coefficients of a polynomial, its zeros drawn towards 0 until it is stable."""
-    for i in range(order):
-        s.point[first + i, l] = s.theta[first + i, l]
+    """The zeros of a polynomial in s.point are drawn towards 0 until it is stable."""
     for _ in range(CONTRACTIONS):
         if not stable(s, first, order, sign, l):
             scale = CONTRACTION
@@ -141,8 +140,20 @@ def contract(s: State, first: int, order: int, sign: float, l: int) -> None:
             s.point[first + i, l] = 0.0
 
 
+@kernel
+def at_theta(s: State, l: int) -> None:
+    """The point of the linearisation is the last estimate."""
+    for i in range(s.theta.shape[0]):
+        s.point[i, l] = s.theta[i, l]
+
+
+@kernel
+def staying(s: State, l: int) -> None:
+    """The point of the linearisation is held."""
+
+
 @lru_cache
-def _filters(p: Places) -> tuple[Any, Any]:
+def filters(p: Places) -> tuple[Any, Any]:
     """``colour(s, raw, into, l)`` and ``whitened(..)``: D/C and 1/C of the present sample of a row."""
     nc, nd, at_c, at_d = p.nc, p.nd, p.at_c, p.at_d
 
@@ -166,16 +177,13 @@ def _filters(p: Places) -> tuple[Any, Any]:
 
 
 @lru_cache
-def _point(p: Places) -> Any:
-    """The point of the linearisation: theta, where C and F are stable."""
-    n, at_c, at_d, at_f, nc, nf, m = p.n, p.at_c, p.at_d, p.at_f, p.nc, p.nf, p.m
-    past_f = at_f[0] + sum(nf)
+def point(p: Places, place: Step) -> Any:
+    """The point of the linearisation, which ``place`` gives, with C and F made stable."""
+    n, at_c, at_f, nc, nf, m = p.n, p.at_c, p.at_f, p.nc, p.nf, p.m
 
     @kernel
     def linearise(s: State, l: int) -> None:
-        for i in range(n):
-            if (i < at_c) | ((i >= at_d) & (i < at_f[0])) | (i >= past_f):
-                s.point[i, l] = s.theta[i, l]
+        place(s, l)
         if nc > 0:
             contract(s, at_c, nc, 1.0, l)
         for j in range(m):
@@ -201,7 +209,7 @@ def _point(p: Places) -> Any:
 def taking_inputs(p: Places) -> Step:
     """The step that takes the inputs of the present sample, and filters them."""
     m, nf, at_f = p.m, p.nf, p.at_f
-    colour, _ = _filters(p)
+    colour, _ = filters(p)
 
     @kernel
     def take_inputs(s: State, l: int) -> None:
@@ -251,7 +259,7 @@ def _responses(p: Places) -> Any:
 
 
 @lru_cache
-def _predictions(p: Places) -> tuple[Any, Any]:
+def predictions(p: Places) -> tuple[Any, Any]:
     """``predict(s, gradient, l)``: y_hat at s.point; ``noise(s, l)``: the part of it that earlier noise explains."""
     na, nc, nd, at_c, at_d, at_offset = p.na, p.nc, p.nd, p.at_c, p.at_d, p.at_offset
     respond = _responses(p)
@@ -279,7 +287,7 @@ def _predictions(p: Places) -> tuple[Any, Any]:
 
 
 @lru_cache
-def _gradient(p: Places) -> Any:
+def gradient_of(p: Places) -> Any:
     """s.phi: the gradient of y_hat, or at the start the regression vector."""
     na, nc, nd, m, nb, nf, nk = p.na, p.nc, p.nd, p.m, p.nb, p.nf, p.nk
     at_b, at_c, at_d, at_f, at_offset, n = p.at_b, p.at_c, p.at_d, p.at_f, p.at_offset, p.n
@@ -317,13 +325,13 @@ def _gradient(p: Places) -> Any:
 
 
 @lru_cache
-def _regress(p: Places) -> Any:
-    n, m = p.n, p.m
-    linearise, take_inputs, gradient, (predict, _) = _point(p), taking_inputs(p), _gradient(p), _predictions(p)
+def ageing(p: Places) -> Any:
+    """Every signal moves by one sample."""
+    m = p.m
 
     @kernel
     def age(s: State, l: int) -> None:
-        """Every signal moves by one sample; a gap in time breaks the lags."""
+        # a gap in time breaks the lags
         broken = s.dt[l] > GAP
         for r in range(s.signals.shape[0]):
             for i in range(s.signals.shape[1] - 1, 0, -1):
@@ -335,13 +343,22 @@ def _regress(p: Places) -> Any:
             for r in range(V, ONE):
                 s.signals[r, i, l] = 0.0 if broken else s.signals[r, i, l]
 
+    step: Step = age
+    return step
+
+
+@lru_cache
+def regressing(p: Places, place: Step, regressors: Any) -> Step:
+    """``regress``; ``regressors(s, y_hat, l)`` fills s.phi, and returns the prediction at the point."""
+    n, age, linearise, take_inputs = p.n, ageing(p), point(p, place), taking_inputs(p)
+    predict, _ = predictions(p)
+
     @kernel
     def regress(s: State, l: int) -> None:
         age(s, l)
         linearise(s, l)
         take_inputs(s, l)
-        y_hat = predict(s, True, l)
-        gradient(s, l)
+        y_hat = regressors(s, predict(s, True, l), l)
         complete = True
         for i in range(n):
             complete = complete & (abs(s.phi[i, l]) < LARGEST)
@@ -354,10 +371,11 @@ def _regress(p: Places) -> Any:
 
 
 @lru_cache
-def _push(p: Places) -> Any:
+def pushing(p: Places, place: Step) -> Step:
+    """``push``."""
     na, n, m = p.na, p.n, p.m
     at_offset, first_f = p.at_offset, p.nf[0] if p.m == 1 else 0
-    linearise, (predict, noise), (colour, whitened) = _point(p), _predictions(p), _filters(p)
+    linearise, (predict, noise), (colour, whitened) = point(p, place), predictions(p), filters(p)
 
     @kernel
     def remember(s: State, y: float, known: bool, v: float, e: float, l: int) -> None:
@@ -414,6 +432,13 @@ def _push(p: Places) -> Any:
 
 
 @lru_cache
-def steps(p: Places) -> ModelSteps:
-    """The compiled steps of a model with these orders."""
-    return ModelSteps(_regress(p), _push(p))
+def steps(p: Places, held: bool) -> ModelSteps:
+    """The compiled steps of a model with these orders, linearised at the last estimate or at a point that is held."""
+    gradient, place = gradient_of(p), staying if held else at_theta
+
+    @kernel
+    def regressors(s: State, y_hat: float, l: int) -> float:
+        gradient(s, l)
+        return y_hat
+
+    return ModelSteps(regressing(p, place, regressors), pushing(p, place))

@@ -71,7 +71,7 @@ def process_model(
     Parameters
     ----------
     kind : "P1", "P2", "P2U" or "PI"
-        See `driftfit.models.process`; parameters are K and log_T, or log_T1, log_T2, or log_wn, logit_zeta.
+        See `driftfit.models.continuous.process`; parameters are K and log_T, or log_T1, log_T2, or log_wn, logit_zeta.
     delay : int
         Whole nominal samples between input and response, beyond the hold.
     fraction : bool

@@ -1,0 +1,1 @@
+"""The compiled steps of transfer functions in coloured noise."""
