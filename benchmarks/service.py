@@ -1,9 +1,10 @@
 """The speed of the service: samples per second end to end, latency, memory, and its parts.
 
     python benchmarks/service.py                 all parts at a small size, some two minutes
-    python benchmarks/service.py mqtt            one part: journal, engine, mqtt, http, units, soak, fuzz
+    python benchmarks/service.py mqtt            one part: journal, engine, mqtt, latency, http, units, soak, fuzz
     python benchmarks/service.py soak --seconds 900
     python benchmarks/service.py fuzz --count 100000
+    chrt -r 1 python benchmarks/service.py latency         where other programs use the processor too
     python benchmarks/service.py --quick         the parts that need no broker, in seconds
 
 The model is ARX(1, 1), tracked by Kalman(q=1e-4, r=0.1), with times; each sample is journaled before the update. The
@@ -183,9 +184,9 @@ def send(broker, messages, size, units, rate=1_000_000):
 
 
 def mqtt(options, folder):
-    """Over MQTT: the floor, a consumer by hand, the service without and with a sink; then latencies at a rate."""
+    """Over MQTT: the floor, a consumer by hand, the service without and with a sink."""
     known = importlib.util.find_spec("filterpy") is not None
-    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  client decode engine   sink")
+    print(f"{'mqtt: samples in a message, handler':<44}{'samples/s':>10}{'CPU us':>8}  source engine   sink")
     for size, messages in ((1, 20_000), (20, 20_000)):
         broker, count = Broker(folder), messages * size
         line(f"{size}, empty (the floor)", count, listened(broker, messages, size, options.units, lambda *_: None))
@@ -195,6 +196,10 @@ def mqtt(options, folder):
             found = served(broker, folder / f"{what}{size}", messages, size, options.units, sink=what)
             line(f"{size}, the service, sink {what}", count, found[:2], found[3])
         broker.process.terminate()
+
+
+def latency(options, folder):
+    """Seconds from the arrival of a message to its result, and until it is in the sink, at two rates."""
     for rate in (5_000, 20_000):
         broker = Broker(folder)
         *_, found, _ = served(broker, folder / f"at{rate}", rate // 4, 20, options.units, rate // 20)
@@ -265,7 +270,7 @@ def listened(broker, messages, size, units, handle):
     return found
 
 
-STAGES = ("paho", "driftfit-source", "engine", "driftfit-sink")
+STAGES = ("driftfit-source", "engine", "driftfit-sink")
 """How the names of the threads begin."""
 
 
@@ -422,7 +427,16 @@ def fuzz(options, folder):
     one.close()
 
 
-PARTS = {"journal": journal, "engine": engine, "mqtt": mqtt, "http": http, "units": units, "soak": soak, "fuzz": fuzz}
+PARTS = {
+    "journal": journal,
+    "engine": engine,
+    "mqtt": mqtt,
+    "latency": latency,
+    "http": http,
+    "units": units,
+    "soak": soak,
+    "fuzz": fuzz,
+}
 
 
 def main():
@@ -436,7 +450,7 @@ def main():
     options = parser.parse_args()
     if options.quick:
         options.parts, options.units, options.count = ["journal", "engine", "fuzz"], 20, 500
-    for name in options.parts or PARTS:
+    for name in options.parts or [name for name in PARTS if name != "soak"]:
         with tempfile.TemporaryDirectory(prefix="driftfit-benchmark-", dir=os.environ.get("TMPDIR")) as folder:
             PARTS[name](options, Path(folder))
 

@@ -2,10 +2,10 @@
 
 from dataclasses import fields
 
-VALUES = {"q": 1e-3, "r": 0.1, "p0": 10.0, "forgetting": 0.98, "mu": 1.0}
+VALUES = {"q": 1e-3, "r": 0.1, "p0": 10.0, "forgetting": 0.98, "mu": 1.0, "particles": 4}
 """By the name of the setting, not of the tracker; 1 / (1 - forgetting) is 50 samples."""
 
-SLOW = {"q": 1e-6, "r": 0.01, "p0": 10.0, "forgetting": 0.995, "mu": 1500.0}
+SLOW = {"q": 1e-6, "r": 0.01, "p0": 10.0, "forgetting": 0.995, "mu": 1500.0, "particles": 4}
 """For long runs of systems with noise of standard deviation 0.1 that drift slowly."""
 
 

@@ -13,6 +13,7 @@ from driftfit import (
     ARX,
     OE,
     BoxJenkins,
+    ContinuousTransfer,
     Equation,
     HammersteinWiener,
     JointKalman,
@@ -34,13 +35,14 @@ READY = {
     "HammersteinWiener": (CURVED, SYSTEM), "ARMAX": (ARMAX(1, 1, 1), (0.5, 1.0, 0.3)), "OE": (OE(1, 1), (1.0, 0.5)),
     "BoxJenkins": (BoxJenkins(2, 1, 1, 2, offset=True), (1.0, 0.5, 0.5, 0.9, 1.5, -0.7, 3.0)),
     "PolynomialModel": (PolynomialModel(1, [1, 1], nf=[1, 0], nk=[1, 2]), (0.5, 1.0, 0.5, 0.3)),
+    "ContinuousTransfer": (ContinuousTransfer(2, 1, delay=1, dt=0.5, inputs=1, offset=True), (1.5, 1.0, 0.5, 2.0, 0.1)),
     "StateSpace": (StateSpace(SPACE), (0.5, 0.3, 0.2)),
     "Equation": (Equation("y = theta.g * tanh(theta.s * u[-1]) + theta.a * y[-1]"), (1.0, 0.5, 0.4)),
 }  # fmt: skip
 
 
-# one has several outputs, the other is a model of the list in the record of a larger one (tests/test_padded.py)
-@pytest.mark.parametrize("name", sorted(set(found()) - {"JointARX", "AnyOrders"}))
+# one has several outputs, the other is a model of the list in the record of a larger one (tests/test_common_size.py)
+@pytest.mark.parametrize("name", sorted(set(found()) - {"JointARX", "RunTimeOrders"}))
 def test_models_that_keep_their_promises(name):
     assert name in READY, f"{name}: give it orders, and a stable system, in READY"
     assert check_model(*READY[name]) == []

@@ -10,6 +10,7 @@ from driftfit.judge.structures.select import grid, select
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
 from driftfit.models.continuous.process import process_model
+from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.equation import Equation
 from driftfit.models.hammerstein_wiener.curves.basis import (
     Chebyshev,
@@ -54,6 +55,7 @@ from driftfit.trackers.instrumental import InstrumentalVariables
 from driftfit.trackers.joint_kalman import JointKalman
 from driftfit.trackers.kalman import Kalman
 from driftfit.trackers.laws.law import Law
+from driftfit.trackers.particle_filter import ParticleFilter
 from driftfit.trackers.rls import RLS
 from driftfit.tracking import track
 from driftfit.tune.frontier import frontier
@@ -80,6 +82,7 @@ __all__ = [
     "Change",
     "Chebyshev",
     "ConformalFactor",
+    "ContinuousTransfer",
     "DataWarning",
     "DeadZone",
     "Decide",
@@ -101,6 +104,7 @@ __all__ = [
     "Model",
     "OutputError",
     "Outputs",
+    "ParticleFilter",
     "PiecewiseLinear",
     "Polynomial",
     "PolynomialModel",

@@ -39,10 +39,11 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names, numbers
+from driftfit.engine.settings import input_names
 from driftfit.models.arx import GAP
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, check_inputs, compiled, parse
+from driftfit.models.formulas import Formula, check_inputs, compiled, parse, start_values
+from driftfit.models.functions import equation_text
 from driftfit.models.linearised import MEMORY, along, informed, restore, subtract
 
 SETTLING = 10.0
@@ -55,8 +56,9 @@ class Equation(Model):
 
     Parameters
     ----------
-    equation : str
-        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``.
+    equation : str, or a function
+        Such as ``"y = theta.k * sqrt(p1 - p2) - theta.c"``; or a plain Python function of u, theta and y that returns
+        the output, and has its name (`driftfit.models.functions`).
     start : mapping from parameter to number, or a number for all
         Where the linearisation begins; 1 for those that are not named. It is no prior: give that to the tracker, as
         ``theta0`` and ``p0``.
@@ -69,11 +71,13 @@ class Equation(Model):
         If the text is not such an equation, ``start`` names what is no parameter, or inputs are missing.
     """
 
-    equation: str
+    equation: Any
     start: Any = 1.0
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        if callable(self.equation):
+            self._set("equation", equation_text(self.equation))
         formula = parse(self.equation)
         if self.inputs is None:
             self._set("inputs", formula.inputs)
@@ -81,18 +85,7 @@ class Equation(Model):
             self._set("inputs", input_names("Equation", "inputs", self.inputs))
         if absent := [name for name in formula.inputs if name not in self.input_names]:
             raise ValueError(f"Equation: inputs must hold {', '.join(absent)}, which the equation uses.")
-        given = self.start
-        if isinstance(given, Sequence) and not isinstance(given, str) and all(len(one) == 2 for one in given):
-            given = dict(given)
-        if isinstance(given, Mapping):
-            if unknown := sorted(set(given) - set(formula.parameters)):
-                raise ValueError(
-                    f"Equation: start names {', '.join(unknown)}; the parameters are {', '.join(formula.parameters)}."
-                )
-            named = tuple((name, numbers("Equation", "start", value, ndim=0)) for name, value in given.items())
-            self._set("start", named)
-        else:
-            self._set("start", numbers("Equation", "start", given, ndim=0))
+        self._set("start", start_values("Equation", self.start, formula.parameters))
 
     def bind(self, inputs: int | Sequence[str]) -> Equation:
         check_inputs(self, inputs)

@@ -85,7 +85,7 @@ class PolynomialModel(Model):
     Raises
     ------
     ValueError
-        If an order is negative, the numbers of inputs disagree, the point does not have the length of theta, or there is
+        If an order is negative, the numbers of inputs disagree, the point has another length than theta, or there is
         nothing to estimate.
     """
 

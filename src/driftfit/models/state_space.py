@@ -11,8 +11,8 @@
 
 The text is read as that of an `Equation`, and never evaluated. The name on the left of a line is a hidden state, and on
 the left of the last line the output. On the right, ``NAME[-1]`` is the state before, and ``NAME`` the state of the
-same sample, in lines after its own. ``dt`` is the interval since the last sample in nominal samples. Equations that do
-not use it are applied once for each nominal sample of a gap, with the inputs held.
+same sample, in lines after its own. ``dt`` is the interval since the last sample in nominal samples, ``clock`` the time
+since the first one. Equations that use neither are applied once for each nominal sample of a gap, with the inputs held.
 
 `JointKalman` follows theta and x together: they are its parameters, with the states last. Derivatives are computed by
 forward differentiation of the text (dual numbers), through all lines.
@@ -37,9 +37,10 @@ import numpy as np
 
 from driftfit.engine.drivers import LARGEST, ModelSteps
 from driftfit.engine.kernel import Array, State, kernel
-from driftfit.engine.settings import input_names, numbers
+from driftfit.engine.settings import input_names
 from driftfit.models.base import Model
-from driftfit.models.formulas import Formula, Writer, check_inputs, parse, written
+from driftfit.models.formulas import Formula, Writer, check_inputs, parse, start_values, written
+from driftfit.models.functions import CLOCK, system_text
 
 TIME = "dt"
 
@@ -54,7 +55,7 @@ class System(NamedTuple):
     output: str
     reach: int
     timed: bool
-    """Whether the equations use dt."""
+    """Whether the equations use dt or clock."""
 
 
 @lru_cache(maxsize=256)
@@ -65,8 +66,10 @@ def system_of(text: str) -> System:
         raise ValueError("StateSpace: give a line for each hidden state, and one for the output.")
     lines = tuple(parse(line, known=True) for line in given)
     left = tuple(line.output for line in lines)
-    if len(set(left)) < len(left) or TIME in left:
-        raise ValueError(f"StateSpace: the names on the left must differ, and dt is not one; got {', '.join(left)}.")
+    if len(set(left)) < len(left) or {TIME, CLOCK} & set(left):
+        raise ValueError(
+            f"StateSpace: the names on the left must differ, and dt and clock are none; got {', '.join(left)}."
+        )
     hidden, output = left[:-1], left[-1]
     parameters: dict[str, None] = {}
     inputs: dict[str, None] = {}
@@ -80,14 +83,14 @@ def system_of(text: str) -> System:
                 )
             if name == output and lag == 0:
                 raise ValueError(f"StateSpace: {output} on the right must have a lag, as {output}[-1].")
-            if name not in hidden and name != TIME:
+            if name not in hidden and name not in (TIME, CLOCK):
                 lags.append(lag)
                 inputs |= dict.fromkeys([name] if name != output else [])
     if not parameters:
         raise ValueError("StateSpace: the equations have no parameter; write the unknown numbers as theta.NAME.")
     if both := sorted(set(parameters) & set(hidden)):
         raise ValueError(f"StateSpace: {', '.join(both)} is the name of a parameter and of a state.")
-    timed = any(name == TIME for line in lines for name, _ in line.lags)
+    timed = any(name in (TIME, CLOCK) for line in lines for name, _ in line.lags)
     return System(lines, tuple(parameters), hidden, tuple(inputs), output, max(lags), timed)
 
 
@@ -97,8 +100,10 @@ class StateSpace(Model):
 
     Parameters
     ----------
-    equations : str
-        A line for each hidden state, and last one for the output.
+    equations : str, or two functions
+        A line for each hidden state, and last one for the output. Or a list of two plain Python functions of x, u,
+        theta, y, t and dt: the first returns the states by name, as ``{"soc": x.soc - dt * u.i}``, the second returns
+        the output, and has its name (`driftfit.models.functions`).
     start : mapping from name to number, or a number for all
         Parameters and states before the first sample; 1 for parameters that are not named, 0 for states. It is the
         mean of the tracker's prior, unless that has its own.
@@ -111,11 +116,13 @@ class StateSpace(Model):
         If the text is not such a system, ``start`` names nothing in it, or inputs are missing.
     """
 
-    equations: str
+    equations: Any
     start: Any = ()
     inputs: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.equations, str) and isinstance(self.equations, Sequence):
+            self._set("equations", system_text(self.equations))
         system = system_of(self.equations)
         if self.inputs is None:
             self._set("inputs", system.inputs)
@@ -123,14 +130,7 @@ class StateSpace(Model):
             self._set("inputs", input_names("StateSpace", "inputs", self.inputs))
         if absent := [name for name in system.inputs if name not in self.input_names]:
             raise ValueError(f"StateSpace: inputs must hold {', '.join(absent)}, which the equations use.")
-        if isinstance(self.start, Mapping | Sequence):
-            given = dict(self.start)
-            if unknown := sorted(set(given) - set(self.names)):
-                raise ValueError(f"StateSpace: start names {', '.join(unknown)}; there are {', '.join(self.names)}.")
-            named = ((name, numbers("StateSpace", "start", value, ndim=0)) for name, value in given.items())
-            self._set("start", tuple(named))
-        else:
-            self._set("start", numbers("StateSpace", "start", self.start, ndim=0))
+        self._set("start", start_values("StateSpace", self.start, self.names))
 
     def bind(self, inputs: int | Sequence[str]) -> StateSpace:
         check_inputs(self, inputs)
@@ -178,7 +178,7 @@ class StateSpace(Model):
         return {
             "y_lag": np.full(depth, np.nan), "u_lag": np.full((max(self.m, 1), depth), np.nan),
             "u_known": np.zeros((max(self.m, 1), depth)), "point": np.zeros(n), "next": np.zeros(n),
-            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0,
+            "slopes": np.zeros((max(len(self.hidden), 1), n)), "value": 0.0, "without": 0.0, "clock": -1.0,
         }  # fmt: skip
 
     @property
@@ -208,6 +208,8 @@ class _StateWriter(Writer):
     def signal(self, name: str, lag: int) -> tuple[str, dict[int, str]]:
         if name == TIME:
             return "s.dt[l]", {}
+        if name == CLOCK:
+            return "s.clock[l]", {}
         if name in self.system.hidden:
             if lag == 0 and name in self.present:
                 value, derivatives = self.present[name]
@@ -269,6 +271,7 @@ def _steps(equations: str, inputs: tuple[str, ...]) -> ModelSteps:
 
     @kernel
     def regress(s: State, l: int) -> None:
+        s.clock[l] += s.dt[l]
         for i in range(reach, 0, -1):
             s.y_lag[i, l] = s.y_lag[i - 1, l]
             for j in range(m):

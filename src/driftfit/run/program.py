@@ -65,7 +65,7 @@ class Program:
         if (self.model.hidden is not None) != self.tracker.follows_states:
             raise ValueError(
                 f"{type(self.tracker).__name__} does not work with {type(self.model).__name__}: a StateSpace is "
-                "followed by JointKalman, which moves its hidden states and follows nothing else."
+                "followed by JointKalman or ParticleFilter, which move its hidden states and follow nothing else."
             )
 
     def __reduce__(self) -> Any:

@@ -104,10 +104,12 @@ class Service:
             for one in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(one, lambda *_: self.stop())
         runners: list[WorkerThread] = [*self.sources, *self.sinks]
-        for runner in (*runners, self.control):
-            runner.start()
+        self.control.start()
         keeper = threading.Thread(target=self._keep, daemon=True)
         keeper.start()
+        self.engine.prepare()
+        for runner in runners:
+            runner.start()
         cut_the_tail()
         notify("READY=1")
         log.info("running", extra={"detail": {"units": len(self.engine.units), "folder": str(self.folder)}})

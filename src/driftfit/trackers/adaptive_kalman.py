@@ -36,6 +36,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -135,7 +136,7 @@ def learn(s: State, l: int, odd: float) -> None:
     learn_proportion(s, l, odd)
 
 
-@kernel
+@partial(kernel, inline=False)
 def follow(s: State, entering: int, l: int) -> None:
     """One sample of the running filters; ``entering`` is the column in a new direction, or -1."""
     resolve(s, l)

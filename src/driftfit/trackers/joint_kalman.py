@@ -283,13 +283,7 @@ class JointKalman(Tracker):
 
     def __post_init__(self) -> None:
         for name in ("q", "p0"):
-            given = getattr(self, name)
-            if isinstance(given, Mapping) or _pairs(given):
-                named = dict(given)
-                checked = {key: numbers("JointKalman", name, one, ndim=0, low=0.0) for key, one in named.items()}
-                self._set(name, tuple(checked.items()))
-            elif given is not None:
-                self._set(name, covariance("JointKalman", name, given))
+            self._set(name, named_variances("JointKalman", name, getattr(self, name)))
         if self.r is not None:
             self._set("r", numbers("JointKalman", "r", self.r, ndim=0, low=0.0, strict=True))
         if self.theta0 is not None:
@@ -309,7 +303,7 @@ class JointKalman(Tracker):
         if not isinstance(model, StateSpace):
             raise ValueError(f"JointKalman follows a StateSpace model; got {type(model).__name__}.")
         n, hidden = model.n, max(len(model.hidden), 1)
-        q, p0 = (self._by_name(name, model) for name in ("q", "p0"))
+        q, p0 = (by_name("JointKalman", name, getattr(self, name), model) for name in ("q", "p0"))
         own: dict[str, Array] = {"W": np.zeros((hidden, n))}
         if self.method == "unscented":
             own = {"L": np.zeros((n, n)), "moved": np.zeros((hidden, 2 * n + 1)), "shown": np.zeros(2 * n + 1)}
@@ -318,16 +312,6 @@ class JointKalman(Tracker):
             "P": matrix("JointKalman", "p0", p0, n), "q": matrix("JointKalman", "q", q, n), "r": self.r,
             "g": np.zeros(n), "drift_root": np.ones(n), **own,
         }  # fmt: skip
-
-    def _by_name(self, name: str, model: Model) -> Any:
-        given = getattr(self, name)
-        if not _pairs(given):
-            return given
-        for key, _ in given:
-            if key not in model.names:
-                raise ValueError(f"JointKalman: {name} names {key!r}; {near(key, model.names)}")
-        found: Array = np.array([dict(given).get(one, 0.0) for one in model.names])
-        return found
 
     @property
     def steps(self) -> TrackerSteps:
@@ -340,6 +324,24 @@ class JointKalman(Tracker):
         if self.method == "extended":
             return _extended(*given, len(model.hidden), model.system.timed)
         return _unscented(*given, model.n, len(model.hidden), model.system.timed)
+
+
+def named_variances(owner: str, name: str, given: Any) -> Any:
+    """A covariance as a setting: numbers, or pairs of a name and a variance."""
+    if isinstance(given, Mapping) or _pairs(given):
+        return tuple((key, numbers(owner, name, one, ndim=0, low=0.0)) for key, one in dict(given).items())
+    return None if given is None else covariance(owner, name, given)
+
+
+def by_name(owner: str, name: str, given: Any, model: Model) -> Any:
+    """Such a setting for a model: pairs become variances (n,), 0 for names that it does not have."""
+    if not _pairs(given):
+        return given
+    for key, _ in given:
+        if key not in model.names:
+            raise ValueError(f"{owner}: {name} names {key!r}; {near(key, model.names)}")
+    found: Array = np.array([dict(given).get(one, 0.0) for one in model.names])
+    return found
 
 
 def _pairs(given: Any) -> bool:

@@ -27,6 +27,7 @@ from driftfit.engine.kernel import Array
 from driftfit.engine.settings import whole
 from driftfit.models.arx import ARX
 from driftfit.models.base import Model
+from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.models.polynomial import PolynomialModel
 from driftfit.models.regression import Regression
 from driftfit.run.result import Track
@@ -102,7 +103,7 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     if inputs.shape[1] != run.model.m:
         raise ValueError(f"simulate: the model has {run.model.m} inputs, but u has {inputs.shape[1]} columns.")
     given = np.zeros(0) if y is None else np.asarray(y, float)
-    if isinstance(run.model, PolynomialModel):
+    if isinstance(run.model, PolynomialModel | ContinuousTransfer):
         return _through_transfers(run, run.model, inputs, at, given)
     if not isinstance(run.model, ARX | Regression):
         return simulate_by_draws(run, inputs, at, given)
@@ -124,7 +125,9 @@ def simulate(run: Track, u: Any, at: int = -1, y: Any = None) -> Prediction:
     return Prediction(out, np.sqrt(of_theta), np.sqrt(of_theta + r * energy))
 
 
-def _through_transfers(run: Track, model: PolynomialModel, u: Array, at: int, given: Array) -> Prediction:
+def _through_transfers(
+    run: Track, model: PolynomialModel | ContinuousTransfer, u: Array, at: int, given: Array
+) -> Prediction:
     """Inputs (h, m) through the transfer functions of a sample, from rest, with noise through that of the noise."""
     if len(given):
         raise ValueError("simulate: transfer functions start from rest; leave y out.")

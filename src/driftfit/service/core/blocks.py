@@ -23,13 +23,13 @@ class Blocks:
 
     def __init__(self, columns: int) -> None:
         self._values = np.empty((0, SIZE, columns))
-        self._count = np.zeros(0, np.int64)
-        self._first, self._last = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        self._state: Array = np.zeros((0, 3), np.int64)
+        """(count, first number, last number) of each unit."""
 
     @property
     def capacity(self) -> int:
         """Units for which there is room."""
-        return len(self._count)
+        return len(self._state)
 
     @property
     def columns(self) -> int:
@@ -38,80 +38,72 @@ class Blocks:
 
     def grow(self, capacity: int) -> None:
         """Make room for more units."""
-        more = capacity - len(self._count)
+        more = capacity - self.capacity
         self._values = np.concatenate([self._values, np.empty((more, *self._values.shape[1:]))])
-        zeros = np.zeros(more, np.int64)
-        self._count, self._first, self._last = (
-            np.concatenate([old, zeros]) for old in (self._count, self._first, self._last)
-        )
+        self._state = np.concatenate([self._state, np.zeros((more, 3), np.int64)])
 
     def add(self, places: Array, results: Results) -> list[tuple[Any, ...]]:
         """Add results, sorted by place (N,); the rows of the table ``block`` for the blocks that they complete."""
         most = len(places) // SIZE + np.count_nonzero(places[1:] != places[:-1]) + 1
-        rows = np.empty((most, SIZE, self.columns))
-        extremes, about = np.empty((most, 3, self.columns)), np.zeros((most + 1, 3), np.int64)
-        kept = (self._values, self._count, self._first, self._last)
-        _add(*results, places, *kept, rows, extremes, about)
-        owners, first, last = about[: about[-1, 0]].T.tolist()
+        rows, about = np.empty((most, SIZE, self.columns)), np.zeros((most + 1, 3), np.int64)
+        _add(results.number, places, results.values, self._values, self._state, rows, about)
+        about = about[: about[-1, 0]]
+        rows = rows[: len(about)]
+        units, extremes = results.unit[about[:, 0]].tolist(), extremes_of(rows)
+        start, stop = (rows[:, k, TIME].tolist() for k in (0, -1))
         return [
-            (unit, a, b, *rows[k, :: SIZE - 1, TIME].tolist(), SIZE, rows[k].tobytes(), extremes[k].tobytes())
-            for k, (unit, a, b) in enumerate(zip(owners, first, last, strict=True))
+            (*one, SIZE, rows[k].tobytes(), extremes[k].tobytes())
+            for k, one in enumerate(zip(units, *about[:, 1:].T.tolist(), start, stop, strict=True))
         ]
 
     def flush(self, place: int, unit: int) -> list[tuple[Any, ...]]:
         """The row of the table ``block`` for what a unit has so far; none if it has nothing."""
-        count = int(self._count[place])
+        count, first, last = self._state[place].tolist()
         if not count:
             return []
-        self._count[place] = 0
-        values, (first, last) = self._values[place, :count], (int(one[place]) for one in (self._first, self._last))
+        self._state[place] = 0
+        values = self._values[place, :count]
         start, stop = values[0, TIME].item(), values[-1, TIME].item()
         return [(unit, first, last, start, stop, count, values.tobytes(), extremes_of(values).tobytes())]
 
 
 @Driver
-def _add(
-    number: Array, unit: Array, flags: Array, given: Array, places: Array, values: Array, count: Array, first: Array,
-    last: Array, rows: Array, extremes: Array, about: Array,
-) -> None:  # fmt: skip
-    """Copy results to the blocks of their places; what is complete is moved to ``rows``, with (unit, first, last).
+def _add(number: Array, places: Array, given: Array, values: Array, state: Array, rows: Array, about: Array) -> None:
+    """Copy results to the blocks of their places, whose ``state`` is (count, first, last).
 
-    How many blocks that are is written into the last row of ``about``. Where samples have no times their numbers are
-    used; variances of innovations become standard deviations.
+    Complete ones are moved to ``rows``, with (a result of theirs, first, last); how many that are is written into the
+    last row of ``about``. Where samples have no times their numbers are used; variances of innovations become standard
+    deviations. All are plain loops: with slices it would take ten times as long to compile.
     """
     complete = 0
     for i in range(len(number)):
         p = places[i]
-        k = count[p]
+        k = state[p, 0]
         for c in range(given.shape[1]):
             values[p, k, c] = given[i, c]
         if np.isnan(values[p, k, TIME]):
             values[p, k, TIME] = number[i]
         values[p, k, S] = np.sqrt(values[p, k, S])
-        first[p] = min(number[i], first[p]) if k else number[i]
-        last[p] = max(number[i], last[p]) if k else number[i]
-        count[p] = k + 1
-        if k + 1 < SIZE:
-            continue
-        rows[complete] = values[p]
-        for c in range(given.shape[1]):
-            low, high, total, fine = np.inf, -np.inf, 0.0, 0
+        state[p, 0] = k + 1
+        if k == 0 or number[i] < state[p, 1]:
+            state[p, 1] = number[i]
+        if k == 0 or number[i] > state[p, 2]:
+            state[p, 2] = number[i]
+        if k + 1 == SIZE:
             for t in range(SIZE):
-                x = values[p, t, c]
-                if np.isfinite(x):
-                    low, high, total, fine = min(low, x), max(high, x), total + x, fine + 1
-            extremes[complete, 0, c] = low if fine else np.nan
-            extremes[complete, 1, c] = high if fine else np.nan
-            extremes[complete, 2, c] = total / fine if fine else np.nan
-        about[complete, 0], about[complete, 1], about[complete, 2] = unit[i], first[p], last[p]
-        count[p] = 0
-        complete += 1
+                for c in range(given.shape[1]):
+                    rows[complete, t, c] = values[p, t, c]
+            about[complete, 0], about[complete, 1], about[complete, 2] = i, state[p, 1], state[p, 2]
+            state[p, 0] = 0
+            complete += 1
     about[-1, 0] = complete
 
 
 def extremes_of(values: Array) -> Array:
     """Least, largest and mean (.., 3, c) of columns (.., T, c), over finite numbers; NaN if there are none."""
     fine = np.isfinite(values)
+    if fine.all():
+        return np.stack([values.min(axis=-2), values.max(axis=-2), values.mean(axis=-2)], axis=-2)
     count = fine.sum(axis=-2)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.where(fine, values, 0.0).sum(axis=-2) / count

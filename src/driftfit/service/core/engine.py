@@ -121,6 +121,13 @@ class Engine:
         for unit in units:
             self._dirty.setdefault(unit, since)
 
+    def prepare(self) -> None:
+        """Compile what the first samples need; on a new computer that takes some seconds."""
+        self.problem = "the trackers are compiled once for this computer"
+        for section in self.units.sections:
+            section.prepare()
+        self.problem = ""
+
     def run(self) -> None:
         """Work until `stop`."""
         while not self._stop.is_set():

@@ -18,6 +18,7 @@ from driftfit.data.record import Records
 from driftfit.engine.kernel import Array
 from driftfit.run.live.interventions import HELD
 from driftfit.run.live.rule import FROZEN
+from driftfit.run.parallel_lanes import FEWEST
 from driftfit.run.states import late
 from driftfit.run.states.advance import Advanced, advance
 from driftfit.service.core.blocks import Blocks
@@ -30,8 +31,8 @@ from driftfit.service.settings.config import UnitSettings
 AHEAD = 86_400.0
 """A time so many seconds ahead of both the last sample and this machine's clock is refused: it would make every later
 sample late."""
-COLUMNS = ("y_hat", "e", "s", "theta", "var")
-"""Fields of a tracker's output, in the order of the results."""
+COLUMNS = ("y_hat", "e", "s", "theta", "var", "ok")
+"""Fields of a tracker's output, in the order of the results; the last becomes a flag."""
 REFUSED = {late.LATE: "late", late.REPEATED: "duplicate", late.UNTIMED: "no time"}
 """How samples are counted that do not enter the journal."""
 
@@ -52,6 +53,17 @@ class Section:
             self.blocks.grow(self.streams.capacity)
         self.units.append(unit)
         return unit
+
+    def prepare(self) -> None:
+        """Compile what the first samples need, so that they do not wait; lanes only if there are units for them."""
+        for count in (1, FEWEST) if len(self.units) >= FEWEST else (1,):
+            trial = Section(self.streams.index, self.streams.settings)
+            for k in range(count):
+                trial.add(k, "")
+            number = np.arange(count, dtype=np.int32)
+            time = None if self.streams.settings.time is None else np.zeros(count)
+            values = np.zeros((count, len(self.streams.settings.columns)))
+            trial.process(0, Rows(self.streams.index, number, time, values), Out())
 
     def admit(self, places: Array, time: Array | None, values: Array) -> Rows | None:
         """The samples (N,) that enter the journal, sorted by unit and time; the others are counted."""
@@ -167,11 +179,13 @@ class Section:
         values = np.empty((len(places), self.blocks.columns))
         values[:, TIME] = math.nan if rows.time is None else rows.time
         values[:, Y] = rows.values[:, 0]
-        found.columns(COLUMNS, values[:, Y_HAT:])
+        given = np.empty((len(places), values.shape[1] - Y_HAT + 1))
+        found.columns(COLUMNS, given)
+        values[:, Y_HAT:] = given[:, :-1]
         std = values[:, THETA + self.streams.program.model.n :]
         with np.errstate(invalid="ignore"):
             np.sqrt(std, out=std)
-        flags = (found.column("ok") > 0.0).astype(np.uint8) * np.uint8(OK)
+        flags = (given[:, -1] > 0.0).astype(np.uint8) * np.uint8(OK)
         np.add.at(self.streams.counted[:, USED], places, flags)
         lanes = None
         for k, place in enumerate(places[records.first].tolist()):

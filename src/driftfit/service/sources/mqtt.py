@@ -231,8 +231,8 @@ class Line:
     def __init__(self, client: Any) -> None:
         self.to_send = bytearray()
         self._client, self._read, self._at = client, b"", 0
-        self._theirs = {name: getattr(client, name) for name in ("_sock_recv", "_sock_send") if hasattr(client, name)}
-        if len(self._theirs) == 2:
+        self.theirs = {name: getattr(client, name) for name in ("_sock_recv", "_sock_send") if hasattr(client, name)}
+        if len(self.theirs) == 2:
             client._sock_recv, client._sock_send = self.receive, self.send
 
     @property
@@ -243,7 +243,7 @@ class Line:
     def receive(self, most: int) -> bytes:
         """At most so many bytes; BlockingIOError if there are none, none at the end."""
         if not self.holds:
-            self._read, self._at = self._theirs["_sock_recv"](max(most, 1 << 16)), 0
+            self._read, self._at = self.theirs["_sock_recv"](max(most, 1 << 16)), 0
         self._at += most
         return self._read[self._at - most : self._at]
 
@@ -256,12 +256,12 @@ class Line:
         """Send as much as the system takes."""
         with contextlib.suppress(BlockingIOError):
             while self.to_send:
-                del self.to_send[: self._theirs["_sock_send"](self.to_send)]
+                del self.to_send[: self.theirs["_sock_send"](self.to_send)]
 
     def release(self) -> None:
         """Send the rest, and give the socket back to the client."""
         self.flush()
-        vars(self._client).update(self._theirs)
+        vars(self._client).update(self.theirs)
 
 
 def paho() -> Any:

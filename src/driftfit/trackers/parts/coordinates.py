@@ -47,6 +47,9 @@ OUTGROWN = 1e12
 earlier information is dropped, which moves an estimate by less than a millionth of its standard deviation.
 """
 
+ROUNDING = 1e-15
+"""A variance below this share of the sum of its squares is rounding."""
+
 
 @shared
 def place(phi: Array, S: Array, work: Array, now: Array) -> None:
@@ -163,7 +166,7 @@ def located_within(s: State, l: int) -> None:
 
 @kernel
 def in_units_of_theta(s: State, l: int) -> None:
-    """The lower triangle of P = R P R'."""
+    """The lower triangle of P = R P R', its diagonal at least as large as its rounding errors."""
     n = s.theta.shape[0]
     for i in range(n):
         for b in range(n):
@@ -172,11 +175,15 @@ def in_units_of_theta(s: State, l: int) -> None:
                 total += s.R[i, a, l] * (s.P[a, b, l] if b <= a else s.P[b, a, l])
             s.W[i, b, l] = total
     for i in range(n):
+        squares = 0.0
+        for a in range(i, n):
+            squares += s.R[i, a, l] * s.R[i, a, l] * s.P[a, a, l]
         for j in range(i + 1):
             total = 0.0
             for b in range(j, n):
                 total += s.W[i, b, l] * s.R[j, b, l]
             s.P[i, j, l] = total
+        s.P[i, i, l] = max(s.P[i, i, l], ROUNDING * squares)
 
 
 @kernel

@@ -22,6 +22,8 @@ import numpy as np
 
 from driftfit.engine.kernel import Array
 from driftfit.engine.settings import numbers
+from driftfit.models.continuous.sampling import matrices, polynomials, sampled
+from driftfit.models.continuous.transfer import ContinuousTransfer
 from driftfit.use.delta_method import jacobian
 from driftfit.use.system import Followed, Response, input_of, linear, taken
 
@@ -78,7 +80,7 @@ class Transfer:
         if self.dt is not None:
             raise ValueError("discrete: this system is in discrete time.")
         n = len(self.a)
-        x, cov = self._mapped(lambda x: _sampled(x[:n], x[n:], step))
+        x, cov = self._mapped(lambda x: sampled(x[:n], x[n:], step))
         return Transfer(x[:n], x[n:], cov, self.delay, step)
 
     def continuous(self) -> Transfer:
@@ -90,40 +92,10 @@ class Transfer:
         return Transfer(x[:n], x[n:], cov, self.delay)
 
 
-def _matrices(a: Array, b: Array) -> tuple[Array, Array]:
-    """Observable companion form: x' = F x + g u, y = x_1."""
-    F = np.diag(np.ones(len(a) - 1), 1)
-    F[:, 0] = -a
-    return F, b
-
-
-def _polynomials(F: Array, g: Array) -> Array:
-    """(a, b) of x' = F x + g u, y = x_1."""
-    n = len(g)
-    a = np.poly(F)[1:]
-    out = np.array([1.0, *np.zeros(n - 1)])
-    # B = sum_k p^(n-1-k) sum_j a_j C F^(k-j) g
-    markov = [g[0] if k == 0 else float(out @ np.linalg.matrix_power(F, k) @ g) for k in range(n)]
-    full = np.append(1.0, a)
-    b = [sum(full[j] * markov[k - j] for j in range(k + 1)) for k in range(n)]
-    return np.concatenate([a, b]).real
-
-
-def _sampled(a: Array, b: Array, dt: float) -> Array:
-    from scipy import linalg
-
-    F, g = _matrices(a, b)
-    n = len(a)
-    whole = np.zeros((n + 1, n + 1))
-    whole[:n, :n], whole[:n, n] = F * dt, g * dt
-    moved = linalg.expm(whole)
-    return _polynomials(moved[:n, :n], moved[:n, n])
-
-
 def _between(a: Array, b: Array, dt: float) -> Array:
     from scipy import linalg
 
-    Phi, gamma = _matrices(a, b)
+    Phi, gamma = matrices(a, b)
     n = len(a)
     poles = np.linalg.eigvals(Phi)
     if np.any((np.abs(poles.imag) < 1e-12) & (poles.real <= 1e-12)):
@@ -134,11 +106,23 @@ def _between(a: Array, b: Array, dt: float) -> Array:
     whole = np.eye(n + 1)
     whole[:n, :n], whole[:n, n] = Phi, gamma
     moved = linalg.logm(whole).real / dt
-    return _polynomials(moved[:n, :n], moved[:n, n])
+    return polynomials(moved[:n, :n], moved[:n, n])
+
+
+def _own(model: ContinuousTransfer, theta: Array, cov: Array, j: int) -> Transfer:
+    """The system of a model that is in continuous time itself."""
+    n, m = model.poles, model.zeros + 1
+    places = np.r_[:n, n + j * m : n + (j + 1) * m]
+    taken_from = np.zeros((2 * n, len(places)))
+    taken_from[np.r_[:n, 2 * n - m : 2 * n], np.arange(len(places))] = 1.0
+    x = taken_from @ theta[places]
+    return Transfer(x[:n], x[n:], taken_from @ cov[np.ix_(places, places)] @ taken_from.T, model.delay * model.dt)
 
 
 def transfer(run: Followed, dt: float = 1.0, input: int | str = 0, at: int = -1) -> Transfer:
     """The system of one sample from one input, in discrete time with its covariance; `Transfer.continuous` converts it.
+
+    That of a `ContinuousTransfer` is in continuous time, and ``dt`` has no effect; `Transfer.discrete` converts it.
 
     Raises
     ------
@@ -148,6 +132,8 @@ def transfer(run: Followed, dt: float = 1.0, input: int | str = 0, at: int = -1)
     model, j = linear(run), input_of(run, input)
     step = float(numbers("transfer", "dt", dt, ndim=0, low=0.0, strict=True))
     theta, cov = taken(run, at)
+    if isinstance(model, ContinuousTransfer):
+        return _own(model, theta[0], cov[0], j)
     B, A = model.transfers(theta)[1][j]
     size = B.shape[-1]
     delay = int(np.argmax(np.append(B[0] != 0.0, True)))

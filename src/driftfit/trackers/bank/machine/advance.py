@@ -18,6 +18,7 @@ from driftfit.trackers.bank.layout import (
     CLOCK,
     DOUBTS,
     ELAPSED,
+    ENTERS,
     EVIDENCE,
     EXPANDED,
     FAULTS,
@@ -58,7 +59,7 @@ from driftfit.trackers.bank.layout import (
     table_at,
 )
 from driftfit.trackers.bank.leaves.forecast import expect, expect_together, weighted
-from driftfit.trackers.bank.leaves.forget import BEFORE, CAP, for_interval, foresee
+from driftfit.trackers.bank.leaves.forget import BEFORE, for_interval, foresee
 from driftfit.trackers.bank.leaves.lags import push, shift_covariance, widen_by_lags
 from driftfit.trackers.bank.leaves.leaf_matrix import (
     FIRST,
@@ -76,7 +77,8 @@ from driftfit.trackers.bank.machine.ancestry import marginals, pick, shift, summ
 from driftfit.trackers.bank.machine.gaps.chain_gap import add_covariance, add_variance, further, go_on, origins, split
 from driftfit.trackers.bank.machine.gaps.gap import chances, close, covariances, extend, odds, take_back, widen
 from driftfit.trackers.bank.machine.grow import grow
-from driftfit.trackers.bank.machine.start import GROWTH, trace, wait
+from driftfit.trackers.bank.machine.late_direction import determine
+from driftfit.trackers.bank.machine.start import limit_forgetting, wait
 from driftfit.trackers.bank.reducing.merge import combine, mix, sort, take
 from driftfit.trackers.bank.reducing.refilter import NOISE, TIME, Y, histories, refilter
 from driftfit.trackers.bank.reducing.selection import (
@@ -418,6 +420,8 @@ def advance(t: Any) -> None:
         take_in(t)
     else:
         let_pass(t, counters[LEAVES])
+        if sample[ENTERS] != 0.0:
+            determine(t, counters[LEAVES])
     counters[CLOCK] += 1
     L = counters[LEAVES]
     mixture(t.n, t, L)
@@ -478,7 +482,7 @@ def bank(address: int) -> None:
         advance(t)
         head[0], head[1], head[2], head[3] = t.sample[EVIDENCE], t.sample[WINDOW], t.sample[KEPT], counters[LEAVES]
     if not begun:
-        t.places[CAP, 0] = GROWTH * trace(t.cov)
+        limit_forgetting(t)
         wait(t)
         for row in range(len(t.root)):
             t.root[row, 0] = t.leaves[row, 0]

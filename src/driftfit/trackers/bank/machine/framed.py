@@ -21,6 +21,7 @@ import numpy as np
 
 from driftfit.engine.kernel import Array, State, cubes, floats, kernel, machine, packed, shared, wholes
 from driftfit.trackers.bank.layout import LEAVES, MEMORY_AT, ROW, ROWS, memory_at
+from driftfit.trackers.bank.leaves.forget import GROWTH, PER_CAP
 from driftfit.trackers.bank.leaves.leaf_matrix import FIRST, NU, WEIGHT, S
 from driftfit.trackers.parts.coordinates import (
     OUTGROWN,
@@ -32,8 +33,8 @@ from driftfit.trackers.parts.coordinates import (
 )
 from driftfit.trackers.parts.diffuse import ENTERING, NOISE, NOW, OK, Y
 
-FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior")
-WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR = (ROW[name] for name in FIELDS)
+FIELDS = ("walks", "fixed_walks", "relative_walks", "leaves", "gap", "path", "prior", "places")
+WALKS, FIXED, RELATIVE, COLUMNS, GAP, PATH, PRIOR, PLACES = (ROW[name] for name in FIELDS)
 """Rows of the table."""
 (
     AT_MEMORY, AT_TABLE, AT_COUNTERS, AT_S, AT_W, AT_C, AT_X, AT_D, AT_P, AT_G, AT_NOW, ADDRESSES,
@@ -107,6 +108,7 @@ def enter_leaves(M: Array, table: Array, many: Array, x: Array, now: Array, g: A
     path, columns, H = table[3 * PATH] // 8, table[3 * PATH + 2], table[3 * PRIOR + 1]
     for i in range(2 * H, table[3 * PATH + 1] - 1):
         enter_packed(M, path + i * columns, 1, x, j, sign, 0.0, g)
+    M[table[3 * PLACES] // 8 + PER_CAP * n + j] = 1.0 / (GROWTH * noise)
 
 
 @shared
@@ -212,12 +214,16 @@ def outgrown(s: State, l: int) -> int:
 
 @kernel
 def enter_bank(s: State, column: int, l: int) -> None:
-    """Row ``column`` of M becomes the rest of this regressor; the compiled routine has made the time update."""
+    """Row ``column`` of M becomes the rest of this regressor. The compiled routine has made the time update, and
+    outside these coordinates (`driftfit.trackers.bank.machine.late_direction`) the rest.
+    """
     n, L = s.d.shape
     for i in range(column, n):
         s.x[i, l] = 0.0
     sign = new_row(s, s.phi, column, l)
     s.root[l] = 1
+    if s.framed[l] == 0:
+        return
     noise = s.noise[l] if s.unknown[l] > 0 else s.r[l] * s.noise[l]
     s.at_start[Y, l], s.at_start[NOISE, l], s.at_start[OK, l], s.at_start[ENTERING, l] = s.y[l], noise, sign, column
     fields = packed((

@@ -21,6 +21,8 @@ to 1. Cost per sample: O(K n^2 + K J) for K filters and J levels, and O(K n^3 / 
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from driftfit.engine.kernel import State, exp, kernel, log
@@ -35,10 +37,10 @@ LEAST = 1e-100
 """Probability that a filter is never below."""
 
 
-@kernel
+@partial(kernel, inline=False)
 def wander(s: State, size: float, l: int) -> None:
     """Drift of all filters: ``size`` in units of their ratios over the scales of the regressors."""
-    n = s.theta.shape[0]
+    n = s.parameters[l]  # not the constant, with which the loop over filters would be repeated n^3 / 6 times
     for i in range(n):
         unit = size / s.c[i, l] if s.c[i, l] > 0.0 else 0.0
         for a in range(i + 1):
@@ -57,7 +59,7 @@ def predict(s: State, l: int) -> None:
         wander(s, s.r[l] * time, l)
 
 
-@kernel
+@partial(kernel, inline=False)
 def project(s: State, l: int) -> None:
     """x' m, g and h of every filter."""
     n, K = s.theta.shape[0], s.modes[l]
@@ -195,7 +197,7 @@ def weigh(s: State, l: int) -> None:
         s.nu[j, l] += s.nu[J - 1, l] * s.nu_prior[j, l] / (1.0 - OUTLIER)
 
 
-@kernel
+@partial(kernel, inline=False)
 def absorb(s: State, l: int) -> None:
     """The rank-one update: m + g step, C - h g g'."""
     n, K = s.theta.shape[0], s.modes[l]
@@ -262,11 +264,11 @@ def enter_filters(s: State, j: int, l: int) -> None:
     s.density[l] = -0.5 * (log(2.0 * np.pi * v) + e * e / v)
 
 
-@kernel
+@partial(kernel, inline=False)
 def mixture(s: State, l: int) -> None:
     """Mean d of the filters, and the covariance of theta; without a sample d keeps its bits."""
-    K = s.modes[l]
-    for i in range(s.theta.shape[0]):
+    n, K = s.theta.shape[0], s.modes[l]
+    for i in range(n):
         for k in range(K):
             s.row[k, l] = s.mu[k, l] * s.m[i, k, l]
         mean = sum_of_row(s, l)
@@ -278,5 +280,5 @@ def mixture(s: State, l: int) -> None:
             s.Z[i, j, l] = sum_of_row(s, l)
             s.P[i, j, l] = s.Z[i, j, l]
     in_units_of_theta(s, l)
-    for i in range(s.theta.shape[0]):
+    for i in range(n):
         s.var[i, l] = s.P[i, i, l]

@@ -29,6 +29,7 @@ vectorised over the modes.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,7 @@ def filters(n: int, groups: Any) -> dict[str, Any]:
     start[0] = AT_REST
     return {
         "modes": K,
+        "parameters": n,
         "ratio": ratio,
         "moves": moves,
         "arrive": arrive,
@@ -165,7 +167,7 @@ def learn_rate(s: State, l: int) -> None:
     s.calm[l] = max(CALMEST, min(1.0, (EVENTS + s.jumps[l]) / (EVENTS + JUMP * s.watched[l])))
 
 
-@kernel
+@partial(kernel, inline=False)
 def mix(s: State, l: int) -> None:
     """Interaction: every filter continues from the mixture of its predecessors; mu becomes that of the next sample.
 
