@@ -8,7 +8,8 @@ Of K series with ny outputs each, programs and states have K ny entries, those o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,8 +38,9 @@ class Advanced:
         for job in self.jobs:
             lanes, L = np.flatnonzero(job.live), len(job.lanes)
             series, output = np.divmod(job.lanes[lanes], self.records.ny)
-            fields = [job.out.dtype.fields[name] for name in names]
-            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at, *_ in fields]
+            fields: Mapping[str, Any] = job.out.dtype.fields or {}
+            places = (fields[name][:2] for name in names)
+            begin = [np.arange(at, at + kind.itemsize, 8 * L) // 8 for kind, at in places]
             words = job.out.view(np.float64).reshape(len(job.out), -1)
             first, length = self.records.first[series], self.records.length[series]
             _natural(words, np.concatenate(begin), lanes, first, length, output, into)
